@@ -156,9 +156,8 @@ class Daemon:
 
     def report(self, *, within: float = 0.0) -> AccountReport:
         """Return the events of the last `within` seconds and the current state of each vehicle."""
-        return report_of(
-            self.update_events(), self.id, socket.gethostname(), clock.steady(), within=within, to_utc=clock.to_utc()
-        )
+        event_log, host = self.update_events(), socket.gethostname()
+        return report_of(event_log, self.id, host, clock.steady(), within=within, to_utc=clock.to_utc())
 
     def _status_reply(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
         within, seconds = parameter(ACCOUNT_PARAMETER), 0.0

@@ -77,7 +77,7 @@ class SourceOutput:
 
     def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
         """Return the health of all streams, or of the first `limit`."""
-        streams, now = list(self._streams.items())[:limit], self._now_ns()
+        streams, now = list(self._streams.items())[:limit], round(self._now() * 1e9)
         return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
 
     @property
@@ -135,7 +135,7 @@ class SourceOutput:
             return
         self.durations.add(time.perf_counter() - start)
         self.published += 1
-        stream.health.add(fields, received=self._now_ns(), lost=message.lost)
+        stream.health.add(fields, received=round(self._now() * 1e9), lost=message.lost)
         if message.dropout:
             self._event_log.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
         self._event_log.add(message.address, fields, clock.steady(), lost=message.lost)
@@ -233,11 +233,8 @@ class SourceOutput:
     def _republish_retained(self, message: SourceMessage) -> None:
         """After an outage, republish the last messages of topics without a rate, unless the vehicle has rebooted."""
         vehicle = message.address.vehicle
-        known = [
-            (address, stream, stream.last)
-            for address, stream in self._streams.items()
-            if address.vehicle == vehicle and stream.last is not None
-        ]
+        streams = [(address, stream) for address, stream in self._streams.items() if address.vehicle == vehicle]
+        known = [(address, stream, stream.last) for address, stream in streams if stream.last is not None]
         rebooted = message.rebooted or _timestamp(message) < max((_timestamp(last) for *_, last in known), default=0)
         for address, stream, last in known:
             if stream.publisher is not None or get_topic(address.topic).rate:
@@ -250,9 +247,6 @@ class SourceOutput:
                 extra = about("stream_resumed", address, source=self._name)
                 _log.info("%s: %s is published again", self._name, address, extra=extra)
                 self.publish(replace(last, lost=0))
-
-    def _now_ns(self) -> int:
-        return round(self._now() * 1e9)
 
     def _count_rejected(self, rule: str, count: int = 1) -> None:
         self.rejected += count

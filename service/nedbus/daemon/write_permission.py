@@ -108,13 +108,11 @@ class WritePermission:
                 self._denials.pop(vehicle, None)
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
-            _log.warning(
+            text = (
                 "the router refuses messages of %s, so they reach no reader: check that its access rules allow them for"
-                " the certificate %s ('nedbus pki rules', docs/security.md); nedbus probes again every minute",
-                _list_vehicles(new),
-                self._tls.certificate,
-                extra=about("access_denied"),
+                " the certificate %s ('nedbus pki rules', docs/security.md); nedbus probes again every minute"
             )
+            _log.warning(text, _list_vehicles(new), self._tls.certificate, extra=about("access_denied"))
         if accepted := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
             _log.info("the router now accepts messages of %s", _list_vehicles(accepted), extra=about("access_granted"))
         if any(verdict == "denied" and self._denials[vehicle] < _CONFIRMED for vehicle, verdict in verdicts.items()):

@@ -83,11 +83,8 @@ class Observation:
                 # several publishers, or a storage, may answer for one key
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
-        others = {
-            key
-            for key in transport.token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
-            if not key.startswith("@")
-        }
+        tokens = transport.token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
+        others = {key for key in tokens if not key.startswith("@")}
         self._add(take_messages())
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)

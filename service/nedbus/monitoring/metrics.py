@@ -164,15 +164,12 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
         "nedbus_stream_rate_hertz": measure("rate"),
         "nedbus_stream_usual_rate_hertz": measure("usual_rate"),
         "nedbus_stream_jitter_seconds": measure("jitter"),
-        "nedbus_stream_flag_ratio": (
-            ((*each.labels, flag), share) for each in active for flag, share in (each.health.flags or {}).items()
-        ),
-        "nedbus_resets": (
-            ((*each.labels, quantity), total) for each in named for quantity, total in each.health.resets.items()
-        ),
-        "nedbus_latency_seconds": (
-            _histogram_row(each.labels, each.latencies) for each in named if each.latencies is not None
-        ),
+        "nedbus_stream_flag_ratio":
+            (((*each.labels, flag), share) for each in active for flag, share in (each.health.flags or {}).items()),
+        "nedbus_resets":
+            (((*each.labels, quantity), total) for each in named for quantity, total in each.health.resets.items()),
+        "nedbus_latency_seconds":
+            (_histogram_row(each.labels, each.latencies) for each in named if each.latencies is not None),
         "nedbus_streams": [((), len(streams))],
     })  # fmt: skip
 
@@ -189,9 +186,8 @@ def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> I
             for name, state in states.items() for severity in SEVERITIES
         ],
         "nedbus_vehicle_condition": [((name, kind), 1) for name in kinds for kind in kinds[name]],
-        "nedbus_vehicle_events": [
-            ((name, severity), event_log.counts[name, severity]) for name in vehicles for severity in SEVERITIES
-        ],
+        "nedbus_vehicle_events":
+            [((name, severity), event_log.counts[name, severity]) for name in vehicles for severity in SEVERITIES],
     })  # fmt: skip
 
 
@@ -222,19 +218,16 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     yield from make_metrics({
         "nedbus_limit_reached": [(("vehicles",), event_log.refused), (("addresses",), addresses)],
         "nedbus_source_rejected": [((label,), status.rejected) for label, status in of.items()],
-        "nedbus_messages_rejected": [
-            ((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()
-        ],
+        "nedbus_messages_rejected":
+            [((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()],
         "nedbus_source_lost": [((label,), status.lost) for label, status in of.items()],
         "nedbus_source_addresses": [((label,), len(status.addresses)) for label, status in of.items()],
-        "nedbus_source_state": [
-            ((label, state), state == status.state) for label, status in of.items() for state in STATES
-        ],
+        "nedbus_source_state":
+            [((label, state), state == status.state) for label, status in of.items() for state in STATES],
         "nedbus_source_restarts": [((label,), status.retries) for label, status in of.items()],
         **_log_stream_rows(of),
-        "nedbus_publish_duration_seconds": [
-            _histogram_row((label,), measures.durations) for label, measures in sources.items()
-        ],
+        "nedbus_publish_duration_seconds":
+            [_histogram_row((label,), measures.durations) for label, measures in sources.items()],
     })  # fmt: skip
 
 

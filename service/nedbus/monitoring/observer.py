@@ -89,9 +89,8 @@ class Observer:
         paused, self._last_poll = self._last_poll is not None and now - self._last_poll > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
-        self.event_log.update(
-            now, states, link=link, dropped=dropped, is_behind=is_behind, present={each.vehicle for each in alive}
-        )
+        present = {each.vehicle for each in alive}
+        self.event_log.update(now, states, link=link, dropped=dropped, is_behind=is_behind, present=present)
         if settled:
             silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
             for age, address in silent:

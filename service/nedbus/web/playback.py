@@ -151,11 +151,9 @@ class Player:
         if isinstance(entry, str):
             self.fleet.reject([RejectionReport(address, entry, received)])
             return
-        message: Any
+        message: Any = SimpleNamespace(timestamp=entry)
         if isinstance(entry, bytes):
             message = codec_of(BY_TOPIC[address.topic]).decode_row(entry)
-        else:
-            message = SimpleNamespace(timestamp=entry)
         sample = Sample(message, address, received)
         self._monitor.add(sample, received=received)
         self.fleet.add(sample, due)

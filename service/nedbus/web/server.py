@@ -107,12 +107,8 @@ class LiveFleet(Exporter):
         super().__init__(bus, selection, version=version)
         self.fleet = Fleet()
         now = clock.utc()
-        remembered = [
-            event
-            for report in bus.accounts(within=PAST)
-            for event in report.events
-            if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
-        ]
+        before = (event for report in bus.accounts(within=PAST) for event in report.events if event.time < now)
+        remembered = [each for each in before if each.vehicle != ALL and selection.vehicle in ("*", each.vehicle)]
         self.timeline = EventTimeline(self.event_log, before=remembered)
 
     def add(self, sample: Sample[Any]) -> None:

@@ -265,11 +265,9 @@ class Viewer:
 
     def _show_next(self, *, is_later: bool) -> None:
         now, events = self._player.time if self._player else self.pinned, self._events_of_chosen()
-        if is_later:
-            events = [event for event in events if now is not None and event.time > now + 0.05][:1]
-        else:
-            events = [event for event in events if now is None or event.time < now - 0.05][-1:]
-        for event in events:
+        later = [event for event in events if now is not None and event.time > now + 0.05]
+        earlier = [event for event in events if now is None or event.time < now - 0.05]
+        for event in later[:1] if is_later else earlier[-1:]:
             self._show(event)
 
     def _on_tap(self, source: ColumnDataSource, shown: Callable[[], list[Any]], show: Callable[[Any], object]) -> None:
