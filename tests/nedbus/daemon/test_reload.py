@@ -75,7 +75,7 @@ def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> N
     wait_for(lambda: "seed 0" in service.err, what="the vehicle")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
         write_settings(file, ["1", "2", "a b"])
-        assert f"{file}, line 11, column 1: source 'sim:?vehicle=a+b': " in reload(service, 1)
+        assert f"{file}, line 11, column 1: source 'sim:?vehicle=a%20b': " in reload(service, 1)
         write_settings(file, ["2"], header='prefix = "other"\n')
         reason = "prefix cannot be changed by a reload: restart the service"
         assert f"{file}, line 1, column 1: {reason}" in reload(service, 2)
