@@ -1,6 +1,7 @@
 """Output of a source: validate, publish or reject its messages, and track the health of each stream."""
 
 import logging
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Container
@@ -23,6 +24,7 @@ _MAX_ADDRESSES: Final = 1000  # published and stale addresses of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one per origin (`where`)
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
+_UNSETTLED: Final = 60.0  # s after which a stream that was stale counts as stable again
 _MAX_RULES: Final = 50  # rules with a separate counter
 _NO_MESSAGE: Final = "input that is no message"
 TOO_MANY: Final = "too many addresses"
@@ -39,6 +41,8 @@ class _Stream:
     publisher: Publisher | None = None
     last_received: float | None = None
     last: SourceMessage | None = None
+    unsettled_until: float = 0.0  # a stream that is stale again before then flaps, which is logged once
+    is_flapping: bool = False
 
 
 class SourceOutput:
@@ -167,38 +171,56 @@ class SourceOutput:
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
-            text = f"{address} is published{' again' if resumed else ''}"
-            event = "stream_resumed" if resumed else "published"
-            _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
-            self._republish_retained(message)
             stream = self._streams[address]
+            if not stream.is_flapping:
+                text = f"{address} is published{' again' if resumed else ''}"
+                event = "stream_resumed" if resumed else "published"
+                _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
+            self._republish_retained(message)
         stream.last_received, stream.last = self._now(), message
         self.publish(message)
 
     def expire_stale(self) -> bool:
-        """Stop publishing live addresses without a message for 3 s; return True if any address is still published.
+        """Stop publishing stale live addresses; return True if any address is still published.
 
-        Topics without a rate stay published while other messages of their vehicle arrive.
+        An address is stale after 3 s without a message, or three of its usual intervals if that is longer. Topics
+        without a rate stay published while other messages of their vehicle arrive.
         """
         now = self._now()
         fresh = {
             address
             for address, stream in self._streams.items()
-            if stream.last_received is not None and now - stream.last_received < TIMINGS.stale
+            if stream.last_received is not None and now - stream.last_received < self._patience(stream, now)
         }
         vehicles = {address.vehicle for address in fresh}
         fresh |= {each for each in self._streams if each.vehicle in vehicles and not get_topic(each.topic).rate}
         for address in self.addresses:
             if address not in fresh:
-                text = f"{address} is stale: no message for {TIMINGS.stale:.0f} s"
-                _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
+                self._log_stale(address, self._streams[address], now)
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
+            stream.is_flapping = stream.is_flapping and now < stream.unsettled_until
             is_known = address.vehicle in self._event_log.vehicles and stream.last_received is not None
             if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]
         self._is_full = False
         return bool(fresh)
+
+    def _patience(self, stream: _Stream, now: float) -> float:
+        """Return the seconds without a message after which an address is stale."""
+        if now - (stream.last_received or 0.0) < TIMINGS.stale:
+            return TIMINGS.stale  # the usual case, without the median of its intervals
+        limit = stream.health.snapshot(self._now_ns()).stale_after
+        return limit if math.isfinite(limit) else TIMINGS.stale
+
+    def _log_stale(self, address: Address, stream: _Stream, now: float) -> None:
+        """Log that an address is stale, and the second time within a minute that it flaps, until it is stable again."""
+        is_again, stream.unsettled_until = now < stream.unsettled_until, now + _UNSETTLED
+        if not stream.is_flapping:
+            text = f"{address} is stale: no message for {now - (stream.last_received or 0.0):.0f} s"
+            text += f"; it flaps, so this is not logged again until it is stable for {_UNSETTLED:.0f} s" * is_again
+            _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
+        stream.is_flapping = is_again
 
     def _evict_stale(self) -> bool:
         """Delete the address that has been stale the longest; return False if all are published."""

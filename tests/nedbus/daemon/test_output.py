@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
@@ -111,3 +113,34 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses
     assert present[0] not in fake.output.stale
+
+
+def test_slow_stream_stays_published_for_three_of_its_intervals() -> None:
+    """A stream of a message every 4 s is stale after 12 s without one, not after 3 s."""
+    fake = FakeOutput()
+    for _ in range(6):
+        fake.receive(4, HOME if fake.now else POSITION, POSITION)
+    for silence, published in ((8, True), (3, True), (2, False)):
+        fake.receive(silence)
+        assert (POSITION in fake.output.addresses) == published
+
+
+def test_flapping_stream_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """A stream that comes and goes is logged until the second time that it is stale, and again once it was stable."""
+    caplog.set_level("INFO")
+    fake = FakeOutput()
+
+    def flap() -> list[str]:
+        caplog.clear()
+        for _ in range(5):
+            fake.receive(0.5, POSITION)
+        fake.receive(4)
+        fake.receive(1, POSITION)
+        return [text.partition(" is ")[2] for text in caplog.messages]
+
+    assert flap() == ["published", "stale: no message for 4 s", "published again"]
+    assert flap()[0].startswith("stale: no message for 4 s; it flaps")
+    assert [flap(), flap()] == [[], []]
+    for _ in range(120):
+        fake.receive(0.5, POSITION)
+    assert flap() == ["stale: no message for 4 s", "published again"]

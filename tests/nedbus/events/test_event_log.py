@@ -24,7 +24,7 @@ from nedbus.events import (
 from nedbus.events.event_log import MAX_GONE
 from nedbus.events.rules import FLAPPING_CHANGES, PAUSE
 from nedbus.timings import TIMINGS
-from nedbus_msgs import Address
+from nedbus_msgs import RESET_COUNTERS, Address
 from tests.flights.messages import VALID, message
 
 from .flight import ARMED, DISARMED, GOOD_GPS, POSITION, Flight
@@ -506,7 +506,10 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
         ),  # delta plus motion
         (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
-        (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
+        (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
+        (2.0, {"x": 7.0, "vx": 2.0, "xy_reset_counter": 2}, "xy by 5.0 m (5.0 north, 0.0 east)"),  # minus the motion
+        (3.5, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
+        (2.0, {"heading": 3.0, "heading_reset_counter": 2}, "heading by an unknown amount"),  # its rate is unknown
         (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
         (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
         (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
@@ -521,6 +524,17 @@ def test_reset_size_is_delta_or_observed_step(
     """
     reset = next(each for each in flight.wait(seconds).send(**fields) if each.kind == "reset")
     assert reset.text == f"reset of {size}"
+
+
+def test_missing_fields_are_neither_a_reset_nor_an_origin(flight: Flight) -> None:
+    """Where messages change between streamed and converted ones, missing counters and origins are no events."""
+    counters: dict[str, Any] = dict.fromkeys(RESET_COUNTERS.values(), 3)
+    flight.send(**counters)
+    reported = []
+    for _ in range(3):
+        reported += flight.wait(0.1).send(missing=[*counters, "xy_global", "z_global", "ref_lat", "ref_lon"])
+        reported += flight.wait(0.1).send(**counters)
+    assert reported == []
 
 
 def test_flapping_flag_is_reported_after_it_settles(flight: Flight) -> None:
