@@ -31,9 +31,12 @@ class _Receiver(LogReceiver):
         self._reader, self._options, self._send = cast("Any", SimpleNamespace(name="udp")), options, lambda *_: None
         self.vehicles = {}
 
-    def process(self, received: Received) -> Received | Rejection:
+    def tick(self, now: float) -> None:
         for vehicle in self.vehicles.values():
-            self._execute(vehicle, vehicle.client.tick(received.time))
+            self._execute(vehicle, vehicle.client.tick(now))
+
+    def process(self, received: Received) -> Received | Rejection:
+        self.tick(received.time)
         return self._process(received, is_full=False)
 
 
@@ -46,6 +49,7 @@ def play(path: Path, options: MavlinkOptions) -> Iterator[tuple[float, SourceMes
         checked = when if math.isnan(checked) else checked
         while checked + _TICK <= when:
             checked += _TICK
+            receiver.tick(checked)
             for log in session._logs.values():
                 log.log_changes()
             yield checked, None

@@ -805,3 +805,80 @@ def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
                 is_repeated = suppressed is not None and int(suppressed[1]) % 2 == 0
                 assert known is not None or is_repeated or (key not in initial and event.lasted is None)
                 initial |= {key} if known is None else set()
+
+
+def fly_with_gps(flight: Flight, seconds: float, *, rate: float = 5.0, topic: str = "vehicle_gps_position") -> None:
+    """Send positions at 10 Hz, and GPS messages at `rate` Hz, 0 for none; update twice a second."""
+    for index in range(round(10 * seconds)):
+        flight.wait(0.1).send()
+        if rate and index % round(10 / rate) == 0:
+            flight.send(topic, **GOOD_GPS)
+        if index % 5 == 0:
+            flight.update()
+
+
+def no_messages(flight: Flight) -> list[tuple[str, str, float]]:
+    found = [each for each in flight.event_log.events if each.kind == "no_messages"]
+    return [(each.change, each.text, round(flight.now - each.time)) for each in found]
+
+
+def test_gps_without_messages_is_a_condition_until_it_resumes(flight: Flight) -> None:
+    """A GPS without a message for 4 s, while positions arrive, is a condition that began at its last message."""
+    fly_with_gps(flight, 10)
+    fly_with_gps(flight, 3.5, rate=0)
+    assert no_messages(flight) == []
+    fly_with_gps(flight, 1.5, rate=0)
+    assert no_messages(flight) == [("begin", "no GPS message", 5)]
+    assert flight.kinds == ["no_messages"]
+    fly_with_gps(flight, 1)
+    assert no_messages(flight)[1][:2] == ("end", "GPS messages resumed after 5.1 s")
+    assert flight.severity == "info"
+
+
+def test_silence_of_a_topic_follows_its_rate(flight: Flight) -> None:
+    """A GPS with a message every 5 s is silent after 15 s without one, and one second for a replacement."""
+    fly_with_gps(flight, 40, rate=0.2)
+    fly_with_gps(flight, 10, rate=0)
+    assert no_messages(flight) == []
+    fly_with_gps(flight, 3, rate=0)
+    assert no_messages(flight) == [("begin", "no GPS message", 18)]
+
+
+def test_other_gps_topic_replaces_a_silent_one(flight: Flight) -> None:
+    """If `vehicle_gps_position` stops, events come from `sensor_gps`, and from the former again once it resumes."""
+    for _ in range(50):
+        flight.send("sensor_gps", instance=0, **GOOD_GPS)
+        fly_with_gps(flight, 0.2)
+    for _ in range(50):
+        fly_with_gps(flight, 0.2, topic="sensor_gps")
+    assert no_messages(flight) == []
+    assert flight.kinds == []
+    flight.new_events()
+    flight.send("sensor_gps", instance=0, **GOOD_GPS | {"fix_type": 0})
+    assert brief(flight.new_events() or flight.event_log.events[-1:]) == [("gps_fix_lost", "begin", "watch")]
+    flight.gps()
+    flight.send("sensor_gps", instance=0, **GOOD_GPS | {"fix_type": 0})
+    assert flight.kinds == []
+
+
+def test_pause_of_all_messages_is_the_silence_of_no_topic(flight: Flight) -> None:
+    """After a pause of the link, the first position does not make topics silent whose messages follow it."""
+    fly_with_gps(flight, 10)
+    flight.wait(20).send()
+    for _ in range(4):
+        flight.wait(0.5).send()
+        flight.update()
+    fly_with_gps(flight, 2)
+    assert no_messages(flight) == []
+
+
+def test_single_wild_timestamp_makes_no_topic_silent(flight: Flight) -> None:
+    """One position or GPS message with a wild timestamp does not make the GPS silent."""
+    fly_with_gps(flight, 10)
+    for topic, seconds in ((POSITION.topic, 60.0), ("vehicle_gps_position", -60.0)):
+        flight.booted -= seconds
+        flight.send(topic, **GOOD_GPS if topic != POSITION.topic else {})
+        flight.booted += seconds
+        flight.update()
+        fly_with_gps(flight, 2)
+    assert no_messages(flight) == []
