@@ -79,14 +79,10 @@ class Health:
 
     @property
     def stale_after(self) -> float:
-        """Seconds without a message until this stream is stale: three usual intervals, at least 3 s.
-
-        Infinity if it may pause indefinitely.
-        """
+        """Seconds without a message until this stream is stale: 3 intervals, at least 3 s; infinity if it may pause."""
         if not self.nominal and (self.on_change or (self.usual_rate or 0) < _MIN_PERIODIC_RATE):
             return math.inf
-        slowest = 2 / self.nominal if self.on_change else 0.0
-        return max(TIMINGS.stale, slowest, _FACTOR * (self.usual_interval or 0.0))
+        return max(TIMINGS.stale, _FACTOR * (self.usual_interval or 0.0))
 
 
 _FlagCounts = Counter[tuple[str, bool]]  # messages by flag and value; unknown values are not counted
@@ -207,6 +203,11 @@ class StreamHealth:
                 window.flags[flag, bool(is_set)] += 1
                 self._flags[flag, bool(is_set)] += 1
 
+    @property
+    def usual_interval(self) -> float | None:
+        """As in Health."""
+        return median(self._intervals) if len(self._intervals) >= _MIN_STEPS else None
+
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
         now = time.monotonic_ns() if now is None else now
@@ -231,7 +232,7 @@ class StreamHealth:
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,
-            usual_interval=median(self._intervals) if len(self._intervals) >= _MIN_STEPS else None,
+            usual_interval=self.usual_interval,
         )
 
     def _add_time(self, timestamp: int) -> bool:

@@ -1,7 +1,6 @@
 """Output of a source: validate, publish or reject its messages, and track the health of each stream."""
 
 import logging
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Container
@@ -41,8 +40,13 @@ class _Stream:
     publisher: Publisher | None = None
     last_received: float | None = None
     last: SourceMessage | None = None
-    unsettled_until: float = 0.0  # a stream that is stale again before then flaps, which is logged once
-    is_flapping: bool = False
+    settled: float = 0.0  # a stream that is stale again before then flaps, which is logged once
+    flaps: int = 0
+
+    @property
+    def patience(self) -> float:
+        """Seconds without a message until the stream is stale."""
+        return max(TIMINGS.stale, 3 * (self.health.usual_interval or 0.0))
 
 
 class SourceOutput:
@@ -172,7 +176,7 @@ class SourceOutput:
                 self.reject(Rejection(str(address), str(exc)))
                 return
             stream = self._streams[address]
-            if not stream.is_flapping:
+            if not stream.flaps:
                 text = f"{address} is published{' again' if resumed else ''}"
                 event = "stream_resumed" if resumed else "published"
                 _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
@@ -190,37 +194,25 @@ class SourceOutput:
         fresh = {
             address
             for address, stream in self._streams.items()
-            if stream.last_received is not None and now - stream.last_received < self._patience(stream, now)
+            if stream.last_received is not None and now - stream.last_received < stream.patience
         }
         vehicles = {address.vehicle for address in fresh}
         fresh |= {each for each in self._streams if each.vehicle in vehicles and not get_topic(each.topic).rate}
-        for address in self.addresses:
-            if address not in fresh:
-                self._log_stale(address, self._streams[address], now)
+        for address in [each for each in self.addresses if each not in fresh]:
+            stream = self._streams[address]
+            stream.flaps, stream.settled = stream.flaps + 1 if now < stream.settled else 0, now + _UNSETTLED
+            if stream.flaps < 2:
+                text = f"{address} is stale: no message for {now - (stream.last_received or 0.0):.0f} s"
+                text += f"; it flaps, logged again once stable for {_UNSETTLED:.0f} s" * stream.flaps
+                _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
-            stream.is_flapping = stream.is_flapping and now < stream.unsettled_until
+            stream.flaps *= now < stream.settled
             is_known = address.vehicle in self._event_log.vehicles and stream.last_received is not None
             if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]
         self._is_full = False
         return bool(fresh)
-
-    def _patience(self, stream: _Stream, now: float) -> float:
-        """Return the seconds without a message after which an address is stale."""
-        if now - (stream.last_received or 0.0) < TIMINGS.stale:
-            return TIMINGS.stale  # the usual case, without the median of its intervals
-        limit = stream.health.snapshot(self._now_ns()).stale_after
-        return limit if math.isfinite(limit) else TIMINGS.stale
-
-    def _log_stale(self, address: Address, stream: _Stream, now: float) -> None:
-        """Log that an address is stale, and the second time within a minute that it flaps, until it is stable again."""
-        is_again, stream.unsettled_until = now < stream.unsettled_until, now + _UNSETTLED
-        if not stream.is_flapping:
-            text = f"{address} is stale: no message for {now - (stream.last_received or 0.0):.0f} s"
-            text += f"; it flaps, so this is not logged again until it is stable for {_UNSETTLED:.0f} s" * is_again
-            _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
-        stream.is_flapping = is_again
 
     def _evict_stale(self) -> bool:
         """Delete the address that has been stale the longest; return False if all are published."""

@@ -1,7 +1,7 @@
 """Flag labels, thresholds and mode names for the table of kinds and the event detectors."""
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 _AIDING: Final = {
     "cs_gnss_pos": "GNSS position", "cs_gnss_vel": "GNSS velocity", "cs_ev_pos": "vision position",
@@ -54,27 +54,17 @@ FAILSAFE_FLAGS: Final[Mapping[str, str]] = {
 POSITIONS: Final = ("vehicle_local_position", "external_ins_local_position", "estimator_local_position")
 """Topics with position validity flags, in order of preference."""
 
-
-class Evidence(NamedTuple):
-    """Topics on which a verdict rests, in order of preference; `of_validity`: they may explain an invalid estimate."""
-
-    topics: tuple[str, ...]
-    of_validity: bool = True
-
-
-EVIDENCE: Final[Mapping[str, Evidence]] = {
-    "GPS": Evidence(("vehicle_gps_position", "sensor_gps")),
-    "barometer": Evidence(("vehicle_air_data",), of_validity=False),
-    "estimator flags": Evidence(("estimator_status_flags",)), "vehicle status": Evidence(("vehicle_status",)),
-    "failsafe flags": Evidence(("failsafe_flags",)), "battery": Evidence(("battery_status",), of_validity=False),
+EVIDENCE: Final[Mapping[str, tuple[str, ...]]] = {
+    "GPS": ("vehicle_gps_position", "sensor_gps"), "barometer": ("vehicle_air_data",),
+    "estimator flags": ("estimator_status_flags",), "vehicle status": ("vehicle_status",),
+    "failsafe flags": ("failsafe_flags",), "battery": ("battery_status",),
 }  # fmt: skip
-"""What a verdict rests on besides the position, by its name in events; each needs one of its topics."""
+"""What a verdict rests on besides the position, with its topics in order of preference, one of which suffices."""
 
 RECENT: Final = 60.0
 """Seconds for which a single event affects the state of a vehicle."""
 
 MAX_SILENCE: Final = 3.0  # s without a position after which a vehicle is silent, if the state of its stream is unknown
-SILENT_INTERVALS: Final = 3.0  # usual intervals without a message, and at least MAX_SILENCE, until EVIDENCE is missing
 MIN_FIX_TYPE: Final = 3  # SensorGps.FIX_TYPE_3D
 FEW_SATELLITES: Final = 6  # the condition begins below this (PX4's EKF2_REQ_NSATS) and ends at ENOUGH_SATELLITES
 ENOUGH_SATELLITES: Final = 7

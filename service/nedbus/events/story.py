@@ -13,6 +13,7 @@ from .times import Times
 
 TOGETHER: Final = 1.0  # s; maximum time between the starts of conditions of one story
 _INVALID: Final = " not valid"
+_UNNEEDED: Final = ("barometer", "battery")  # EVIDENCE that does not explain an invalid estimate
 _SENSOR_FAILURE: Final = re.compile(r"#\d+ fail(ed|ure):")  # PX4's "MAG #0 failed: STALE!", and its event for it
 
 
@@ -196,7 +197,7 @@ def _make_story(
     after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
     lacking: list[str] = []
     if span.is_of_estimate and span.severity != "info":
-        needed = (each.topics for each in EVIDENCE.values() if each.of_validity)
+        needed = (each for name, each in EVIDENCE.items() if name not in _UNNEEDED)
         lacking = [each[0] for each in needed if set(each).isdisjoint(topics)]
     return Story(
         tuple(group), what, span.since, until, None if span.initial else span.begin, end, tuple(before),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median
@@ -18,17 +18,7 @@ from .detectors import ChangeDetector, Fields, Finding
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS
 from .position import PositionDetector
-from .rules import (
-    EVIDENCE,
-    FLAPPING_CHANGES,
-    MAX_BURST,
-    MAX_SILENCE,
-    MAX_SINGLE,
-    PAUSE,
-    POSITIONS,
-    RECENT,
-    SILENT_INTERVALS,
-)
+from .rules import EVIDENCE, FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
 from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
@@ -36,12 +26,13 @@ _REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smal
 _MAX_PAUSE: Final = 2_000_000  # us between positions, after which missing EVIDENCE is timed anew
 _REPLACED: Final = 1_000_000  # us for another topic to replace missing EVIDENCE, such as sensor_gps
 _MIN_STEPS: Final = 3  # intervals until the usual one of EVIDENCE is known
+_INTERVALS: Final = 3  # usual intervals after which EVIDENCE is late
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference; conditions come from the best one received.
-_GROUPS: Final = (POSITIONS, *(each.topics for each in EVIDENCE.values() if len(each.topics) > 1))
-_EVIDENCE_OF: Final = {topic: name for name, each in EVIDENCE.items() for topic in each.topics}
+_GROUPS: Final = (POSITIONS, EVIDENCE["GPS"])
+_EVIDENCE_OF: Final = {topic: name for name, topics in EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = detectors.FieldReader(_SAMPLE)
 
@@ -193,22 +184,22 @@ class Vehicle:
             self._resumed = now
         self._checked = now
         for name, supply in self._supplies.items():
-            newest = supply.update()
-            age = now - max(newest, self._resumed) if newest else 0
-            was_late, supply.is_late = supply.is_late, len(supply.steps) >= _MIN_STEPS and age > supply.limit
+            newest, limit = supply.update()
+            age, was_late = now - max(newest, self._resumed) if newest else 0, supply.is_late
+            supply.is_late = age > limit
             if ("no_messages", name) in self.conditions:
                 resumed += [name] * (not supply.is_late)
             elif supply.is_late and not was_late:  # another topic may replace it
                 self._detectors = {each: found for each, found in self._detectors.items() if found}
-            elif supply.is_late and age > supply.limit + _REPLACED:
+            elif age > limit + _REPLACED:
                 silent[name] = newest
-        if silent:
-            since = self._main_time - (now - min(silent.values())) / 1e6
-            text = KINDS["no_messages"].begin.format(", ".join(silent))
-            self.emit(Finding("no_messages", "begin", text, tuple(silent)), "", since)
-        if resumed:
-            text = KINDS["no_messages"].end.format(", ".join(resumed))
-            self.emit(Finding("no_messages", "end", text, tuple(resumed)), "", self._main_time)
+        since = self._main_time - (now - min(silent.values(), default=now)) / 1e6
+        changes: dict[detectors.Change, Collection[str]] = {"begin": silent, "end": resumed}
+        for change, names in changes.items():
+            if names:
+                text = getattr(KINDS["no_messages"], change).format(", ".join(names))
+                time = self._main_time if change == "end" else since
+                self.emit(Finding("no_messages", change, text, tuple(names)), "", time)
 
     def state(self, time: float) -> State:
         """Return the current state, set by active and flapping conditions and single events of the last minute."""
@@ -396,23 +387,18 @@ class _Burst:
 
 @dataclass(slots=True)
 class _Supply:
-    """Messages of one entry of EVIDENCE; `newest`: PX4's time of the last one [us], 0 if there is none since boot."""
+    """Messages of one entry of EVIDENCE; `is_late`: another topic may replace the one in use."""
 
     detectors: dict[Address, ChangeDetector] = field(default_factory=dict)
     steps: deque[int] = field(default_factory=lambda: deque(maxlen=9))  # us between two messages, sampled
     newest: int = 0
     is_late: bool = False
 
-    @property
-    def limit(self) -> float:
-        """Time without a message until it is late [us]."""
-        return max(1e6 * MAX_SILENCE, SILENT_INTERVALS * median(self.steps))
-
-    def update(self) -> int:
-        """Update and return `newest`."""
+    def update(self) -> tuple[int, float]:
+        """Return PX4's time of the last message, 0 if none since boot, and the time until the next is late [us]."""
         last = max(self.detectors.values(), key=lambda each: max(each.stamp, each.earlier))
-        newest = max(last.stamp, last.earlier)
-        if newest != self.newest and last.stamp > last.earlier > 0:
+        before, self.newest = self.newest, max(last.stamp, last.earlier)
+        if self.newest != before and last.stamp > last.earlier > 0:
             self.steps.append(last.stamp - last.earlier)
-        self.newest = newest
-        return newest
+        is_known = len(self.steps) >= _MIN_STEPS
+        return self.newest, max(1e6 * MAX_SILENCE, _INTERVALS * median(self.steps)) if is_known else math.inf
