@@ -144,6 +144,7 @@ class StreamHealth:
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
+        self._earlier = 0  # PX4's time before the last one
         self._steps = deque[int](maxlen=_USUAL)  # us between two messages
         self._usual_step = 0.0  # their median, updated every _USUAL messages and at a gap
         self._intervals = deque[float](maxlen=_USUAL)  # s between arrivals
@@ -238,6 +239,10 @@ class StreamHealth:
     def _add_time(self, timestamp: int) -> bool:
         """Track PX4's time; return True for the first timestamp, and for one so far back that it means a reboot."""
         step = None if self._time is None else timestamp - self._time
+        if step is not None and step < -_REBOOT_STEP and 0 < timestamp - self._earlier <= _REBOOT_STEP:
+            self._out_of_order, self._time = self._out_of_order + 1, timestamp  # only the time of the last was wild
+            return False
+        self._earlier = self._time or 0
         if step is None or step < -_REBOOT_STEP:
             self._reboots += step is not None and self._topic.name != _QUEUED
             self._time, self._usual_step = timestamp, 0.0

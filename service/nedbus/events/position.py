@@ -108,8 +108,8 @@ class PositionDetector(ChangeDetector):
         jump, self._jump = self._jump, step
         if jump is not None and step is not None:
             self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
-        elif jump is not None:
-            distance, seconds = math.hypot(*jump[1:]), self.stamp / 1e6 - jump[0]
+        elif jump is not None and (distance := math.hypot(*jump[1:])) > JUMP_DISTANCE:  # else one message was wild
+            seconds = self.stamp / 1e6 - jump[0]
             text = f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
             yield Finding("jump", "once", text, numbers=numbers)

@@ -86,7 +86,7 @@ class Vehicle:
         except KeyError:
             if len(self._detectors) >= _MAX_STREAMS:
                 return
-            detector = self._detectors[address] = self._open_tracked(address)
+            detector = self._detectors[address] = self._open(address)
         if detector is None or time < detector.due:
             return
         if detector.pause:
@@ -269,13 +269,6 @@ class Vehicle:
         if len(burst.topics) < _MAX_TOPICS:
             burst.topics.add(topic)
 
-    def _open_tracked(self, address: Address) -> ChangeDetector | None:
-        """Return the detector of a new stream as `_open` does, and track its messages if they are EVIDENCE."""
-        detector = self._open(address)
-        if detector is not None and address.topic in _EVIDENCE_OF:
-            self._supplies.setdefault(_EVIDENCE_OF[address.topic], _Supply()).detectors[address] = detector
-        return detector
-
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream; None if it has no events, or a preferred stream is in use."""
         self.topics.add(address.topic)
@@ -303,12 +296,14 @@ class Vehicle:
             self.main, self._position = address, PositionDetector()
             return self._position
         own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
-        if topic in REFERENCES:
-            return ReferenceDetector(topic, self._comparison, own)
         if own is not None and topic == _EKF:
             own = *own[:2], partial(self._detect_flags, instance, own[2])
-        detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
-        return None if own is None else detector(*own)
+        kind = detectors.TextDetector if topic == "log_message" else ChangeDetector
+        is_reference = topic in REFERENCES
+        found = ReferenceDetector(topic, self._comparison, own) if is_reference else kind(*own) if own else None
+        if found is not None and topic in _EVIDENCE_OF:
+            self._supplies.setdefault(_EVIDENCE_OF[topic], _Supply()).detectors[address] = found
+        return found
 
     def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)

@@ -165,6 +165,14 @@ def test_lasting_change_of_the_rate_causes_few_gaps() -> None:
     assert health_at_px4_times(*clock, clock[-1] + 0.5).gaps == 9
 
 
+def test_single_wild_time_is_no_reboot() -> None:
+    """One message with a wild time counts as out of order; a time that stays back is a reboot."""
+    health = health_at_px4_times(100.0, 100.1, 999.0, 100.2, 100.3)
+    assert (health.reboots, health.out_of_order) == (0, 1)
+    health = health_at_px4_times(100.0, 100.1, 1.0, 1.1, 1.2)
+    assert (health.reboots, health.out_of_order) == (1, 0)
+
+
 def test_time_of_log_messages_reveals_no_reboot() -> None:
     """PX4 queues its log messages, so an old one among newer ones is no reboot."""
     stream = StreamHealth("log_message")

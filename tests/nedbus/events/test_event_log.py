@@ -490,6 +490,15 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
     assert flight.wait(0.1).send(x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)) == []
 
 
+def test_single_wild_position_is_no_jump(flight: Flight) -> None:
+    """One position far away among others that agree is no jump, unlike a position that stays there."""
+    flight.wait(0.1).send(x=500.0)
+    assert flight.fly(1) == []
+    for _ in range(3):
+        flight.wait(0.1).send(x=50.0)
+    assert [each.kind for each in flight.event_log.events] == ["jump"]
+
+
 @pytest.mark.parametrize(
     ("seconds", "fields", "size"),
     [
