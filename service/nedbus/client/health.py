@@ -7,10 +7,11 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
+from statistics import median
 from typing import Final, Literal, cast, get_args
 
 from nedbus import clock
@@ -26,9 +27,10 @@ StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"] 
 _log = logging.getLogger(__name__)
 
 _REBOOT_STEP: Final = 1_000_000  # us; PX4's time steps back by more in a reboot, by less if a message is out of order
-_GAP_FACTOR: Final = 3.0  # times the usual interval between PX4's timestamps; a longer interval is a gap
-_MIN_STEPS: Final = 5  # intervals before gaps are counted
-_SMOOTHING: Final = 0.05  # smoothing factor of the usual interval and the usual rate
+_FACTOR: Final = 3.0  # times the usual interval, after which there is a gap, or the stream is stale
+_MIN_STEPS: Final = 5  # intervals before the usual one is known
+_USUAL: Final = 15  # latest intervals, whose median is the usual one: half as many long ones are a lasting change
+_SMOOTHING: Final = 0.05  # smoothing factor of the usual rate
 _MAX_MEASURED: Final = 1000  # latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 _MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
@@ -37,6 +39,7 @@ _MAX_STREAMS: Final = 4096  # per monitor
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
 _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
 _ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token counts as gone
+_QUEUED: Final = "log_message"  # PX4's queue may hold old ones, so their timestamps reveal no reboot
 _FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
 
 
@@ -51,6 +54,7 @@ class Health:
     `nominal`: PX4's rate of this topic [Hz], 0 if it has none; logs and links are usually slower.
     `age`: seconds since the last message.
     `usual_rate`: smoothed rate so far [Hz]; a `rate` far below it means that the stream has become slow.
+    `usual_interval`: median of the latest 15 arrival intervals [s], None before the fifth.
     `on_change`: published on change only, so pauses and bursts are normal.
     For messages other than positions, `resets` is empty and flags are None.
     """
@@ -71,15 +75,14 @@ class Health:
     usual_rate: float | None = None
     resets: dict[Quantity, int] = field(default_factory=dict)
     on_change: bool = False
+    usual_interval: float | None = None
 
     @property
     def stale_after(self) -> float:
-        """Seconds without a message until this stream is stale: at least 3, infinity if it may pause indefinitely."""
-        if self.on_change:
-            return max(TIMINGS.stale, 2 / self.nominal) if self.nominal else math.inf
-        if not self.nominal and (self.usual_rate or 0) < _MIN_PERIODIC_RATE:
+        """Seconds without a message until this stream is stale: 3 intervals, at least 3 s; infinity if it may pause."""
+        if not self.nominal and (self.on_change or (self.usual_rate or 0) < _MIN_PERIODIC_RATE):
             return math.inf
-        return max(TIMINGS.stale, 2 / self.usual_rate) if self.usual_rate else TIMINGS.stale
+        return max(TIMINGS.stale, _FACTOR * (self.usual_interval or 0.0))
 
 
 _FlagCounts = Counter[tuple[str, bool]]  # messages by flag and value; unknown values are not counted
@@ -152,11 +155,14 @@ class StreamHealth:
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
-        self._usual_step = 0.0  # us between two messages
+        self._earlier = 0  # PX4's time before the last one
+        self._steps = deque[int](maxlen=_USUAL)  # us between two messages
+        self._usual_step = 0.0  # their median, updated every _USUAL messages and at a gap
+        self._intervals = deque[float](maxlen=_USUAL)  # s between arrivals
         self._usual_rate: float | None = None
-        self._steps = 0
         self._flags: _FlagCounts = Counter()
-        self._counters: tuple[int, ...] = ()
+        self._seen: tuple[Sequence[int], Collection[str]] = (), ()  # counters of the last message, and missing fields
+        self._counters: dict[Quantity, int] = {}  # the last known ones
         self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
         self.latencies = Histogram(_LATENCY_BUCKETS)
         self._window = self._last_window = _Window(0)
@@ -174,7 +180,7 @@ class StreamHealth:
         names = _FIELDS if self._is_position else _FIELDS[:1]
         if isinstance(message, Mapping):
             timestamp, *seen = (cast("int", message.get(name, 0)) for name in names)
-            missing = DOUBT_FLAGS - message.keys() if self._is_position else ()
+            missing = set(names) - message.keys() if self._is_position else ()
         else:
             timestamp, *seen = (getattr(message, name) for name in names)
         window = self._window
@@ -189,14 +195,18 @@ class StreamHealth:
         self._lost += lost
         window.messages += 1
         if self._received is not None:
-            window.add_interval((received - self._received) / 1e9)
+            interval = (received - self._received) / 1e9
+            window.add_interval(interval)
+            self._intervals.append(interval)
         self._received = received
-        rebooted, counters = self._add_time(int(timestamp)), tuple(seen[len(DOUBT_FLAGS) :])
-        if counters != self._counters:
-            if self._counters and not rebooted:  # a reboot restarts the counters, which are uint8
-                for quantity, before, after in zip(self._resets, self._counters, counters, strict=True):
-                    self._resets[quantity] += (after - before) % 256
-            self._counters = counters
+        rebooted, counters = self._add_time(int(timestamp)), seen[len(DOUBT_FLAGS) :]
+        if rebooted or (counters, missing) != self._seen:
+            self._seen, known = (counters, missing), {} if rebooted else self._counters  # a reboot restarts them
+            for (quantity, name), count in zip(RESET_COUNTERS.items(), counters, strict=False):
+                if name not in missing:
+                    self._resets[quantity] += (count - known.get(quantity, count)) % 256
+                    known[quantity] = count
+            self._counters = known
         if latency is not None:
             window.add_latency(latency)
             self.latencies.add(latency)
@@ -204,6 +214,11 @@ class StreamHealth:
             if flag not in missing:
                 window.flags[flag, bool(is_set)] += 1
                 self._flags[flag, bool(is_set)] += 1
+
+    @property
+    def usual_interval(self) -> float | None:
+        """As in Health."""
+        return median(self._intervals) if len(self._intervals) >= _MIN_STEPS else None
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
@@ -229,24 +244,30 @@ class StreamHealth:
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,
+            usual_interval=self.usual_interval,
         )
 
     def _add_time(self, timestamp: int) -> bool:
         """Track PX4's time; return True for the first timestamp, and for one so far back that it means a reboot."""
         step = None if self._time is None else timestamp - self._time
+        if step is not None and step < -_REBOOT_STEP and 0 < timestamp - self._earlier <= _REBOOT_STEP:
+            self._out_of_order, self._time = self._out_of_order + 1, timestamp  # only the time of the last was wild
+            return False
+        self._earlier = self._time or 0
         if step is None or step < -_REBOOT_STEP:
-            self._reboots += step is not None
-            self._time, self._steps = timestamp, 0
+            self._reboots += step is not None and self._topic.name != _QUEUED
+            self._time, self._usual_step = timestamp, 0.0
+            self._steps.clear()
             return True
         if step < 0:
             self._out_of_order += 1
             return False
         self._time = timestamp
-        if self._steps >= _MIN_STEPS and step > _GAP_FACTOR * self._usual_step:
-            self._gaps += not self._topic.on_change
-        else:
-            self._steps += 1
-            self._usual_step += max(_SMOOTHING, 1 / self._steps) * (step - self._usual_step)
+        is_gap = len(self._steps) >= _MIN_STEPS and step > _FACTOR * self._usual_step > 0
+        self._gaps += is_gap and not self._topic.on_change
+        self._steps.append(step)
+        if is_gap or len(self._steps) < _USUAL or self._messages % _USUAL == 0:
+            self._usual_step = median(self._steps)
         return False
 
 

@@ -23,6 +23,7 @@ _MAX_ADDRESSES: Final = 1000  # published and stale addresses of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one per origin (`where`)
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
+_UNSETTLED: Final = 60.0  # s after which a stream that was stale counts as stable again
 _MAX_RULES: Final = 50  # rules with a separate counter
 _NO_MESSAGE: Final = "input that is no message"
 TOO_MANY: Final = "too many addresses"
@@ -39,6 +40,13 @@ class _Stream:
     publisher: Publisher | None = None
     last_received: float | None = None
     last: SourceMessage | None = None
+    settled: float = 0.0  # a stream that is stale again before then flaps, which is logged once
+    flaps: int = 0
+
+    @property
+    def patience(self) -> float:
+        """Seconds without a message until the stream is stale."""
+        return max(TIMINGS.stale, 3 * (self.health.usual_interval or 0.0))
 
 
 class SourceOutput:
@@ -167,33 +175,39 @@ class SourceOutput:
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
-            text = f"{address} is published{' again' if resumed else ''}"
-            event = "stream_resumed" if resumed else "published"
-            _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
-            self._republish_retained(message)
             stream = self._streams[address]
+            if not stream.flaps:
+                text = f"{address} is published{' again' if resumed else ''}"
+                event = "stream_resumed" if resumed else "published"
+                _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
+            self._republish_retained(message)
         stream.last_received, stream.last = self._now(), message
         self.publish(message)
 
     def expire_stale(self) -> bool:
-        """Stop publishing live addresses without a message for 3 s; return True if any address is still published.
+        """Stop publishing stale live addresses; return True if any address is still published.
 
-        Topics without a rate stay published while other messages of their vehicle arrive.
+        An address is stale after 3 s without a message, or three of its usual intervals if that is longer. Topics
+        without a rate stay published while other messages of their vehicle arrive.
         """
         now = self._now()
         fresh = {
             address
             for address, stream in self._streams.items()
-            if stream.last_received is not None and now - stream.last_received < TIMINGS.stale
+            if stream.last_received is not None and now - stream.last_received < stream.patience
         }
         vehicles = {address.vehicle for address in fresh}
         fresh |= {each for each in self._streams if each.vehicle in vehicles and not get_topic(each.topic).rate}
-        for address in self.addresses:
-            if address not in fresh:
-                text = f"{address} is stale: no message for {TIMINGS.stale:.0f} s"
+        for address in [each for each in self.addresses if each not in fresh]:
+            stream = self._streams[address]
+            stream.flaps, stream.settled = stream.flaps + 1 if now < stream.settled else 0, now + _UNSETTLED
+            if stream.flaps < 2:
+                text = f"{address} is stale: no message for {now - (stream.last_received or 0.0):.0f} s"
+                text += f"; it flaps, logged again once stable for {_UNSETTLED:.0f} s" * stream.flaps
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
+            stream.flaps *= now < stream.settled
             is_known = address.vehicle in self._event_log.vehicles and stream.last_received is not None
             if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]

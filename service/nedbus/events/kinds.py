@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
-from .rules import FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, REJECTED
+from .rules import EVIDENCE, FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, REJECTED
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
@@ -63,8 +63,8 @@ _FLAGS: Final = "EstimatorStatusFlags"
 _GPS: Final = "SensorGps"
 _JAMMED: Final = ("jamming", "spoofing")
 _SENSING: Final = (
-    "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided", "innovation_rejected",
-    "estimator_fault", "ekf_changed",
+    "no_messages", "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided",
+    "innovation_rejected", "estimator_fault", "ekf_changed",
 )  # fmt: skip
 _CONTRADICTED: Final = ("height_contradicted", "position_contradicted")
 _INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning", *_CONTRADICTED)
@@ -113,7 +113,12 @@ _ROWS: Final = (
         "estimator_fault", "watch", _FLAGS, ("text",), flags=FAULTS, initial=True, begin="EKF fault: {}",
         end="EKF fault cleared: {}",
     ),
+    Kind("text", "watch", "LogMessage", row="PX4", phase=True, stateless=True),
     Kind("ekf_changed", "watch", causes=("text", "estimator_fault", "innovation_rejected"), on_ground="info"),
+    Kind(
+        "no_messages", "watch", causes=("text", "link_down"), on_ground="info", flags={name: name for name in EVIDENCE},
+        begin="no {} message", end="{} messages resumed",
+    ),
     Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites"), once_armed=True),
     Kind("few_satellites", "watch", _GPS, _JAMMED),
     Kind("jamming", "watch", _GPS, ("text",)),
@@ -125,7 +130,8 @@ _ROWS: Final = (
     ),
     Kind(
         "not_fused", "watch", _FLAGS,
-        ("gps_fix_lost", "few_satellites", *_JAMMED, "innovation_rejected", "estimator_fault"), on_ground="info",
+        ("no_messages", "gps_fix_lost", "few_satellites", *_JAMMED, "innovation_rejected", "estimator_fault"),
+        on_ground="info",
         flags=FUSED, bad=False, minor=frozenset(HEIGHTS), begin="EKF stopped fusing {}", end="EKF started fusing {}",
     ),
     _not_global("xy"),
@@ -149,7 +155,6 @@ _ROWS: Final = (
     Kind("lost", "watch", causes=("link_down", "overload")),
     Kind("rejected", "watch", kept_on_reboot=True),
     Kind("overload", "watch"),
-    Kind("text", "watch", "LogMessage", row="PX4", phase=True, stateless=True),
     Kind(
         "heading_not_good", "info", _ESTIMATE, (*_SENSING, "reset", "landed"),
         flags={"heading_good_for_control": "heading"}, bad=False, begin="heading not good for control",

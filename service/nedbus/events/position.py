@@ -19,6 +19,7 @@ _COMPARED: Final = (
 )  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; smaller steps are never jumps
 _MAX_INTERVAL: Final = 0.5  # s between messages; longer intervals are not checked for jumps
+_MAX_MOTION: Final = 3.0  # s for which the rates at both ends determine the motion well enough to find a reset's step
 _SURE_INTERVAL: Final = 0.1  # s; over longer intervals, the rates at both ends do not determine the motion accurately
 # By quantity with a reset counter: its fields, rates of change of each field, names in the event's `numbers`, text.
 _Quantity = tuple[tuple[str, ...], tuple[tuple[str, ...], ...], tuple[str, ...], str]
@@ -79,11 +80,12 @@ class PositionDetector(ChangeDetector):
     def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
         if before:
             earlier, values = (
-                {name: _CONTEXT.get(name, 0) if value is None else value for name, value in fields.items()}
+                {name: _CONTEXT.get(name) if value is None else value for name, value in fields.items()}
                 for fields in (before, after)
             )
             yield from _detect_origin(earlier, values)
-            quantities = [name for name in _RESETS if earlier[RESET_COUNTERS[name]] != values[RESET_COUNTERS[name]]]
+            counts = [(name, [each[RESET_COUNTERS[name]] for each in (earlier, values)]) for name in _RESETS]
+            quantities = [name for name, each in counts if None not in each and each[0] != each[1]]
             if quantities:
                 yield _reset(quantities, earlier, values)
             is_same_origin = all(str(earlier[name]) == str(values[name]) for name in _ORIGIN)  # NaN equals NaN
@@ -106,8 +108,8 @@ class PositionDetector(ChangeDetector):
         jump, self._jump = self._jump, step
         if jump is not None and step is not None:
             self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
-        elif jump is not None:
-            distance, seconds = math.hypot(*jump[1:]), self.stamp / 1e6 - jump[0]
+        elif jump is not None and (distance := math.hypot(*jump[1:])) > JUMP_DISTANCE:  # else one message was wild
+            seconds = self.stamp / 1e6 - jump[0]
             text = f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
             yield Finding("jump", "once", text, numbers=numbers)
@@ -145,10 +147,8 @@ def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float
     if not all(map(math.isfinite, observed)):
         return reported if is_reported else None
     # The velocity changed at an unknown time in between, and vz need not be the rate of z: allow for every rate.
-    motions = [
-        [rate * seconds for of in names for rate in (before[of], after[of]) if math.isfinite(rate)] or [0.0]
-        for names in rates
-    ]
+    known = [[rate for of in names for rate in (before[of], after[of]) if math.isfinite(rate)] for names in rates]
+    motions = [[rate * seconds for rate in each] or [0.0] for each in known]
     margin = SMALL_RESET * max(1.0, seconds / _SURE_INTERVAL)
     if is_reported and all(
         min(0.0, *motion) - margin <= step - size <= max(0.0, *motion) + margin
@@ -156,13 +156,13 @@ def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float
     ):
         return reported
     steps = tuple(step - sum(motion[:2]) / len(motion[:2]) for step, motion in zip(observed, motions, strict=True))
-    return steps if is_reported or 0 < seconds <= _MAX_INTERVAL else None
+    return steps if is_reported or 0 < seconds <= (_MAX_MOTION if all(known) else _MAX_INTERVAL) else None
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield an origin that was set or moved; a change of `ref_timestamp` alone is ignored."""
+    """Yield an origin that was set or moved; one that was not provided before, and `ref_timestamp`, are ignored."""
     had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
-    if has and not had:
+    if has and not had and before["xy_global"] is not None:
         text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
         yield Finding("origin_set", "once", text, numbers={"latitude": after["ref_lat"], "longitude": after["ref_lon"]})
     elif has and had:

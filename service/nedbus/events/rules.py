@@ -54,6 +54,13 @@ FAILSAFE_FLAGS: Final[Mapping[str, str]] = {
 POSITIONS: Final = ("vehicle_local_position", "external_ins_local_position", "estimator_local_position")
 """Topics with position validity flags, in order of preference."""
 
+EVIDENCE: Final[Mapping[str, tuple[str, ...]]] = {
+    "GPS": ("vehicle_gps_position", "sensor_gps"), "barometer": ("vehicle_air_data",),
+    "estimator flags": ("estimator_status_flags",), "vehicle status": ("vehicle_status",),
+    "failsafe flags": ("failsafe_flags",), "battery": ("battery_status",),
+}  # fmt: skip
+"""What a verdict rests on besides the position, with its topics in order of preference, one of which suffices."""
+
 RECENT: Final = 60.0
 """Seconds for which a single event affects the state of a vehicle."""
 

@@ -1,20 +1,20 @@
 """Stories for `nedbus why`: each fault with its period, evidence, and missing topics that may hold more evidence."""
 
 import math
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, importance
-from .rules import RECENT
+from .rules import EVIDENCE, RECENT
 from .times import Times
 
 TOGETHER: Final = 1.0  # s; maximum time between the starts of conditions of one story
 _INVALID: Final = " not valid"
-_GPS: Final = "vehicle_gps_position"
-_EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
-"""Topics that may explain an invalid estimate."""
+_UNNEEDED: Final = ("barometer", "battery")  # EVIDENCE that does not explain an invalid estimate
+_SENSOR_FAILURE: Final = re.compile(r"#\d+ fail(ed|ure):")  # PX4's "MAG #0 failed: STALE!", and its event for it
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +23,11 @@ class Span(Condition):
 
     until: float | None = None
     end: Event | None = None
+
+    @property
+    def is_of_estimate(self) -> bool:
+        """True if it is a fault of the position estimate."""
+        return KINDS[self.kind].message == "VehicleLocalPosition"
 
     def holds(self, time: float) -> bool:
         """Return True if the condition is active at `time`, or the single event is recent."""
@@ -57,9 +62,17 @@ class Story:
         """True if any of its conditions is bad."""
         return any(each.severity == "bad" for each in self.spans)
 
+    def has_ended(self, now: float) -> bool:
+        """Return True if it is over, and not a single event of the last minute."""
+        return not any(span.holds(now) for span in self.spans)
+
     def when(self, times: Times, now: float) -> str:
         """Format the period of the fault; `now`: the current time, or the end of the file."""
-        return times.period(self.begin, self.end, (now if self.until is None else self.until) - self.since)
+        begin = self.begin
+        if begin is not None and begin.time != self.since:  # silence is detected later
+            boot = None if begin.boot is None else begin.boot - (begin.time - self.since)
+            begin = replace(begin, time=self.since, boot=boot)
+        return times.period(begin, self.end, (now if self.until is None else self.until) - self.since)
 
 
 def stories_of(
@@ -79,6 +92,7 @@ def stories_of(
     if not any(span.until is None if at is None else span.holds(at) for span in chosen):
         others = [s for s in spans if s.severity != "info" and not (KINDS[s.kind].fault or KINDS[s.kind].stateless)]
         chosen += [s for s in others if s.until is None] if chosen and at is None else others
+    chosen += [replace(span, severity="watch") for span in spans if _is_alarm(span.begin)]
     stories: list[Story] = []
     while chosen:
         group = _together(chosen[0], chosen)
@@ -89,6 +103,12 @@ def stories_of(
         return _without_parts(stories)
     held = [story for story in stories if story.since <= at and (story.until is None or at <= story.until)]
     return held or [story for story in stories if story.since <= at][-1:] or stories[:1]
+
+
+def _is_alarm(event: Event) -> bool:
+    """Return True for PX4's text about a failed sensor, or of severity critical and worse while armed."""
+    is_critical = event.severity == "bad" and "armed" in event.numbers
+    return event.kind == "text" and (is_critical or _SENSOR_FAILURE.search(event.text) is not None)
 
 
 def story_of(
@@ -155,7 +175,7 @@ def _make_story(
     span = group[0]
     until = None if any(each.until is None for each in group) else max(each.until or 0.0 for each in group)
     end = next((each.end for each in group if each.end is not None and each.until == until), None)
-    what = "; ".join(dict.fromkeys(each.text for each in group))
+    what = "; ".join(dict.fromkeys(each.begin.words if each.kind == "text" else each.text for each in group))
     if all(each.text.endswith(_INVALID) for each in group):
         what = what.replace(f"{_INVALID}; ", " and ")
     used = {event for each in group for event in (each.begin, each.end) if event is not None}
@@ -176,9 +196,9 @@ def _make_story(
     stop = math.inf if until is None else until
     after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
     lacking: list[str] = []
-    if KINDS[span.kind].message == "VehicleLocalPosition" and span.severity != "info":
-        known = {*topics, *([_GPS] if "sensor_gps" in topics else [])}
-        lacking = [each for each in _EVIDENCE if each not in known]
+    if span.is_of_estimate and span.severity != "info":
+        needed = (each for name, each in EVIDENCE.items() if name not in _UNNEEDED)
+        lacking = [each[0] for each in needed if set(each).isdisjoint(topics)]
     return Story(
         tuple(group), what, span.since, until, None if span.initial else span.begin, end, tuple(before),
         tuple(each for each in notable if span.since <= each.time < stop), tuple(after), tuple(lacking),
@@ -196,13 +216,14 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _is_part(story: Story, of: Story) -> bool:
-    """Return True if a story is part of another one; a bad story that is more important or lasts longer is not."""
+    """Return True if a story is part of a bad one; not if it is still active, or bad and more important or longer."""
     begin, kind = story.spans[0].begin, story.spans[0].kind
     if not of.is_bad or begin not in (*of.before, *of.meanwhile, *of.after):
         return False
-    is_estimate = KINDS[kind].message == "VehicleLocalPosition"
-    outlasts = of.until is not None and (story.until is None or (is_estimate and story.until > of.until + TOGETHER))
-    return not (story.is_bad and (outlasts or importance(kind) < importance(of.spans[0].kind)))
+    is_bad_estimate = story.is_bad and story.spans[0].is_of_estimate
+    outlasts = of.until is not None and (story.until is None or (is_bad_estimate and story.until > of.until + TOGETHER))
+    is_worse = story.is_bad and importance(kind) < importance(of.spans[0].kind)
+    return not (outlasts or is_worse)
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:

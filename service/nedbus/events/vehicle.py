@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
+from statistics import median
 from typing import Final
 
 from nedbus_msgs import BY_TOPIC, Address
@@ -17,16 +18,21 @@ from .detectors import ChangeDetector, Fields, Finding
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS
 from .position import PositionDetector
-from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
+from .rules import EVIDENCE, FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
 from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
 _REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
+_MAX_PAUSE: Final = 2_000_000  # us between positions, after which missing EVIDENCE is timed anew
+_REPLACED: Final = 1_000_000  # us for another topic to replace missing EVIDENCE, such as sensor_gps
+_MIN_STEPS: Final = 3  # intervals until the usual one of EVIDENCE is known
+_INTERVALS: Final = 3  # usual intervals after which EVIDENCE is late
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference; conditions come from the best one received.
-_GROUPS: Final = (POSITIONS, ("vehicle_gps_position", "sensor_gps"))
+_GROUPS: Final = (POSITIONS, EVIDENCE["GPS"])
+_EVIDENCE_OF: Final = {topic: name for name, topics in EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = detectors.FieldReader(_SAMPLE)
 
@@ -67,6 +73,8 @@ class Vehicle:
         self._ekf = 0  # instance of the primary EKF
         self._position: PositionDetector | None = None  # of `main`
         self._comparison = Comparison(lambda: self._position)
+        self._supplies: dict[str, _Supply] = {}  # by key of EVIDENCE
+        self._checked = self._resumed = 0  # time of the last position then, and after its last pause [us since boot]
         self._equal: dict[int, bool] = {}  # by EKF: whether its estimate equals the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
@@ -149,6 +157,7 @@ class Vehicle:
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
         """Update from the state of the position stream ("stale", "gone", "duplicate", ...), None if not observed."""
         self.settle(time)
+        self._check_supplies()
         if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
             several = f"several publishers of {stream}: readers receive a mixture of their messages"
@@ -165,6 +174,32 @@ class Vehicle:
         age = max(0.0, time - since)
         text = f"silent: no {stream} for {age:.1f} s" if silent == "silent" else f"gone: no publisher of {stream}"
         self.emit(Finding(silent, "begin", text, numbers={"age": age}), stream, time, changed=since)
+
+    def _check_supplies(self) -> None:
+        """Report EVIDENCE whose messages stopped while positions arrive, and those that resumed, by PX4's time."""
+        if self._position is None:
+            return
+        now, silent, resumed = min(self._position.stamp, self._position.earlier), dict[str, int](), list[str]()
+        if not 0 <= now - self._checked <= _MAX_PAUSE:  # positions resume: other messages may follow them
+            self._resumed = now
+        self._checked = now
+        for name, supply in self._supplies.items():
+            newest, limit = supply.update()
+            age, was_late = now - max(newest, self._resumed) if newest else 0, supply.is_late
+            supply.is_late = age > limit
+            if ("no_messages", name) in self.conditions:
+                resumed += [name] * (not supply.is_late)
+            elif supply.is_late and not was_late:  # another topic may replace it
+                self._detectors = {each: found for each, found in self._detectors.items() if found}
+            elif age > limit + _REPLACED:
+                silent[name] = newest
+        since = self._main_time - (now - min(silent.values(), default=now)) / 1e6
+        changes: dict[detectors.Change, Collection[str]] = {"begin": silent, "end": resumed}
+        for change, names in changes.items():
+            if names:
+                text = getattr(KINDS["no_messages"], change).format(", ".join(names))
+                time = self._main_time if change == "end" else since
+                self.emit(Finding("no_messages", change, text, tuple(names)), "", time)
 
     def state(self, time: float) -> State:
         """Return the current state, set by active and flapping conditions and single events of the last minute."""
@@ -204,8 +239,9 @@ class Vehicle:
             elif kind.first:
                 text = kind.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
+        numbers = {**found.numbers, "armed": 1} if self.armed and found.kind == "text" else found.numbers
         event = Event(
-            self.name, found.kind, found.change, severity, text, time, boot, topic, found.numbers, found.names, lasted
+            self.name, found.kind, found.change, severity, text, time, boot, topic, numbers, found.names, lasted
         )
         if found.change == "begin":
             condition = Condition(found.kind, in_air, text, changed, event, found.initial)
@@ -246,7 +282,9 @@ class Vehicle:
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.setdefault(group, address)
-            if min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0)) != address:
+            best = min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0))
+            supply = self._supplies.get(_EVIDENCE_OF.get(topic, ""))
+            if best != address and not (supply and supply.is_late):
                 is_sought = topic == POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
@@ -258,12 +296,14 @@ class Vehicle:
             self.main, self._position = address, PositionDetector()
             return self._position
         own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
-        if topic in REFERENCES:
-            return ReferenceDetector(topic, self._comparison, own)
         if own is not None and topic == _EKF:
             own = *own[:2], partial(self._detect_flags, instance, own[2])
-        detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
-        return None if own is None else detector(*own)
+        kind = detectors.TextDetector if topic == "log_message" else ChangeDetector
+        is_reference = topic in REFERENCES
+        found = ReferenceDetector(topic, self._comparison, own) if is_reference else kind(*own) if own else None
+        if found is not None and topic in _EVIDENCE_OF:
+            self._supplies.setdefault(_EVIDENCE_OF[topic], _Supply()).detectors[address] = found
+        return found
 
     def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
@@ -338,3 +378,22 @@ class _Burst:
     end: float
     count: int = 0
     topics: set[str] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class _Supply:
+    """Messages of one entry of EVIDENCE; `is_late`: another topic may replace the one in use."""
+
+    detectors: dict[Address, ChangeDetector] = field(default_factory=dict)
+    steps: deque[int] = field(default_factory=lambda: deque(maxlen=9))  # us between two messages, sampled
+    newest: int = 0
+    is_late: bool = False
+
+    def update(self) -> tuple[int, float]:
+        """Return PX4's time of the last message, 0 if none since boot, and the time until the next is late [us]."""
+        last = max(self.detectors.values(), key=lambda each: max(each.stamp, each.earlier))
+        before, self.newest = self.newest, max(last.stamp, last.earlier)
+        if self.newest != before and last.stamp > last.earlier > 0:
+            self.steps.append(last.stamp - last.earlier)
+        is_known = len(self.steps) >= _MIN_STEPS
+        return self.newest, max(1e6 * MAX_SILENCE, _INTERVALS * median(self.steps)) if is_known else math.inf

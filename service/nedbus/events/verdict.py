@@ -57,18 +57,23 @@ def verdict_of(
     if not stories:
         length = "the services' history" if times.is_live else f"{end:.0f} s"
         return Verdict(f"no faults in {length}{'' if known else '; the data has no position validity'}", known)
-    ranked = sorted(stories, key=lambda story: rank(story.spans[0], story.until, is_now=times.is_live and at is None))
+    is_now = times.is_live and at is None
+    past = [story for story in stories if is_now and story.has_ended(end)]
+    ranked = sorted(stories, key=lambda story: (story in past, rank(story.spans[0], story.until, is_now=is_now)))
     worst = ranked[0]
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
-    usable = False if worst.is_bad and is_then else known
-    of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
-    head = "position valid throughout, but " if usable else "not usable: " * of_estimate
+    usable = False if worst.is_bad and worst not in past and is_then else known
+    of_estimate = [story for story in stories if story.is_bad and story.spans[0].is_of_estimate]
+    head = f"position valid {'now' if of_estimate else 'throughout'}, but " if usable else ""
+    if worst.is_bad:
+        head = ("was " * (worst in past) + "not usable: ") * (worst in of_estimate)
     head = head if is_then else "no fault at that time; nearest: "
     # Evidence: events before the fault, and PX4's log messages until a second after its start, or all of them for a bad
     # fault that was active in the first message. Texts that also appeared long before the first fault are excluded.
     said = [event for event in events if event.kind == "text"]
     earlier = {each.text for each in said if each.time < stories[0].since - WINDOW}
     late = TOGETHER if worst.begin else math.inf if worst.is_bad else -WINDOW
+    said = [event for event in said if event is not worst.begin]
     near = (e for e in said if e.severity != "info" and -WINDOW <= e.time - worst.since <= late)
     found = [each for each in near if each.text not in earlier] + [e for e in worst.before if e.kind != "text"]
     cause = tuple(sorted(found, key=lambda each: each.time))

@@ -145,6 +145,46 @@ def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, rebo
     assert health.reboots == reboots
 
 
+def test_missing_reset_counters_do_not_count_as_zero() -> None:
+    """Messages without reset counters, such as converted ones, cause no resets; those meanwhile are counted after."""
+    for missing in ("xy_reset_counter", "z_reset_counter"), ():
+        stream = StreamHealth(VLP)
+        for index, count in enumerate((3, 3, 0, 0, 3, 4)):
+            fields: dict[str, object] = {"timestamp": index * 10_000}
+            if missing:
+                values = dict.fromkeys(missing, count)
+                stream.add(message(index * 10_000, **values), received=0, missing=missing if count == 0 else ())
+            else:
+                fields |= {"xy_reset_counter": count, "z_reset_counter": count} if count else {}
+                stream.add(fields, received=0)
+        resets = stream.snapshot(0).resets
+        assert (resets["xy"], resets["z"], sum(resets.values())) == (1, 1, 2)
+
+
+def test_lasting_change_of_the_rate_causes_few_gaps() -> None:
+    """After a lasting drop of the rate, its intervals are no longer gaps once they are half of the latest 15."""
+    clock = [index * 0.02 for index in range(100)]
+    clock += [clock[-1] + index * 0.125 for index in range(1, 500)]
+    assert health_at_px4_times(*clock).gaps == 8
+    assert health_at_px4_times(*clock, clock[-1] + 0.5).gaps == 9
+
+
+def test_single_wild_time_is_no_reboot() -> None:
+    """One message with a wild time counts as out of order; a time that stays back is a reboot."""
+    health = health_at_px4_times(100.0, 100.1, 999.0, 100.2, 100.3)
+    assert (health.reboots, health.out_of_order) == (0, 1)
+    health = health_at_px4_times(100.0, 100.1, 1.0, 1.1, 1.2)
+    assert (health.reboots, health.out_of_order) == (1, 0)
+
+
+def test_time_of_log_messages_reveals_no_reboot() -> None:
+    """PX4 queues its log messages, so an old one among newer ones is no reboot."""
+    stream = StreamHealth("log_message")
+    for seconds in (40, 5, 41):
+        stream.add({"timestamp": seconds * 1_000_000}, received=0)
+    assert stream.snapshot(0).reboots == 0
+
+
 def test_flag_shares_are_fractions_of_messages() -> None:
     """`flags` and `flags_ever` are the shares of messages with a flag set, in the last second and since the start."""
     stream = StreamHealth(VLP)
@@ -187,9 +227,9 @@ def test_usual_rate_reveals_a_slow_stream() -> None:
 
 
 def test_stale_timeout_is_longer_for_slow_streams() -> None:
-    """A stream is stale after 3 s without a message, or after two usual intervals if that is longer."""
+    """A stream is stale after 3 s without a message, or after three usual intervals if that is longer."""
     assert stream_at(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
-    assert stream_at(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
+    assert stream_at(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(15.0)
 
 
 def test_rare_topic_without_nominal_rate_is_never_stale() -> None:

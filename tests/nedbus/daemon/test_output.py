@@ -152,3 +152,34 @@ def test_silent_addresses_are_logged_once_up_to_the_limit(caplog: pytest.LogCapt
         assert fake.output.unavailable.silent == names
     text = "".join(record.getMessage() for record in caplog.records)
     assert [text.count(f"v{number}/") for number in (0, 599, 999, 1000, 1799)] == [1, 1, 1, 0, 0]
+
+
+def test_slow_stream_stays_published_for_three_of_its_intervals() -> None:
+    """A stream of a message every 4 s is stale after 12 s without one, not after 3 s."""
+    fake = FakeOutput()
+    for _ in range(6):
+        fake.receive(4, HOME if fake.now else POSITION, POSITION)
+    for silence, published in ((8, True), (3, True), (2, False)):
+        fake.receive(silence)
+        assert (POSITION in fake.output.addresses) == published
+
+
+def test_flapping_stream_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """A stream that comes and goes is logged until the second time that it is stale, and again once it was stable."""
+    caplog.set_level("INFO")
+    fake = FakeOutput()
+
+    def flap() -> list[str]:
+        caplog.clear()
+        for _ in range(5):
+            fake.receive(0.5, POSITION)
+        fake.receive(4)
+        fake.receive(1, POSITION)
+        return [text.partition(" is ")[2] for text in caplog.messages]
+
+    assert flap() == ["published", "stale: no message for 4 s", "published again"]
+    assert flap()[0].startswith("stale: no message for 4 s; it flaps")
+    assert [flap(), flap()] == [[], []]
+    for _ in range(120):
+        fake.receive(0.5, POSITION)
+    assert flap() == ["stale: no message for 4 s", "published again"]

@@ -24,7 +24,7 @@ from nedbus.events import (
 from nedbus.events.event_log import MAX_GONE
 from nedbus.events.rules import FLAPPING_CHANGES, PAUSE
 from nedbus.timings import TIMINGS
-from nedbus_msgs import Address
+from nedbus_msgs import RESET_COUNTERS, Address
 from tests.flights.messages import VALID, message
 
 from .flight import ARMED, DISARMED, GOOD_GPS, POSITION, Flight
@@ -508,6 +508,15 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
     assert flight.wait(0.1).send(x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)) == []
 
 
+def test_single_wild_position_is_no_jump(flight: Flight) -> None:
+    """One position far away among others that agree is no jump, unlike a position that stays there."""
+    flight.wait(0.1).send(x=500.0)
+    assert flight.fly(1) == []
+    for _ in range(3):
+        flight.wait(0.1).send(x=50.0)
+    assert [each.kind for each in flight.event_log.events] == ["jump"]
+
+
 @pytest.mark.parametrize(
     ("seconds", "fields", "size"),
     [
@@ -524,7 +533,10 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
         ),  # delta plus motion
         (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
-        (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
+        (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
+        (2.0, {"x": 7.0, "vx": 2.0, "xy_reset_counter": 2}, "xy by 5.0 m (5.0 north, 0.0 east)"),  # minus the motion
+        (3.5, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
+        (2.0, {"heading": 3.0, "heading_reset_counter": 2}, "heading by an unknown amount"),  # its rate is unknown
         (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
         (0.1, {"vz": -3.0, "vz_reset_counter": 1, "delta_vz": -3.0}, "vz by 3.0 m/s"),
         (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
@@ -547,6 +559,17 @@ def test_reset_counter_wraps_from_255_to_0(flight: Flight) -> None:
     flight.wait(0.1).send(xy_reset_counter=255)
     wrapped = flight.wait(2.0).send(x=8.0, xy_reset_counter=0, delta_xy=(3.0, 0.0))
     assert [each.text for each in wrapped] == ["reset of xy by 3.0 m (3.0 north, 0.0 east)"]
+
+
+def test_missing_fields_are_neither_a_reset_nor_an_origin(flight: Flight) -> None:
+    """Where messages change between streamed and converted ones, missing counters and origins are no events."""
+    counters: dict[str, Any] = dict.fromkeys(RESET_COUNTERS.values(), 3)
+    flight.send(**counters)
+    reported = []
+    for _ in range(3):
+        reported += flight.wait(0.1).send(missing=[*counters, "xy_global", "z_global", "ref_lat", "ref_lon"])
+        reported += flight.wait(0.1).send(**counters)
+    assert reported == []
 
 
 def test_flapping_flag_is_reported_after_it_settles(flight: Flight) -> None:
@@ -818,3 +841,80 @@ def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
                 is_repeated = suppressed is not None and int(suppressed[1]) % 2 == 0
                 assert known is not None or is_repeated or (key not in initial and event.lasted is None)
                 initial |= {key} if known is None else set()
+
+
+def fly_with_gps(flight: Flight, seconds: float, *, rate: float = 5.0, topic: str = "vehicle_gps_position") -> None:
+    """Send positions at 10 Hz, and GPS messages at `rate` Hz, 0 for none; update twice a second."""
+    for index in range(round(10 * seconds)):
+        flight.wait(0.1).send()
+        if rate and index % round(10 / rate) == 0:
+            flight.send(topic, **GOOD_GPS)
+        if index % 5 == 0:
+            flight.update()
+
+
+def no_messages(flight: Flight) -> list[tuple[str, str, float]]:
+    found = [each for each in flight.event_log.events if each.kind == "no_messages"]
+    return [(each.change, each.text, round(flight.now - each.time)) for each in found]
+
+
+def test_gps_without_messages_is_a_condition_until_it_resumes(flight: Flight) -> None:
+    """A GPS without a message for 4 s, while positions arrive, is a condition that began at its last message."""
+    fly_with_gps(flight, 10)
+    fly_with_gps(flight, 3.5, rate=0)
+    assert no_messages(flight) == []
+    fly_with_gps(flight, 1.5, rate=0)
+    assert no_messages(flight) == [("begin", "no GPS message", 5)]
+    assert flight.kinds == ["no_messages"]
+    fly_with_gps(flight, 1)
+    assert no_messages(flight)[1][:2] == ("end", "GPS messages resumed after 5.1 s")
+    assert flight.severity == "info"
+
+
+def test_silence_of_a_topic_follows_its_rate(flight: Flight) -> None:
+    """A GPS with a message every 5 s is silent after 15 s without one, and one second for a replacement."""
+    fly_with_gps(flight, 40, rate=0.2)
+    fly_with_gps(flight, 10, rate=0)
+    assert no_messages(flight) == []
+    fly_with_gps(flight, 3, rate=0)
+    assert no_messages(flight) == [("begin", "no GPS message", 18)]
+
+
+def test_other_gps_topic_replaces_a_silent_one(flight: Flight) -> None:
+    """If `vehicle_gps_position` stops, events come from `sensor_gps`, and from the former again once it resumes."""
+    for _ in range(50):
+        flight.send("sensor_gps", instance=0, **GOOD_GPS)
+        fly_with_gps(flight, 0.2)
+    for _ in range(50):
+        fly_with_gps(flight, 0.2, topic="sensor_gps")
+    assert no_messages(flight) == []
+    assert flight.kinds == []
+    flight.new_events()
+    flight.send("sensor_gps", instance=0, **GOOD_GPS | {"fix_type": 0})
+    assert brief(flight.new_events() or flight.event_log.events[-1:]) == [("gps_fix_lost", "begin", "watch")]
+    flight.gps()
+    flight.send("sensor_gps", instance=0, **GOOD_GPS | {"fix_type": 0})
+    assert flight.kinds == []
+
+
+def test_pause_of_all_messages_is_the_silence_of_no_topic(flight: Flight) -> None:
+    """After a pause of the link, the first position does not make topics silent whose messages follow it."""
+    fly_with_gps(flight, 10)
+    flight.wait(20).send()
+    for _ in range(4):
+        flight.wait(0.5).send()
+        flight.update()
+    fly_with_gps(flight, 2)
+    assert no_messages(flight) == []
+
+
+def test_single_wild_timestamp_makes_no_topic_silent(flight: Flight) -> None:
+    """One position or GPS message with a wild timestamp does not make the GPS silent."""
+    fly_with_gps(flight, 10)
+    for topic, seconds in ((POSITION.topic, 60.0), ("vehicle_gps_position", -60.0)):
+        flight.booted -= seconds
+        flight.send(topic, **GOOD_GPS if topic != POSITION.topic else {})
+        flight.booted += seconds
+        flight.update()
+        fly_with_gps(flight, 2)
+    assert no_messages(flight) == []

@@ -157,7 +157,7 @@ def test_worse_warning_ends_the_previous_one(vehicle: SimpleVehicle) -> None:
 def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
     """Two faults within a minute have one story each; an end event belongs to the story of its begin event."""
     vehicle.send(0.0)
-    vehicle.send(1.0, timestamp=1_000_000)
+    vehicle.send(1.0, timestamp=1_000_000, xy_reset_counter=0)
     vehicle.send(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)
     vehicle.send(2.0, timestamp=2_000_000, xy_reset_counter=1, x=3.0, y=4.0, xy_valid=False)
     vehicle.send(3.0, timestamp=3_000_000, xy_reset_counter=1, x=3.0, y=4.0)

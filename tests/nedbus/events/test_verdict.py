@@ -13,7 +13,7 @@ import pytest
 from nedbus.events import ALL, Condition, Event, Times, Verdict, from_json, report_of, verdict_of
 from nedbus.events.detectors import Finding
 
-from .flight import ARMED, Flight, lose_gps
+from .flight import ARMED, DISARMED, Flight, lose_gps
 
 LIVE = Times(is_live=True)
 
@@ -88,6 +88,60 @@ def test_verdict_on_ended_fault_includes_start_and_end() -> None:
     assert found.begin is not None
     assert found.end is not None
     assert (found.usable, found.begin.time, found.end.time) == (False, flight.now - 2.0, flight.now)
+
+
+def test_live_verdict_begins_with_what_is_wrong_now() -> None:
+    """Live, an active condition or a single event of the last minute comes before a worse fault that has ended."""
+    flight = Flight()
+    lose_gps(flight)
+    flight.wait(1.0).send()
+    flight.wait(0.1).gps()
+    flight.wait(0.1).status(ARMED)
+    found = verdict(flight, times=LIVE)
+    assert found.text.startswith("was not usable: xy and vxy not valid from ")
+    assert found.usable
+    flight.fly(10)
+    flight.send("failsafe_flags", fd_motor_failure=False)
+    flight.wait(0.1).send("failsafe_flags", fd_motor_failure=True)
+    flight.fly(1)
+    found = verdict(flight, times=LIVE)
+    assert found.text.startswith("position valid now, but failsafe flags: motor failure from ")
+    assert "Also" in found.text
+    assert "xy and vxy not valid" in found.text
+    assert verdict(flight).text.startswith("not usable: xy and vxy not valid")  # in a file, the worst one
+
+
+@pytest.mark.parametrize(
+    ("text", "level", "state", "is_fault"),
+    [
+        ("Baro sensor #0 failure: Timeout", 2, ARMED, True), ("MAG #0 failed: STALE!", 0, DISARMED, True),
+        ("Mag sensor #1 failure: Stale data", 3, ARMED, True), ("Engine on fire", 2, ARMED, True),
+        ("Engine on fire", 2, DISARMED, False), ("No manual control input", 4, ARMED, False),
+    ],
+)  # fmt: skip
+def test_sensor_failures_and_critical_texts_in_flight_are_faults(
+    text: str, level: int, state: int, *, is_fault: bool
+) -> None:
+    """PX4's text about a failed sensor, and any critical one while armed, is a fault; the position stays valid."""
+    flight = Flight()
+    flight.fly(1)
+    flight.status(state)
+    flight.send("log_message", severity=level, text=text)
+    flight.fly(1)
+    for times in Times(), LIVE:
+        found = verdict(flight, times=times)
+        assert found.usable
+        assert found.text.startswith(f'position valid throughout, but PX4: "{text}" at ') == is_fault
+        assert ("Evidence" in found.text, found.text.startswith("no faults")) == (False, not is_fault)
+
+
+def test_silence_lasts_from_the_last_message() -> None:
+    """The period of a silence begins at the last message, not where the silence was noticed."""
+    flight = Flight()
+    flight.fly(5)
+    flight.wait(3.5).update("stale")
+    flight.wait(6.5).send()
+    assert "from 15.000 to 25.000 s since boot (10.0 s)" in verdict(flight).text
 
 
 def test_verdict_reports_absence_of_faults() -> None:

@@ -174,7 +174,7 @@ class LayoutLookup:
             _log.warning(text, name, unknown, extra=about("newer_layout", reason=reason))
         else:
             text = "%s is not built in: using the publisher's definition"
-            _log.info(text, name, extra=about("runtime_definition", reason=reason))
+            _log.debug(text, name, extra=about("runtime_definition", reason=reason))
         return True
 
     def _evict(self, size: int) -> bool:

@@ -61,6 +61,7 @@ class LogStream:
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
         self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
+        self._new_header = True  # not yet logged
 
     @property
     def is_streaming(self) -> bool:
@@ -140,9 +141,10 @@ class LogStream:
         self._logged = status
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
-            text = f"the log on the SD card lacks the {header:.1f} s in which the header was sent"
+            text = f"; the log on the SD card lacks the {header:.1f} s in which the header was sent"
+            text, self._new_header = text if self._new_header else " again", False
             extra = about("log_stream", self._address)
-            _log.info("vehicle %s: receiving the ULog stream; %s", self._name, text, extra=extra)
+            _log.info("vehicle %s: receiving the ULog stream%s", self._name, text, extra=extra)
         elif status.reason is not None:
             extra = about("log_stream", self._address, reason=status.text)
             _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)

@@ -1,0 +1,119 @@
+"""Recordings of the datagrams between a real PX4 and a service, played into the output of a source; without sockets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final, cast
+
+import pytest
+
+from nedbus import clock
+from nedbus.client import Health, PublisherRegistry, stream_state
+from nedbus.daemon.output import SourceOutput
+from nedbus.events import Event, EventLog, Times, Verdict, report_of, verdict_of
+from nedbus.sources import Rejection, SourceMessage
+from nedbus.sources.mavlink.reader import LogReceiver, Received, new_parser, parse
+from nedbus.sources.mavlink.source import _LinkSession
+from nedbus.sources.options import MavlinkOptions
+from nedbus_msgs import BY_TOPIC, Address, codec_of
+from tests.peers.px4_log_stream import datagrams
+
+_TICK: Final = 0.25  # s of the recording between two checks of the streams
+
+
+class _Receiver(LogReceiver):
+    """The receiver of a link without its thread."""
+
+    def __init__(self, options: MavlinkOptions) -> None:
+        self._reader, self._options, self._send = cast("Any", SimpleNamespace(name="udp")), options, lambda *_: None
+        self.vehicles = {}
+
+    def tick(self, now: float) -> None:
+        for vehicle in self.vehicles.values():
+            self._execute(vehicle, vehicle.client.tick(now))
+
+    def process(self, received: Received) -> Received | Rejection:
+        self.tick(received.time)
+        return self._process(received, is_full=False)
+
+
+def play(path: Path, options: MavlinkOptions) -> Iterator[tuple[float, SourceMessage | Rejection | None]]:
+    """Yield the items of the source and their times of arrival [s]."""
+    session = _LinkSession(
+        cast("Any", SimpleNamespace(send=lambda *_: None, peer=None, baud=None)), options, name="udp"
+    )
+    session._receiver = receiver = _Receiver(options)
+    checked = math.nan
+    for when, is_sent, frame in datagrams(path):
+        checked = when if math.isnan(checked) else checked
+        while checked + _TICK <= when:
+            checked += _TICK
+            receiver.tick(checked)
+            for log in session._logs.values():
+                log.log_changes()
+            yield checked, None
+        for item in parse(new_parser(), frame, "udp", ("127.0.0.1", 1), when) if is_sent else ():
+            found = item if isinstance(item, Rejection) else receiver.process(item)
+            if isinstance(found, Rejection):
+                yield when, found
+                continue
+            for each in session._handle(found):
+                yield when, each
+
+
+class Service:
+    """A service without a network that receives a recording; `start`, `now`: times in it [s]."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+        self.now = self.start = 0.0
+        self.event_log = EventLog()
+        registry = SimpleNamespace(publisher=self._open, reject=lambda *_: None)
+        self.output = SourceOutput("udp", "mavlink:udp", cast("PublisherRegistry", registry), self._now, self.event_log)
+        monkeypatch.setattr(clock, "steady", self._now)
+        self._items = play(path, MavlinkOptions.model_validate({"log": "armed"} | options))
+
+    def run(self, until: float = 1e9) -> Service:
+        """Play the recording up to this time [s since its start]."""
+        for time, item in self._items:
+            self.now, self.start = time, self.start or time
+            if isinstance(item, Rejection):
+                self.output.reject(item)
+            elif item is not None:
+                self.output.publish_live(item)
+            else:
+                self.output.expire_stale()
+                alive, healths = {*self.output.addresses}, self.healths
+                mains = [each.main for each in self.event_log.vehicles.values() if each.main]
+                states = {each: stream_state(healths[each], publishers=each in alive).name for each in mains}
+                self.event_log.update(self.now, states, present={each.vehicle for each in alive})
+            if self.now - self.start >= until:
+                break
+        return self
+
+    @property
+    def healths(self) -> dict[Address, Health]:
+        streams, now = self.output._streams.items(), round(1e9 * self.now)
+        return {address: stream.health.snapshot(now) for address, stream in streams}
+
+    def verdict(self, vehicle: str = "4") -> Verdict:
+        """Return the verdict of `nedbus why` on the live vehicle."""
+        known = report_of(self.event_log, "", "", self.now, within=1e9).vehicles[vehicle]
+        return verdict_of(
+            vehicle, self.event_log.events, known.held, topics=known.topics, unknown=known.unknown,
+            times=Times(is_live=True), end=self.now,
+        )  # fmt: skip
+
+    def events(self, *kinds: str) -> list[Event]:
+        return [each for each in self.event_log.events if not kinds or each.kind in kinds]
+
+    def _now(self) -> float:
+        return self.now
+
+    def _open(self, address: Address, definition: Any, **_: object) -> SimpleNamespace:
+        known = definition or BY_TOPIC[address.topic]
+        return SimpleNamespace(
+            definition=known, publish=codec_of(known).encode_fields, close=lambda: None, relabel=lambda _: None
+        )
