@@ -24,9 +24,8 @@ class HomePosition(Message):
         Layout("main", "*"),
     )
     RULES = (
-        Within("lat", 90.0),
-        Within("lon", 180.0),
-        FiniteWhile({"valid_hpos": ("lat", "lon"), "valid_alt": ("alt",), "valid_lpos": ("x", "y", "z")}),
+        Within(lat=90.0, lon=180.0),
+        FiniteWhile(valid_hpos="lat lon", valid_alt="alt", valid_lpos="x y z"),
     )
 
     lat: Float64 = field("Latitude [deg] [WGS84]")

@@ -28,10 +28,9 @@ class VehicleGlobalPosition(Message):
     )
     RULES = (
         NotLater("timestamp_sample", "timestamp"),
-        Within("lat", 90.0),
-        Within("lon", 180.0),
+        Within(lat=90.0, lon=180.0),
         NotNegative("eph", "epv"),
-        FiniteWhile({"lat_lon_valid": ("lat", "lon"), "alt_valid": ("alt",), "terrain_alt_valid": ("terrain_alt",)}),
+        FiniteWhile(lat_lon_valid="lat lon", alt_valid="alt", terrain_alt_valid="terrain_alt"),
     )
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
