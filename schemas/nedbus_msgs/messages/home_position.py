@@ -23,10 +23,7 @@ class HomePosition(Message):
         Layout("1.17", "1.15, z: roll pitch"),
         Layout("main", "*"),
     )
-    RULES = (
-        Within(lat=90.0, lon=180.0),
-        FiniteWhile(valid_hpos="lat lon", valid_alt="alt", valid_lpos="x y z"),
-    )
+    RULES = (Within(lat=90.0, lon=180.0), FiniteWhile(valid_hpos="lat lon", valid_alt="alt", valid_lpos="x y z"))
 
     lat: Float64 = field("Latitude [deg] [WGS84]")
     lon: Float64 = field("Longitude [deg] [WGS84]")

@@ -38,8 +38,7 @@ class MsgError(ValueError):
 
     def __init__(self, line: int, column: int, reason: str) -> None:
         super().__init__(f"line {line}, column {column}: {reason}")
-        self.line = line
-        self.column = column
+        self.line, self.column = line, column
 
 
 class MsgField(NamedTuple):

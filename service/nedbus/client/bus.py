@@ -33,12 +33,7 @@ class Bus(AbstractContextManager["Bus"]):
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        *,
-        timeout: float | None,
-        tls: Tls | None = None,
-        stop: threading.Event | None = None,
+        self, settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
     ) -> None:
         self.prefix, self.routers = settings.prefix, settings.routers
         self._tls, prefix = tls or settings.tls, settings.prefix

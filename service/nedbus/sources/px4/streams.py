@@ -32,8 +32,7 @@ _SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after whic
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each vehicle its own namespace or domain"
 
-Definitions = Mapping[str, Mapping[str, Definition[Any]]]
-"""Definitions supplied by the user, by DDS type and ROS 2 type hash."""
+Definitions = Mapping[str, Mapping[str, Definition[Any]]]  # supplied by the user, by DDS type and ROS 2 type hash
 
 
 class NotAcceptedError(Exception):
