@@ -94,8 +94,7 @@ class AsyncBus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
-        open_receiver = partial(self._in_thread, bus._open_receiver, pending_queue)
-        return AsyncSubscription(open_receiver, pending_queue)
+        return AsyncSubscription(partial(self._in_thread, bus._open_receiver, pending_queue), pending_queue)
 
     @overload
     async def latest(

@@ -98,8 +98,7 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Subscription[Any]:
         """Subscribe to a selection of addresses; see `subscribe`."""
         pending_queue = self._make_queue(selection, mode, max_rate)
-        receiver = self._open_receiver(pending_queue)
-        return Subscription(receiver, pending_queue, owner=self)
+        return Subscription(self._open_receiver(pending_queue), pending_queue, owner=self)
 
     @overload
     def latest(
@@ -122,8 +121,7 @@ class Bus(AbstractContextManager["Bus"]):
         A sample from a storage has `stored` set; it is returned only if the publisher does not reply.
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        key_expr = selection.key_expr(prefix=self.prefix)
-        answers = query(self._session, key_expr, timeout=timeout)
+        answers = query(self._session, selection.key_expr(prefix=self.prefix), timeout=timeout)
         samples = list(Decoder(self._layouts, prefix=self.prefix).read(answers))
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
         newest = {sample.address: sample for sample in samples}  # the last sample of each address wins

@@ -8,11 +8,11 @@ import errno
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, Final, Self, cast
+from typing import IO, Any, Final, cast
 
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
@@ -49,7 +49,7 @@ _LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # FATAL, ERROR, WARN, INF
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
 
 
-class RecordingWriter:
+class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     """Write messages to a new MCAP file; a context manager that finishes the file on exit.
 
     Each combination of address, definition and provenance has its own channel. Its layout is the current one; if no
@@ -120,7 +120,7 @@ class RecordingWriter:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
         channels = self._channels.setdefault(definition, {})
         for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
-            channel, layout = channels.get(stream) or self._open_channel(definition, *stream)
+            channel, layout = channels.get(stream) or self._new_channel(definition, *stream)
             if layout not in encoded:
                 payloads = arrays_of(definition).encode_cdr(messages, layout)
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
@@ -152,18 +152,13 @@ class RecordingWriter:
             self._writer.finish()
             self._file.sync(end=b"")
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         if isinstance(exc[1], OutputError):
             self._file.raw.close()  # finishing the file would fail again
         else:
             self.close()
 
-    def _open_channel(
-        self, definition: Definition[Any], address: Address, provenance: Provenance
-    ) -> tuple[int, Layout]:
+    def _new_channel(self, definition: Definition[Any], address: Address, provenance: Provenance) -> tuple[int, Layout]:
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
         metadata = {"vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:

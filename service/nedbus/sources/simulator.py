@@ -46,7 +46,6 @@ _STEP: Final = 1e-3  # s, step of the numerical derivatives
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
-_ARMED: Final = _BOOT - 1_000_000  # us since boot
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
 _ENDURANCE: Final = 1200.0  # s until the battery, then at 20 %, is replaced by a full one
@@ -167,7 +166,7 @@ class Estimator:
         flown = _Status.NAVIGATION_STATE_AUTO_MISSION if is_mission else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
         mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
         return {
-            "armed_time": _ARMED, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
+            "armed_time": _BOOT - 1_000_000, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
             "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
             "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
             "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
@@ -300,11 +299,7 @@ def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> R
     vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
     ticks = None if options.duration is None else round(options.duration / _TICK)
     streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)
-    chosen = {
-        address: stream
-        for address, stream in streams.items()
-        if stream[0] and (topics is None or address.topic in topics)
-    }
+    chosen = {at: each for at, each in streams.items() if each[0] and (topics is None or at.topic in topics)}
     if not chosen:
         asked = ", ".join(sorted(topics or ()))
         known = ", ".join(sorted({address.topic for address in streams}))

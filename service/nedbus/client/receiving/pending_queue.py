@@ -81,8 +81,7 @@ class PendingQueue:
         self.name = name
         self.counters = LossCounters()
         self._warned: set[str] = set()
-        self.decoder = decoder
-        self._clock = clock
+        self.decoder, self._clock = decoder, clock
         self._lock = threading.RLock()  # reentrant, because log handlers may read the counts
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._streams: dict[str, KeyState] = {}

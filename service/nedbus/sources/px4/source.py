@@ -62,8 +62,7 @@ class Px4ZenohSource:
             check_endpoints([endpoint], where="px4-zenoh")
         self._endpoints = (endpoint,) if endpoint else routers
         self._is_own = not endpoint or endpoint in routers
-        self._tls = tls
-        self._options = options
+        self._options, self._tls = options, tls
         self._supplied = _read_definitions(options.msg)
         self._vehicle = options.vehicle or vehicle
 
