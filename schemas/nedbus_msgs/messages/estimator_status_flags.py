@@ -41,7 +41,6 @@ class EstimatorStatusFlags(Message):
     RULES = (NotLater("timestamp_sample", "timestamp"),)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     control_status_changes: Uint32 = field("Number of changes of the cs_ flags")
     cs_tilt_align: Bool = field("Tilt alignment is complete")
     cs_yaw_align: Bool = field("Yaw alignment is complete")

@@ -67,9 +67,7 @@ class SensorGps(Message):
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     device_id: Uint32 = field("Device ID, unchanged by restarts")
-
     latitude_deg: Float64 = field("Latitude [deg] [WGS84]")
     longitude_deg: Float64 = field("Longitude [deg] [WGS84]")
     altitude_msl_m: Float64 = field("Altitude above mean sea level [m]")

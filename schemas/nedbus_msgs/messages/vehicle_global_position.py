@@ -34,7 +34,6 @@ class VehicleGlobalPosition(Message):
     )
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     lat: Float64 = field("Latitude [deg] [WGS84]")
     lon: Float64 = field("Longitude [deg] [WGS84]")
     alt: Float32 = field("Altitude above mean sea level [m]")
@@ -54,7 +53,6 @@ class VehicleGlobalPosition(Message):
 
     terrain_alt: Float32 = field("Terrain altitude [m], NaN if unknown")
     terrain_alt_valid: Bool = field("terrain_alt is valid")
-
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
     global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "lat_lon_valid", "alt_valid")

@@ -66,7 +66,6 @@ class VehicleLocalPosition(Message):
     DIST_BOTTOM_SENSOR_NONE, DIST_BOTTOM_SENSOR_RANGE, DIST_BOTTOM_SENSOR_FLOW = range(3)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     xy_valid: Bool = field("x and y are valid")
     z_valid: Bool = field("z is valid")
     v_xy_valid: Bool = field("vx and vy are valid")
@@ -119,7 +118,6 @@ class VehicleLocalPosition(Message):
     epv: Float32 = field("Standard deviation of down position [m]")
     evh: Float32 = field("Standard deviation of north and east velocity combined [m/s]")
     evv: Float32 = field("Standard deviation of down velocity [m/s]")
-
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
     vxy_max: Float32 = field("Maximum horizontal speed [m/s]; infinity if unlimited (0 in ground truth)")

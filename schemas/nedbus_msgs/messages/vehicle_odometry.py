@@ -41,7 +41,6 @@ class VehicleOdometry(Message):
     VELOCITY_FRAME_UNKNOWN, VELOCITY_FRAME_NED, VELOCITY_FRAME_FRD, VELOCITY_FRAME_BODY_FRD = range(4)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us]")
-
     pose_frame: Uint8 = field("Frame of position and q: 0 unknown, 1 NED, 2 FRD with arbitrary heading")
     position: Float32x3 = field("Position [m] [pose_frame]")
     q: Float32x4 = field("Rotation from FRD body to pose_frame, Hamilton (w, x, y, z)")

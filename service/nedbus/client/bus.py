@@ -230,12 +230,12 @@ class Bus(AbstractContextManager["Bus"]):
             return PendingQueue(mode, decoder, name=selection.key_expr(prefix=self.prefix))
         return MaxRateQueue(mode, decoder, selection, max_rate=max_rate)
 
-    def _open_receiver(self, pending_queue: PendingQueue) -> Receiver:
+    def _open_receiver(self, pending: PendingQueue) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
-        if isinstance(pending_queue, MaxRateQueue):
-            receiver: Receiver = MaxRateReceiver(self._session, pending_queue)
-        else:
-            receiver = Receiver(self._session, pending_queue)
+        session = self._session
+        receiver = (
+            MaxRateReceiver(session, pending) if isinstance(pending, MaxRateQueue) else Receiver(session, pending)
+        )
         self._receivers.add(receiver)
         if self.closed:  # closed by another thread in the meantime
             receiver.close()

@@ -47,6 +47,7 @@ uint32 nanosec
 _LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # FATAL, ERROR, WARN, INFO, DEBUG, by PX4's severity
 
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
+_Streams = Iterable[tuple[Address, Provenance]]  # of each message
 
 
 class RecordingWriter(AbstractContextManager["RecordingWriter"]):
@@ -85,7 +86,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self,
         messages: MessageArray,
         definition: Definition[Any],
-        streams: Iterable[tuple[Address, Provenance]],
+        streams: _Streams,
         *,
         logged: Iterable[int],
         published: Iterable[int],
@@ -114,7 +115,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self,
         messages: MessageArray,
         definition: Definition[Any],
-        streams: Iterable[tuple[Address, Provenance]],
+        streams: _Streams,
         times: Iterable[tuple[int, int, int]],
     ) -> Iterator[_Encoded]:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads

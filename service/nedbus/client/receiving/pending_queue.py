@@ -96,9 +96,8 @@ class PendingQueue:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far, and evicted keys."""
         with self._lock:
-            counters, invalid = self.counters, self.decoder.invalid
-            lost, dropped, forgotten = counters.lost, counters.dropped, counters.forgotten
-            return Counts(self._received, lost, dropped, invalid, counters.discarded, forgotten)
+            each, invalid = self.counters, self.decoder.invalid
+            return Counts(self._received, each.lost, each.dropped, invalid, each.discarded, each.forgotten)
 
     @property
     def waiting(self) -> int:
