@@ -40,8 +40,7 @@ class Arrays(Generic[M]):
     """
 
     def __init__(self, definition: Definition[M]) -> None:
-        types = definition.types
-        self.definition = definition
+        self.definition, types = definition, definition.types
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size

@@ -63,7 +63,6 @@ class VehicleStatus(Message):
 
     armed_time: Uint64 = field("Time of arming, since boot [us], 0 if not armed")
     takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if none")
-
     arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 init, 3 error, 4 shutdown, 5 in-air restore")
     latest_arming_reason: Uint8 = field("Arming reason: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
     latest_disarming_reason: Uint8 = field("Disarming reason, as latest_arming_reason: 6 landing (up to 1.17: 7) ...")
@@ -71,11 +70,9 @@ class VehicleStatus(Message):
     nav_state_timestamp: Uint64 = field("Time of the latest change of nav_state, since boot [us]")
     nav_state_user_intention: Uint8 = field("Mode selected by the user, as nav_state")
     nav_state: Uint8 = field("Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ...")
-
     executor_in_charge: Uint8 = field("Mode executor in charge: 0 autopilot")
     nav_state_display: Uint8 = field("Mode to display to the user, as nav_state")
     accepts_offboard_setpoints: Bool = field("Active mode accepts offboard setpoints")
-
     valid_nav_states_mask: Uint32 = field("Available modes, as a bitmask of nav_state")
     can_set_nav_states_mask: Uint32 = field("Modes that the user can select, as a bitmask of nav_state")
 

@@ -193,8 +193,7 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
     def __init__(self, publisher: Publisher) -> None:
         self.address, self.key = publisher.address, publisher.key
         self.source, self.lossless = publisher.source, publisher.lossless
-        self._blocking = publisher
-        self._thread = ThreadPoolExecutor(1, "nedbus-async")
+        self._blocking, self._thread = publisher, ThreadPoolExecutor(1, "nedbus-async")
 
     @property
     def closed(self) -> bool:

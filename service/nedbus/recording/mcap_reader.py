@@ -120,8 +120,7 @@ class RecordingReader(ExitStack):
 
 class _RecordedFile:
     def __init__(self, path: Path, vehicle: str) -> None:
-        self.name = path.name
-        self._vehicle = vehicle
+        self.name, self._vehicle = path.name, vehicle
         self.boot_times: set[str] = set()
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}

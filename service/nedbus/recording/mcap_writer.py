@@ -63,8 +63,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0) -> None:
-        self.path, self._boot_utc = Path(path), boot_utc
-        self.messages = 0
+        self.path, self._boot_utc, self.messages = Path(path), boot_utc, 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
         # Large chunks: the writer keeps an index per chunk and channel in memory.
@@ -161,15 +160,12 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
 
     def _new_channel(self, definition: Definition[Any], address: Address, provenance: Provenance) -> tuple[int, Layout]:
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
-        metadata = {"vehicle": address.vehicle, "topic": address.topic}
-        if address.instance is not None:
-            metadata["instance"] = str(address.instance)
-        if provenance.source is not None:
-            metadata["source"] = provenance.source
-        if self._boot_utc:
-            metadata["boot_time_utc_us"] = str(self._boot_utc)
-        if provenance.missing:
-            metadata["missing"] = " ".join(sorted(provenance.missing))
+        known = {
+            "vehicle": address.vehicle, "topic": address.topic,
+            "instance": "" if address.instance is None else str(address.instance), "source": provenance.source or "",
+            "boot_time_utc_us": str(self._boot_utc or ""), "missing": " ".join(sorted(provenance.missing)),
+        }  # fmt: skip
+        metadata = {name: value for name, value in known.items() if value}
         channel = self._register(f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata)
         self._channels[definition][address, provenance] = channel, layout
         return channel, layout
@@ -203,8 +199,7 @@ class _AppendFile:
 
     def __init__(self, path: Path) -> None:
         self.raw = path.open("xb", buffering=0)
-        self._pending = bytearray()
-        self._offset = 0
+        self._pending, self._offset = bytearray(), 0
 
     def write(self, data: bytes) -> int:
         self._pending += data

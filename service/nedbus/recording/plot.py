@@ -243,12 +243,10 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
             end = max(begin, last if span.until is None else min(span.until + offset, last))
             # Conditions that begin with the same event share a mark, which ends when the last condition ends.
             marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
-
-    def order(marks: list[_Mark]) -> tuple[int, float]:
-        return min((SEVERITIES.index(mark.event.severity), mark.begin) for mark in marks)
-
-    by_row = {row: sorted(marks.values(), key=lambda mark: mark.begin) for row, marks in rows.items()}
-    return dict(sorted(by_row.items(), key=lambda row: order(row[1])))
+    order = {
+        row: min((SEVERITIES.index(each.event.severity), each.begin) for each in rows[row].values()) for row in rows
+    }
+    return {row: sorted(rows[row].values(), key=lambda mark: mark.begin) for row in sorted(rows, key=order.__getitem__)}
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:

@@ -50,8 +50,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         self.source, self.lossless = Provenance(source).source, lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._new_timestamp = heartbeats.session.new_timestamp
-        self._registry = registry
-        self._owner = owner  # keeps the bus open
+        self._registry, self._owner = registry, owner  # the owner keeps the bus open
         self.definition, self._all, self._codec = definition, definition.all_fields, codec_of(definition)
         self._encoding = self._declared = encoding_of(definition, source)
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # of the last message with missing fields

@@ -73,13 +73,11 @@ class PendingQueue:
     ) -> None:
         if mode not in get_args(Mode):
             raise ArgumentError("mode", mode, f"one of {', '.join(get_args(Mode))}")
-        self.newest_only = mode == "latest"
-        self.ended = False
+        self.newest_only, self.ended = mode == "latest", False
         self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None  # wakes a reader on an event loop; called on any thread
-        self.name = name
-        self.counters = LossCounters()
+        self.name, self.counters = name, LossCounters()
         self._warned: set[str] = set()
         self.decoder, self._clock = decoder, clock
         self._lock = threading.RLock()  # reentrant, because log handlers may read the counts

@@ -47,8 +47,7 @@ class Receiver:
     """
 
     def __init__(self, session: Session, pending_queue: PendingQueue, *, history: bool = True) -> None:
-        self._session = session
-        self._queue, key_expr = pending_queue, pending_queue.name
+        self._session, self._queue, key_expr = session, pending_queue, pending_queue.name
         self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", key_expr)
         self._changing = threading.Lock()
         self._closed = False
@@ -154,9 +153,7 @@ class Receiver:
                 return
             batch = [handler.recv()]
             self._idle = False
-            if (item := handler.try_recv()) is not None:
-                batch.append(item)
-                drain(handler, batch)
+            drain(handler, batch)
         except zenoh.ZError:
             self._queue.end("its Zenoh session was closed")  # no effect after `close`
             return
