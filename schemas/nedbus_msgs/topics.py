@@ -26,8 +26,7 @@ _TYPO_SIMILARITY: Final = 0.9  # minimum similarity of a name that counts as a m
 _STREAM = re.compile(r"/([^/]*)/([^/]*)(?:/(0|[1-9][0-9]{0,2}))?")
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
-_OUT: Final = ("fmu", "out")
-_IN: Final = ("fmu", "in")
+_OUT, _IN = ("fmu", "out"), ("fmu", "in")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 

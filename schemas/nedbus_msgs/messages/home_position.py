@@ -41,7 +41,6 @@ class HomePosition(Message):
     valid_hpos: Bool = field("lat and lon are valid")
     valid_lpos: Bool = field("x, y and z are valid")
     valid_attitude: Bool = field("roll, pitch and yaw are valid")
-
     manual_home: Bool = field("Home position was set manually")
     update_count: Uint32 = field("Number of home position updates since boot")
 

@@ -98,7 +98,6 @@ class SensorGps(Message):
 
     timestamp_time_relative: Int32 = field("Time of time_utc_usec relative to timestamp [us]")
     time_utc_usec: Uint64 = field("Unix time of the fix [us], 0 if unknown")
-
     satellites_used: Uint8 = field("Number of satellites used")
     system_error: Uint32 = field("Receiver error bitmask, see SYSTEM_ERROR_; 0 if none")
 

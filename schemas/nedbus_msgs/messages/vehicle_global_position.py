@@ -38,7 +38,6 @@ class VehicleGlobalPosition(Message):
     lon: Float64 = field("Longitude [deg] [WGS84]")
     alt: Float32 = field("Altitude above mean sea level [m]")
     alt_ellipsoid: Float32 = field("Altitude above the ellipsoid [m] [WGS84]")
-
     lat_lon_valid: Bool = field("lat and lon are valid")
     alt_valid: Bool = field("alt is valid")
 

@@ -48,6 +48,7 @@ _LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # FATAL, ERROR, WARN, INF
 
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
 _Streams = Iterable[tuple[Address, Provenance]]  # of each message
+_Times = Iterable[tuple[int, int, int]]  # log time [ns], publish time [ns] and sequence number of each message
 
 
 class RecordingWriter(AbstractContextManager["RecordingWriter"]):
@@ -111,11 +112,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file sequentially
 
     def _encode(
-        self,
-        messages: MessageArray,
-        definition: Definition[Any],
-        streams: _Streams,
-        times: Iterable[tuple[int, int, int]],
+        self, messages: MessageArray, definition: Definition[Any], streams: _Streams, times: _Times
     ) -> Iterator[_Encoded]:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
         channels = self._channels.setdefault(definition, {})

@@ -95,8 +95,7 @@ class LayoutLookup:
     def wait(self, schema_id: SchemaId | None = None) -> None:
         """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
         with self._changed:
-            start = time.monotonic()
-            longest = TIMINGS.definition_timeout
+            start, longest = time.monotonic(), TIMINGS.definition_timeout
             budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
             is_pending = self._open.__len__ if schema_id is None else partial(self._open.__contains__, schema_id)
             self._changed.wait_for(lambda: self._closed or not is_pending(), longest if schema_id is None else budget)

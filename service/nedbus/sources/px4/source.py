@@ -49,8 +49,7 @@ class Px4ZenohSource:
         self._endpoints = (endpoint,) if endpoint else routers
         self._is_own = not endpoint or endpoint in routers
         self._options, self._tls = options, tls
-        self._supplied = _read_definitions(options.msg)
-        self._vehicle = options.vehicle or vehicle
+        self._supplied, self._vehicle = _read_definitions(options.msg), options.vehicle or vehicle
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
         """Receive; raise SourceError if no router answers."""
