@@ -51,7 +51,9 @@ class UnknownLayoutError(DecodeError):
         readable = ", ".join(map(str, known))
         fields = f"{count} field{'s' * (count != 1)}"
         super().__init__(f"unknown layout {layout} with {fields} (known: {readable}); update nedbus_msgs", message)
-        self.layout, self.count, self.known = layout, count, tuple(known)
+        self.layout = layout
+        self.count = count
+        self.known = tuple(known)
 
 
 class InvalidMessageError(NedbusError, ValueError):
@@ -66,7 +68,9 @@ class InvalidMessageError(NedbusError, ValueError):
     ) -> None:
         where = "" if index is None else f" at index {index}"
         super().__init__(f"not a valid {message}{where}: {reason}")
-        self.reason, self.violations, self.index = reason, tuple(violations), index
+        self.reason = reason
+        self.violations = tuple(violations)
+        self.index = index
 
 
 class EncodeError(NedbusError, ValueError):

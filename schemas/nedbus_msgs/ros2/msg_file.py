@@ -38,7 +38,8 @@ class MsgError(ValueError):
 
     def __init__(self, line: int, column: int, reason: str) -> None:
         super().__init__(f"line {line}, column {column}: {reason}")
-        self.line, self.column = line, column
+        self.line = line
+        self.column = column
 
 
 class MsgField(NamedTuple):

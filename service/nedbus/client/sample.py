@@ -1,7 +1,7 @@
 """Sample, a received message with its metadata, and Counts, the statistics of a subscription."""
 
-from dataclasses import dataclass, field
-from typing import Generic, Literal, TypedDict
+from dataclasses import dataclass
+from typing import Final, Generic, Literal, TypedDict
 
 import zenoh
 from typing_extensions import TypeVar
@@ -29,6 +29,9 @@ class Subscribe(TypedDict, total=False):
     max_rate: float | None
 
 
+_UNKNOWN: Final = Provenance()
+
+
 @dataclass(slots=True, eq=False)
 class Sample(Generic[M_co]):
     """A received message with its metadata.
@@ -48,7 +51,7 @@ class Sample(Generic[M_co]):
     received: int
     stamp: zenoh.Timestamp | None = None
     lost: int = 0
-    provenance: Provenance = field(default=Provenance())
+    provenance: Provenance = _UNKNOWN
     retained: bool = False
     stored: bool = False
     _sent: int | None = None  # set in copies, because Zenoh's timestamp cannot be pickled

@@ -28,7 +28,8 @@ _T = TypeVar("_T")
 
 class _SubscriptionBase(Generic[M_co]):
     def __init__(self, pending_queue: PendingQueue) -> None:
-        self.name, self._queue = pending_queue.name, pending_queue
+        self.name = pending_queue.name
+        self._queue = pending_queue
         self._pop_row = partial(pending_queue.pop, rows=True)
 
     @property

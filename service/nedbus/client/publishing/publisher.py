@@ -46,12 +46,15 @@ class Publisher(AbstractContextManager["Publisher"]):
         owner: object,
     ) -> None:
         prefix, heartbeats = registry.prefix, registry.heartbeats
-        self.address, self.key = address, address.key(prefix=prefix)
-        self.source, self.lossless = Provenance(source).source, lossless
+        self.address = address
+        self.key = address.key(prefix=prefix)
+        self.source = Provenance(source).source
+        self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._new_timestamp = heartbeats.session.new_timestamp
         self._registry, self._owner = registry, owner  # the owner keeps the bus open
-        self.definition, self._all, self._codec = definition, definition.all_fields, codec_of(definition)
+        self.definition = definition
+        self._codec, self._all = codec_of(definition), definition.all_fields
         self._encoding = self._declared = encoding_of(definition, source)
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # of the last message with missing fields
         topic = get_topic(address.topic)
