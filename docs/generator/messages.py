@@ -70,7 +70,8 @@ def rows_of(rule: Rule) -> list[list[str]]:
         return [[names(fields), f"must be finite while `{flag}` is true"] for flag, fields in rule.flags.items()]
     if isinstance(rule, NotLater):
         return [[f"`{rule.fields[0]}`", f"must not be later than `{rule.fields[1]}`"]]
-    return [[names(rule.fields), rule.checks[0].reason]]
+    reasons = dict.fromkeys(check.reason for check in rule.checks)
+    return [[names(check.field for check in rule.checks if check.reason == reason), reason] for reason in reasons]
 
 
 def names(fields: Iterable[str]) -> str:

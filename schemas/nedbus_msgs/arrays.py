@@ -26,8 +26,7 @@ from .model.validation import Values
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
-_MIN_COLUMNAR: Final = 20
-"""Minimum number of messages for which checking rules by column is faster than by message."""
+_MIN_COLUMNAR: Final = 20  # messages for which checking rules by column is faster than by message
 
 
 def _numpy_type(kind: FieldType) -> Any:
@@ -41,8 +40,7 @@ class Arrays(Generic[M]):
     """
 
     def __init__(self, definition: Definition[M]) -> None:
-        types = definition.types
-        self.definition = definition
+        self.definition, types = definition, definition.types
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size
@@ -164,15 +162,9 @@ class Arrays(Generic[M]):
 
     @staticmethod
     def _cdr(layout: Layout) -> np.dtype[np.void]:
-        cdr = cdr_layout(layout)
-        return np.dtype(
-            {
-                "names": list(layout.types),
-                "formats": [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()],
-                "offsets": list(cdr.offsets.values()),
-                "itemsize": len(cdr.zeros),
-            }
-        )
+        cdr, formats = cdr_layout(layout), [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()]
+        names, offsets = zip(*cdr.offsets.items(), strict=True)
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(cdr.zeros)})
 
 
 @cached_on_owner

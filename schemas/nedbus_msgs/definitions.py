@@ -33,11 +33,7 @@ DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
 
 
 def define(
-    name: str,
-    fields: Iterable[tuple[str, FieldType]],
-    *,
-    meanings: Mapping[str, str] = {},
-    rules: Sequence[Rule] = (),
+    name: str, fields: Iterable[tuple[str, FieldType]], *, meanings: Mapping[str, str] = {}, rules: Sequence[Rule] = ()
 ) -> Definition[Message]:
     """Define a message that is not built in, from a log, a .msg file or a publisher.
 

@@ -23,7 +23,6 @@ from .model.px4_types import FieldType
 from .ros2.types import PACKAGE, hash_of
 
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
-_MISSING = re.compile(r"[0-9a-f]+")
 _IDENTITY = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?")
 # Number of the newest layout that needs no hash, because the first version has it. Never add to this table: readers
 # find the fields of any other layout by its hash.
@@ -85,8 +84,8 @@ def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
     """Parse the provenance in an encoding; unknown or invalid parts, perhaps of other programs, are ignored."""
     parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])
     source, missing = parts.get("source", ""), parts.get("missing", "")
-    fits = _MISSING.fullmatch(missing) and len(missing) <= math.ceil(len(definition.names) / 4)
-    mask = int(missing, 16) if fits else 0
+    digits = math.ceil(len(definition.names) / 4)
+    mask = int(missing, 16) if re.fullmatch(f"[0-9a-f]{{1,{digits}}}", missing) else 0
     return Provenance(
         source if _SOURCE.fullmatch(source) else None,
         frozenset(name for index, name in enumerate(definition.names) if mask >> index & 1),

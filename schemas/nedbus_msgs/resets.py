@@ -71,8 +71,7 @@ class ResetTracker:
         All tracks restart when the timestamp goes back, which counts as a reboot of the vehicle.
         """
         last, self._last = self._last, message
-        reset: set[Quantity] = set()
-        discontinued: set[Quantity] = set()
+        reset, discontinued = set[Quantity](), set[Quantity]()
         origin_changed = last is not None and _origin(last) != _origin(message)
         rebooted = last is not None and message.timestamp < last.timestamp
         values: dict[str, float] = {}

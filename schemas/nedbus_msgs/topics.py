@@ -21,14 +21,12 @@ REJECTED: Final = "/@rejected"
 """Appended to the prefix in the keys of reports on rejected messages."""
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-_TOPIC_LENGTH: Final = 64
+_MAX_LENGTH: Final = 64  # characters of a topic, and of a vehicle
 _TYPO_SIMILARITY: Final = 0.9  # minimum similarity of a name that counts as a misspelling
 _STREAM = re.compile(r"/([^/]*)/([^/]*)(?:/(0|[1-9][0-9]{0,2}))?")
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
-_VEHICLE_LENGTH: Final = 64
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
-_OUT: Final = ("fmu", "out")
-_IN: Final = ("fmu", "in")
+_OUT, _IN = ("fmu", "out"), ("fmu", "in")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -171,7 +169,7 @@ def get_topic(name: object) -> Topic:
 
 @lru_cache(1024)
 def _other_topic(name: str) -> Topic:
-    if not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
+    if not _TOPIC.fullmatch(name) or len(name) > _MAX_LENGTH:
         topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
         if re.search(r"(^|/)(in|out)/", name):
             raise AddressError("topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix")
@@ -236,8 +234,8 @@ def check_vehicle(vehicle: object) -> str:
     """Return a valid vehicle name; raise AddressError for any other."""
     if not isinstance(vehicle, str):
         raise AddressError("vehicle", vehicle, 'one name, such as "7" (call once per vehicle), or "*" for all')
-    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
-        raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
+    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _MAX_LENGTH:
+        raise AddressError("vehicle", vehicle, f"1 to {_MAX_LENGTH} of A-Z a-z 0-9 _ -")
     return vehicle
 
 

@@ -5,7 +5,6 @@ Converts between payloads and fields by name; the model validates the fields.
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -19,24 +18,28 @@ HEADER: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
 _PX4_TRAILER: Final = 24  # PX4 sends 4 + sizeof(struct) + 24 bytes, and its struct may be longer than the CDR body
 
 
-@dataclass(frozen=True, slots=True)
 class CdrLayout:
-    """CDR form of one layout: the struct of the body, and the payload offset of each field.
+    """CDR form of one layout: the struct of the body, with each field at the next multiple of its alignment.
 
-    `limit`: maximum payload size [bytes].
+    `offsets`: payload offset of each field. `zeros`: payload of zeros. `limit`: maximum payload size [bytes].
     `bool_mask`: the bits that must be 0 because bools are 0 or 1, with the payload read as a little-endian integer.
     """
 
-    body: struct.Struct
-    offsets: Mapping[str, int]
-    limit: int
-    bool_mask: int
-    validation: Validation
-
-    @property
-    def zeros(self) -> bytes:
-        """A payload with all fields zero."""
-        return HEADER + bytes(self.body.size)
+    def __init__(self, layout: Layout) -> None:
+        body, size, unpadded, self.bool_mask = "<", 0, 0, 0
+        self.offsets: dict[str, int] = {}
+        for name, kind in layout.types.items():
+            padding = 0 if kind.is_text else -size % kind.size
+            body += (f"{padding}x" if padding else "") + kind.form
+            self.offsets[name] = len(HEADER) + size + padding
+            if kind.base == "bool":
+                self.bool_mask |= int.from_bytes(b"\xfe" * kind.values) << 8 * self.offsets[name]
+            size += padding + kind.size * kind.values
+            unpadded += kind.size * kind.values
+        px4_struct = unpadded + -unpadded % 8
+        self.limit = len(HEADER) + max(size, px4_struct + _PX4_TRAILER)
+        self.body, self.zeros = struct.Struct(body), HEADER + bytes(size)
+        self.validation = Validation(layout.types, ())
 
 
 def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> dict[str, object]:
@@ -48,7 +51,7 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     neither 0 nor 1.
     """
     cdr = cdr_layout(layout)
-    min_size = len(HEADER) + cdr.body.size
+    min_size = len(cdr.zeros)
     if payload[:2] != HEADER[:2]:
         start = f"starts with {payload[:2].hex(' ')}" if payload else "empty"
         raise DecodeError(f"the payload is not little-endian CDR ({start})", definition.name)
@@ -82,17 +85,5 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
 
 @cached_on_owner
 def cdr_layout(layout: Layout) -> CdrLayout:
-    """Compute the CDR form of a layout, with each field at the next multiple of its alignment."""
-    body, size, unpadded, bool_mask = "<", 0, 0, 0
-    offsets = {}
-    for name, kind in layout.types.items():
-        padding = 0 if kind.is_text else -size % kind.size
-        body += (f"{padding}x" if padding else "") + kind.form
-        offsets[name] = len(HEADER) + size + padding
-        if kind.base == "bool":
-            bool_mask |= int.from_bytes(b"\xfe" * kind.values) << 8 * offsets[name]
-        size += padding + kind.size * kind.values
-        unpadded += kind.size * kind.values
-    px4_struct = unpadded + -unpadded % 8
-    limit = len(HEADER) + max(size, px4_struct + _PX4_TRAILER)
-    return CdrLayout(struct.Struct(body), offsets, limit, bool_mask, Validation(layout.types, ()))
+    """Return the cached CDR form of a layout."""
+    return CdrLayout(layout)

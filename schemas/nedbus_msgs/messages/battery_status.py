@@ -17,15 +17,13 @@ class BatteryStatus(Message):
 
     TOPICS = (Topic("battery_status", 1.0, "each battery's driver or estimator", instances=True, plain_first=True),)
     LAYOUTS = (
-        Layout("1.13", """
-            1.16, without internal_resistance_estimate ocv_estimate ocv_estimate_filtered volt_based_soc_estimate
-            voltage_prediction prediction_error estimation_covariance_norm, voltage_v: voltage_filtered_v,
-            current_a: current_filtered_a, faults: custom_faults, warning: mode average_power available_energy,
-            remaining_capacity_wh: design_capacity average_time_to_full"""),
+        Layout("1.13", """1.16, without internal_resistance_estimate ocv_estimate ocv_estimate_filtered
+            volt_based_soc_estimate voltage_prediction prediction_error estimation_covariance_norm,
+            voltage_v: voltage_filtered_v, current_a: current_filtered_a, faults: custom_faults, warning: mode
+            average_power available_energy, remaining_capacity_wh: design_capacity average_time_to_full"""),
         Layout("1.16", "1.17, without warning, average_time_to_empty: serial_number, faults: warning"),
-        Layout("1.17", """
-            *, without serial_number voltage_filtered_v current_filtered_a custom_faults mode average_power
-            available_energy design_capacity average_time_to_full"""),
+        Layout("1.17", """*, without serial_number voltage_filtered_v current_filtered_a custom_faults mode
+            average_power available_energy design_capacity average_time_to_full"""),
     )  # fmt: skip
     RULES = (InRange("remaining", 0.0, 1.0, or_=-1.0),)
 

@@ -19,22 +19,17 @@ class EstimatorStatusFlags(Message):
         Topic("estimator_status_flags", 1.0, "each EKF2 instance", instances=True, on_change=True, plain_first=True),
     )
     LAYOUTS = (
-        Layout("1.13", """
-            1.14, without cs_fake_pos cs_fake_hgt cs_gravity_vector,
-            reject_ver_pos: reject_mag_x reject_mag_y reject_mag_z"""),
-        Layout("1.14", """
-            1.15, without cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos,
+        Layout("1.13", """1.14, without cs_fake_pos cs_fake_hgt cs_gravity_vector, reject_ver_pos: reject_mag_x
+            reject_mag_y reject_mag_z"""),
+        Layout("1.14", """1.15, without cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos,
             fs_bad_optflow_y: fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d"""),
-        Layout("1.15", """
-            1.16, without cs_gnss_pos cs_gnss_yaw cs_gnss_yaw_fault cs_rng_terrain cs_opt_flow_terrain
-            cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel, cs_yaw_align: cs_gps,
-            cs_rng_stuck: cs_gps_yaw, cs_vehicle_at_rest: cs_gps_yaw_fault, fs_bad_optflow_y: fs_bad_acc_bias"""),
+        Layout("1.15", """1.16, without cs_gnss_pos cs_gnss_yaw cs_gnss_yaw_fault cs_rng_terrain cs_opt_flow_terrain
+            cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel, cs_yaw_align: cs_gps, cs_rng_stuck: cs_gps_yaw,
+            cs_vehicle_at_rest: cs_gps_yaw_fault, fs_bad_optflow_y: fs_bad_acc_bias"""),
         Layout("1.16", "1.17, without cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault"),
-        Layout("1.17", """
-            *, without cs_in_transition cs_heading_observable fs_bad_acc_bias fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d
-            fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d reject_mag_x reject_mag_y reject_mag_z"""),
-        Layout("1.18", """
-            1.17, without innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos
+        Layout("1.17", """*, without cs_in_transition cs_heading_observable fs_bad_acc_bias fs_bad_vel_n fs_bad_vel_e
+            fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d reject_mag_x reject_mag_y reject_mag_z"""),
+        Layout("1.18", """1.17, without innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos
             reject_ver_pos reject_yaw reject_airspeed reject_sideslip reject_hagl reject_optflow_x reject_optflow_y,
             cs_gnss_hgt_fault: cs_in_transition cs_heading_observable"""),
     )  # fmt: skip
@@ -46,7 +41,6 @@ class EstimatorStatusFlags(Message):
     RULES = (NotLater("timestamp_sample", "timestamp"),)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     control_status_changes: Uint32 = field("Number of changes of the cs_ flags")
     cs_tilt_align: Bool = field("Tilt alignment is complete")
     cs_yaw_align: Bool = field("Yaw alignment is complete")

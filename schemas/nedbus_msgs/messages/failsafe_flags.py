@@ -17,12 +17,10 @@ class FailsafeFlags(Message):
     LAYOUTS = (
         Layout("1.14", "1.15, without geofence_breached, battery_unhealthy: primary_geofence_breached"),
         Layout("1.15", "1.16, without navigator_failure"),
-        Layout("1.16", """
-            1.17, without mode_req_global_position_relaxed global_position_invalid_relaxed position_accuracy_low,
-            flight_time_limit_exceeded: local_position_accuracy_low"""),
-        Layout("1.17", """
-            main, without fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure fd_alt_loss
-            parachute_unhealthy traffic_avoidance_unhealthy remote_id_unhealthy gnss_lost,
+        Layout("1.16", """1.17, without mode_req_global_position_relaxed global_position_invalid_relaxed
+            position_accuracy_low, flight_time_limit_exceeded: local_position_accuracy_low"""),
+        Layout("1.17", """main, without fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure
+            fd_alt_loss parachute_unhealthy traffic_avoidance_unhealthy remote_id_unhealthy gnss_lost,
             navigator_failure: fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure"""),
         Layout("1.18", "main, without traffic_avoidance_unhealthy"),
         Layout("main", "*"),

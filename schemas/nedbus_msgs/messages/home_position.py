@@ -23,11 +23,7 @@ class HomePosition(Message):
         Layout("1.17", "1.15, z: roll pitch"),
         Layout("main", "*"),
     )
-    RULES = (
-        Within("lat", 90.0),
-        Within("lon", 180.0),
-        FiniteWhile({"valid_hpos": ("lat", "lon"), "valid_alt": ("alt",), "valid_lpos": ("x", "y", "z")}),
-    )
+    RULES = (Within(lat=90.0, lon=180.0), FiniteWhile(valid_hpos="lat lon", valid_alt="alt", valid_lpos="x y z"))
 
     lat: Float64 = field("Latitude [deg] [WGS84]")
     lon: Float64 = field("Longitude [deg] [WGS84]")
@@ -45,7 +41,6 @@ class HomePosition(Message):
     valid_hpos: Bool = field("lat and lon are valid")
     valid_lpos: Bool = field("x, y and z are valid")
     valid_attitude: Bool = field("roll, pitch and yaw are valid")
-
     manual_home: Bool = field("Home position was set manually")
     update_count: Uint32 = field("Number of home position updates since boot")
 

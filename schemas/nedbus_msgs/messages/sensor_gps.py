@@ -29,11 +29,9 @@ class SensorGps(Message):
         Topic("vehicle_gps_position", 50.0, "the GNSS selector or blending"),
     )
     LAYOUTS = (
-        Layout("1.13", """
-            1.14, without timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
+        Layout("1.13", """1.14, without timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
             selected_rtcm_instance, automatic_gain_control: jamming_indicator"""),
-        Layout("1.14", """
-            1.15, without latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m rtcm_crc_failed
+        Layout("1.14", """1.15, without latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m rtcm_crc_failed
             rtcm_msg_used, device_id: lat lon alt alt_ellipsoid"""),
         Layout("1.15", "1.17, without authentication_state system_error"),
         Layout("1.17", "1.18, without antenna_offset_x antenna_offset_y antenna_offset_z"),
@@ -47,10 +45,9 @@ class SensorGps(Message):
     )
     RULES = (
         NotLater("timestamp_sample", "timestamp"),
-        Within("latitude_deg", 90.0),
-        Within("longitude_deg", 180.0),
+        Within(latitude_deg=90.0, longitude_deg=180.0),
         NotNegative("eph", "epv"),
-        FiniteWhile({"vel_ned_valid": ("vel_n_m_s", "vel_e_m_s", "vel_d_m_s")}),
+        FiniteWhile(vel_ned_valid="vel_n_m_s vel_e_m_s vel_d_m_s"),
     )
 
     (
@@ -70,9 +67,7 @@ class SensorGps(Message):
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     device_id: Uint32 = field("Device ID, unchanged by restarts")
-
     latitude_deg: Float64 = field("Latitude [deg] [WGS84]")
     longitude_deg: Float64 = field("Longitude [deg] [WGS84]")
     altitude_msl_m: Float64 = field("Altitude above mean sea level [m]")
@@ -103,7 +98,6 @@ class SensorGps(Message):
 
     timestamp_time_relative: Int32 = field("Time of time_utc_usec relative to timestamp [us]")
     time_utc_usec: Uint64 = field("Unix time of the fix [us], 0 if unknown")
-
     satellites_used: Uint8 = field("Number of satellites used")
     system_error: Uint32 = field("Receiver error bitmask, see SYSTEM_ERROR_; 0 if none")
 

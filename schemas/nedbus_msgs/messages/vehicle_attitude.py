@@ -25,7 +25,6 @@ class VehicleAttitude(Message):
     RULES = (NotLater("timestamp_sample", "timestamp"), UnitQuaternion("q"))
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     q: Float32x4 = field("Rotation from FRD body to NED, Hamilton (w, x, y, z)")
     delta_q_reset: Float32x4 = field("Change of q at its latest reset: q after = delta_q_reset * q before")
     quat_reset_counter: Uint8 = field("Count of q resets, wraps at 255")

@@ -28,19 +28,16 @@ class VehicleGlobalPosition(Message):
     )
     RULES = (
         NotLater("timestamp_sample", "timestamp"),
-        Within("lat", 90.0),
-        Within("lon", 180.0),
+        Within(lat=90.0, lon=180.0),
         NotNegative("eph", "epv"),
-        FiniteWhile({"lat_lon_valid": ("lat", "lon"), "alt_valid": ("alt",), "terrain_alt_valid": ("terrain_alt",)}),
+        FiniteWhile(lat_lon_valid="lat lon", alt_valid="alt", terrain_alt_valid="terrain_alt"),
     )
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     lat: Float64 = field("Latitude [deg] [WGS84]")
     lon: Float64 = field("Longitude [deg] [WGS84]")
     alt: Float32 = field("Altitude above mean sea level [m]")
     alt_ellipsoid: Float32 = field("Altitude above the ellipsoid [m] [WGS84]")
-
     lat_lon_valid: Bool = field("lat and lon are valid")
     alt_valid: Bool = field("alt is valid")
 
@@ -55,7 +52,6 @@ class VehicleGlobalPosition(Message):
 
     terrain_alt: Float32 = field("Terrain altitude [m], NaN if unknown")
     terrain_alt_valid: Bool = field("terrain_alt is valid")
-
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
     global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "lat_lon_valid", "alt_valid")

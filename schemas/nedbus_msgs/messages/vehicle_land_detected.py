@@ -16,7 +16,6 @@ class VehicleLandDetected(Message):
     LAYOUTS = (Layout("1.13", "1.14, without rotational_movement"), Layout("1.14", "*"))
 
     freefall: Bool = field("Vehicle is in free fall")
-
     ground_contact: Bool = field("Stage 1: ground contact detected")
     maybe_landed: Bool = field("Stage 2: vehicle may have landed")
     landed: Bool = field("Stage 3: vehicle has landed")

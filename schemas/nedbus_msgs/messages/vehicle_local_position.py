@@ -37,13 +37,10 @@ class VehicleLocalPosition(Message):
     LAYOUTS = (
         Layout("1.13", "1.14, without dead_reckoning"),
         Layout("1.14", "1.15, without heading_var unaided_heading tilt_var"),
-        Layout("1.15", """
-            V0, without dist_bottom dist_bottom_var delta_dist_bottom dist_bottom_reset_counter,
+        Layout("1.15", """V0, without dist_bottom dist_bottom_var delta_dist_bottom dist_bottom_reset_counter,
             ref_alt: dist_bottom"""),
-        Layout(
-            "V0", "1.16, without hagl_max_z hagl_max_xy, hagl_min: hagl_max", wire=0,
-            aliases=("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0"),
-        ),
+        Layout("V0", "1.16, without hagl_max_z hagl_max_xy, hagl_min: hagl_max", wire=0, aliases=(
+            "px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0")),
         Layout("1.16", "*", wire=1),
     )  # fmt: skip
     ALWAYS = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"
@@ -56,20 +53,12 @@ class VehicleLocalPosition(Message):
         RenamedField("yaw_reset_counter", "heading_reset_counter"),
     )
     RULES = (
-        FiniteWhile({
-            "xy_valid": ("x", "y"),
-            "z_valid": ("z",),
-            "v_xy_valid": ("vx", "vy"),
-            "v_z_valid": ("vz",),
-            "heading_good_for_control": ("heading",),
-            "xy_global": ("ref_lat", "ref_lon"),
-            "z_global": ("ref_alt",),
-            "dist_bottom_valid": ("dist_bottom",),
-        }),
+        FiniteWhile(
+            xy_valid="x y", z_valid="z", v_xy_valid="vx vy", v_z_valid="vz", heading_good_for_control="heading",
+            xy_global="ref_lat ref_lon", z_global="ref_alt", dist_bottom_valid="dist_bottom",
+        ),
         NotNegative("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv"),
-        Within("heading", FLOAT32_PI),
-        Within("ref_lat", 90.0),
-        Within("ref_lon", 180.0),
+        Within(heading=FLOAT32_PI, ref_lat=90.0, ref_lon=180.0),
         NotLater("timestamp_sample", "timestamp"),
     )  # fmt: skip
 
@@ -77,7 +66,6 @@ class VehicleLocalPosition(Message):
     DIST_BOTTOM_SENSOR_NONE, DIST_BOTTOM_SENSOR_RANGE, DIST_BOTTOM_SENSOR_FLOW = range(3)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
-
     xy_valid: Bool = field("x and y are valid")
     z_valid: Bool = field("z is valid")
     v_xy_valid: Bool = field("vx and vy are valid")
@@ -130,7 +118,6 @@ class VehicleLocalPosition(Message):
     epv: Float32 = field("Standard deviation of down position [m]")
     evh: Float32 = field("Standard deviation of north and east velocity combined [m/s]")
     evv: Float32 = field("Standard deviation of down velocity [m/s]")
-
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
     vxy_max: Float32 = field("Maximum horizontal speed [m/s]; infinity if unlimited (0 in ground truth)")

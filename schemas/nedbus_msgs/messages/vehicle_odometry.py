@@ -25,8 +25,7 @@ class VehicleOdometry(Message):
         Topic("estimator_odometry", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
     )
     LAYOUTS = (
-        Layout("1.13", """
-            timestamp timestamp_sample local_frame x y z q q_offset:float32[4] pose_covariance:float32[21]
+        Layout("1.13", """timestamp timestamp_sample local_frame x y z q q_offset:float32[4] pose_covariance:float32[21]
             velocity_frame vx vy vz rollspeed pitchspeed yawspeed velocity_covariance:float32[21] reset_counter"""),
         Layout("1.14", "*"),
     )  # fmt: skip
@@ -42,7 +41,6 @@ class VehicleOdometry(Message):
     VELOCITY_FRAME_UNKNOWN, VELOCITY_FRAME_NED, VELOCITY_FRAME_FRD, VELOCITY_FRAME_BODY_FRD = range(4)
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us]")
-
     pose_frame: Uint8 = field("Frame of position and q: 0 unknown, 1 NED, 2 FRD with arbitrary heading")
     position: Float32x3 = field("Position [m] [pose_frame]")
     q: Float32x4 = field("Rotation from FRD body to pose_frame, Hamilton (w, x, y, z)")

@@ -18,22 +18,19 @@ class VehicleStatus(Message):
 
     TOPICS = (Topic("vehicle_status", 2.0, "the commander", on_change=True),)
     LAYOUTS = (
-        Layout("1.13", """
-            timestamp nav_state nav_state_timestamp arming_state hil_state failsafe failsafe_timestamp system_type
-            system_id component_id vehicle_type is_vtol is_vtol_tailsitter vtol_fw_permanent_stab in_transition_mode
-            in_transition_to_fw rc_signal_lost data_link_lost data_link_lost_counter high_latency_data_link_lost
-            engine_failure mission_failure geofence_violated failure_detector_status:uint8
+        Layout("1.13", """timestamp nav_state nav_state_timestamp arming_state hil_state failsafe failsafe_timestamp
+            system_type system_id component_id vehicle_type is_vtol is_vtol_tailsitter vtol_fw_permanent_stab
+            in_transition_mode in_transition_to_fw rc_signal_lost data_link_lost data_link_lost_counter
+            high_latency_data_link_lost engine_failure mission_failure geofence_violated failure_detector_status:uint8
             onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health
             latest_arming_reason latest_disarming_reason armed_time takeoff_time"""),
-        Layout("1.14", """
-            1.15, without executor_in_charge valid_nav_states_mask can_set_nav_states_mask failsafe_defer_state"""),
+        Layout("1.14", """1.15, without executor_in_charge valid_nav_states_mask can_set_nav_states_mask
+            failsafe_defer_state"""),
         Layout("1.15", "1.16, parachute_system_healthy: avoidance_system_required avoidance_system_valid"),
-        Layout("1.16", """
-            1.18, without nav_state_display accepts_offboard_setpoints traffic_avoidance_system_present,
+        Layout("1.16", """1.18, without nav_state_display accepts_offboard_setpoints traffic_avoidance_system_present,
             can_set_nav_states_mask: failure_detector_status"""),
-        Layout("1.18", """
-            *, without failure_detector_status avoidance_system_required avoidance_system_valid failsafe_timestamp
-            vtol_fw_permanent_stab rc_signal_lost engine_failure mission_failure geofence_violated
+        Layout("1.18", """*, without failure_detector_status avoidance_system_required avoidance_system_valid
+            failsafe_timestamp vtol_fw_permanent_stab rc_signal_lost engine_failure mission_failure geofence_violated
             onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health"""),
     )  # fmt: skip
     OLDER = (
@@ -66,7 +63,6 @@ class VehicleStatus(Message):
 
     armed_time: Uint64 = field("Time of arming, since boot [us], 0 if not armed")
     takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if none")
-
     arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 init, 3 error, 4 shutdown, 5 in-air restore")
     latest_arming_reason: Uint8 = field("Arming reason: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
     latest_disarming_reason: Uint8 = field("Disarming reason, as latest_arming_reason: 6 landing (up to 1.17: 7) ...")
@@ -74,11 +70,9 @@ class VehicleStatus(Message):
     nav_state_timestamp: Uint64 = field("Time of the latest change of nav_state, since boot [us]")
     nav_state_user_intention: Uint8 = field("Mode selected by the user, as nav_state")
     nav_state: Uint8 = field("Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ...")
-
     executor_in_charge: Uint8 = field("Mode executor in charge: 0 autopilot")
     nav_state_display: Uint8 = field("Mode to display to the user, as nav_state")
     accepts_offboard_setpoints: Bool = field("Active mode accepts offboard setpoints")
-
     valid_nav_states_mask: Uint32 = field("Available modes, as a bitmask of nav_state")
     can_set_nav_states_mask: Uint32 = field("Modes that the user can select, as a bitmask of nav_state")
 

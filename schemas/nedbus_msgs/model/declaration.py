@@ -14,8 +14,6 @@ RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 ALL: Final = "all"
 """Name of the layout with every field of the model, if no release of PX4 has them all."""
 
-_CACHE_SECONDS: Final = 20.0  # capacity of a publisher's cache at the nominal rate
-_MIN_CACHE: Final = 400  # messages
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -42,7 +40,7 @@ class Topic:
     @property
     def kept(self) -> int:
         """Number of messages in a publisher's retransmission cache: 20 s at the nominal rate, at least 400."""
-        return max(_MIN_CACHE, round(_CACHE_SECONDS * self.rate))
+        return max(400, round(20.0 * self.rate))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

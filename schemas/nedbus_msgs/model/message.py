@@ -115,14 +115,10 @@ class Message(BaseModel):
 
     def _error(self, broken: Iterable[tuple[str, str]]) -> ValidationError:
         """Create an error with one entry per field, like Pydantic's own."""
-        details: list[InitErrorDetails] = [
-            {
-                "type": PydanticCustomError("px4_rule", "{reason}", {"reason": reason}),
-                "loc": (name,),
-                "input": self.__dict__[name],
-            }
-            for name, reason in broken
-        ]
+        details = list[InitErrorDetails]()
+        for name, reason in broken:
+            error = PydanticCustomError("px4_rule", "{reason}", {"reason": reason})
+            details.append({"type": error, "loc": (name,), "input": self.__dict__[name]})
         return ValidationError.from_exception_data(self.DEFINITION.name, details)
 
 

@@ -41,8 +41,7 @@ BASES: Final[Mapping[str, Base]] = {
     "float64": Base("d", 0xCB, 11, NAN),
     "char": Base("s", 0xDA, 3, ""),  # only in arrays, which are text; ROS 2 uses uint8
 }
-ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
-"""Other names that PX4 uses for types of single values."""
+ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}  # PX4's other names for types of single values
 
 
 class FieldType(str):

@@ -48,13 +48,13 @@ class Rule:
 
 
 class FiniteWhile(Rule):
-    """Fields are finite while their flag is set; `flags` maps each flag to its fields."""
+    """Fields are finite while their flag is set; `flags`: the fields of each flag, separated by spaces."""
 
-    def __init__(self, flags: Mapping[str, Sequence[str]]) -> None:
-        self.flags = flags
+    def __init__(self, **flags: str) -> None:
+        self.flags = {flag: tuple(names.split()) for flag, names in flags.items()}
         super().__init__(
             Check(name, f"must be finite while {flag} is true", f"({{{flag}}} and not isfinite({{{name}}}))")
-            for flag, names in flags.items()
+            for flag, names in self.flags.items()
             for name in names
         )
 
@@ -67,10 +67,13 @@ class NotNegative(Rule):
 
 
 class Within(Rule):
-    """The magnitude of a field is at most a bound; NaN passes."""
+    """The magnitude of each field is at most its bound; NaN passes."""
 
-    def __init__(self, field: str, bound: float) -> None:
-        super().__init__([Check(field, f"must be within +-{bound:.9g}", f"(abs({{{field}}}) > {bound!r})")])
+    def __init__(self, **bounds: float) -> None:
+        super().__init__(
+            Check(field, f"must be within +-{bound:.9g}", f"(abs({{{field}}}) > {bound!r})")
+            for field, bound in bounds.items()
+        )
 
 
 class InRange(Rule):

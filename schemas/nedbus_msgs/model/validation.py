@@ -18,8 +18,7 @@ from .rules import Rule, compile_lambda, compile_rules
 
 _FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
-Values = tuple[object, ...]
-"""The values of all fields of a message, in order."""
+Values = tuple[object, ...]  # the values of all fields of a message, in order
 
 
 class Validation:

@@ -75,12 +75,9 @@ def define_msg(name: str, text: str) -> Definition[Message]:
         except ValueError as exc:
             raise MsgError(field.line, field.column, str(exc)) from None
     try:
-        return define(
-            name,
-            ((field.name, field.type) for field in fields),
-            meanings={field.name: field.comment for field in fields if field.comment},
-            rules=list(filter(None, rules)),
-        )
+        types = ((field.name, field.type) for field in fields)
+        meanings = {field.name: field.comment for field in fields if field.comment}
+        return define(name, types, meanings=meanings, rules=list(filter(None, rules)))
     except ValueError as exc:
         raise MsgError(1, 1, str(exc)) from None
 

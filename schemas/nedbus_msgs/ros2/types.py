@@ -1,7 +1,7 @@
 """ROS 2 types of messages: names, .msg definitions and RIHS01 hashes, computed from layouts."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from hashlib import sha256
 from typing import Any, Final
@@ -30,12 +30,14 @@ def dds_type(name: str) -> str:
 @cache
 def ros2_types() -> Mapping[str, Definition[Any]]:
     """Return the definitions of built-in messages by ROS 2 type, including the types of PX4's translation node."""
-    return {
-        name: definition
-        for definition in MESSAGES.values()
-        for layout in definition.layouts.values()
-        for name in (ros2_type(definition), *layout.aliases)
-    }
+    return {name: definition for name, definition, _ in _named_layouts()}
+
+
+def _named_layouts() -> Iterator[tuple[str, Definition[Any], Layout]]:
+    """Yield the layouts of built-in messages, each with its ROS 2 types."""
+    for definition in MESSAGES.values():
+        for layout in definition.layouts.values():
+            yield from ((name, definition, layout) for name in (ros2_type(definition), *layout.aliases))
 
 
 def hash_of(layout: Layout, ros2_type: str) -> str:
@@ -71,9 +73,4 @@ def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
 
 @cache
 def _by_hash() -> Mapping[str, tuple[Definition[Any], Layout]]:
-    return {
-        hash_of(layout, name).removeprefix(_RIHS01): (definition, layout)
-        for definition in MESSAGES.values()
-        for layout in definition.layouts.values()
-        for name in (ros2_type(definition), *layout.aliases)
-    }
+    return {hash_of(layout, name).removeprefix(_RIHS01): (each, layout) for name, each, layout in _named_layouts()}

@@ -94,8 +94,7 @@ class AsyncBus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
-        open_receiver = partial(self._in_thread, bus._open_receiver, pending_queue)
-        return AsyncSubscription(open_receiver, pending_queue)
+        return AsyncSubscription(partial(self._in_thread, bus._open_receiver, pending_queue), pending_queue)
 
     @overload
     async def latest(
@@ -194,8 +193,7 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
     def __init__(self, publisher: Publisher) -> None:
         self.address, self.key = publisher.address, publisher.key
         self.source, self.lossless = publisher.source, publisher.lossless
-        self._blocking = publisher
-        self._thread = ThreadPoolExecutor(1, "nedbus-async")
+        self._blocking, self._thread = publisher, ThreadPoolExecutor(1, "nedbus-async")
 
     @property
     def closed(self) -> bool:

@@ -33,12 +33,7 @@ class Bus(AbstractContextManager["Bus"]):
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        *,
-        timeout: float | None,
-        tls: Tls | None = None,
-        stop: threading.Event | None = None,
+        self, settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
     ) -> None:
         self.prefix, self.routers = settings.prefix, settings.routers
         self._tls, prefix = tls or settings.tls, settings.prefix
@@ -103,8 +98,7 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Subscription[Any]:
         """Subscribe to a selection of addresses; see `subscribe`."""
         pending_queue = self._make_queue(selection, mode, max_rate)
-        receiver = self._open_receiver(pending_queue)
-        return Subscription(receiver, pending_queue, owner=self)
+        return Subscription(self._open_receiver(pending_queue), pending_queue, owner=self)
 
     @overload
     def latest(
@@ -127,8 +121,7 @@ class Bus(AbstractContextManager["Bus"]):
         A sample from a storage has `stored` set; it is returned only if the publisher does not reply.
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        key_expr = selection.key_expr(prefix=self.prefix)
-        answers = query(self._session, key_expr, timeout=timeout)
+        answers = query(self._session, selection.key_expr(prefix=self.prefix), timeout=timeout)
         samples = list(Decoder(self._layouts, prefix=self.prefix).read(answers))
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
         newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
@@ -237,12 +230,12 @@ class Bus(AbstractContextManager["Bus"]):
             return PendingQueue(mode, decoder, name=selection.key_expr(prefix=self.prefix))
         return MaxRateQueue(mode, decoder, selection, max_rate=max_rate)
 
-    def _open_receiver(self, pending_queue: PendingQueue) -> Receiver:
+    def _open_receiver(self, pending: PendingQueue) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
-        if isinstance(pending_queue, MaxRateQueue):
-            receiver: Receiver = MaxRateReceiver(self._session, pending_queue)
-        else:
-            receiver = Receiver(self._session, pending_queue)
+        session = self._session
+        receiver = (
+            MaxRateReceiver(session, pending) if isinstance(pending, MaxRateQueue) else Receiver(session, pending)
+        )
         self._receivers.add(receiver)
         if self.closed:  # closed by another thread in the meantime
             receiver.close()

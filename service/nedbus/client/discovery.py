@@ -289,11 +289,9 @@ class Rejections:
     """
 
     def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
-        self._prefix = prefix
-        self._owner = owner  # keeps the bus open
+        self._prefix, self._owner = prefix, owner  # the owner keeps the bus open
         with translate_zenoh_errors():
-            reports = f"{prefix}{REJECTED}/**"
-            subscriber = session.declare_subscriber(reports, zenoh.handlers.RingChannel(_MAX_REPORTS))
+            subscriber = session.declare_subscriber(f"{prefix}{REJECTED}/**", zenoh.handlers.RingChannel(_MAX_REPORTS))
         self._handler = subscriber.handler
         self._finalizer = Finalizer(self, subscriber.undeclare)
 

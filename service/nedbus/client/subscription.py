@@ -58,8 +58,7 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
 
     def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, owner: object) -> None:
         super().__init__(pending_queue)
-        self._receiver = receiver
-        self._owner = owner  # keeps the bus open while the subscription is in use
+        self._receiver, self._owner = receiver, owner  # the owner keeps the bus open
         self._finalizer = Finalizer(self, receiver.close)
 
     def receive(self, timeout: float | None = None) -> Sample[M_co]:

@@ -89,8 +89,7 @@ def align(
     elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
         raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}", problem="is not among these arrays")
     else:
-        everything = not topics or ANY in topics
-        streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
+        streams = {name: (array, {}) for name, array in flight.items() if not topics or ANY in topics or name in names}
     if isinstance(on, str):
         found = [name for name in streams if f"/{name}".endswith(f"/{on}")]
         if not found:
@@ -135,8 +134,7 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):
         raise ArgumentError("fields", sorted(unknown), f"any of {', '.join(columns)}", problem="are in no stream")
-    times = {"timestamp", "utc"}
-    return {name: column for name, column in columns.items() if name in times or known[name] & {*fields}}
+    return {name: column for name, column in columns.items() if name in {"timestamp", "utc"} or known[name] & {*fields}}
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:

@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 _CHUNK: Final = 65536  # messages of a recording decoded at a time
 
 _Mask = npt.NDArray[np.bool_]
-Absent = Mapping[str, _Mask]
-"""Masks of the messages that lack a field, by field."""
-Streams = dict[str, tuple[MessageArray, Absent]]
-"""Messages by stream: topic or topic/instance."""
+Absent = Mapping[str, _Mask]  # masks of the messages that lack a field, by field
+Streams = dict[str, tuple[MessageArray, Absent]]  # by topic or topic/instance
 
 Pandas = Literal["pandas"]
 Polars = Literal["polars"]

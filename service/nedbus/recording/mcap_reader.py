@@ -11,19 +11,7 @@ from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import (
-    BY_TOPIC,
-    Address,
-    Definition,
-    FieldType,
-    Layout,
-    MsgError,
-    define_msg,
-    is_vehicle_input,
-    read_msg,
-    ros2_types,
-    split_ros2_topic,
-)
+from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
 
 from .flight_files import recording_files
 from .mcap_chunks import READ_ERRORS, ZSTD_MAGIC, ChunkFile, records_of
@@ -34,16 +22,13 @@ _DEFINITION_BUDGET: Final = 16_000  # for all definitions of a file: 32 per mess
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
-    """A channel: its address, the layout of its messages, and the fields that its source did not provide.
+    """A channel: its ROS 2 topic, address, layout of the messages, and the fields that its source did not provide."""
 
-    `is_input`: True for messages to the vehicle, `/fmu/in/...`.
-    """
-
+    ros2_topic: str
     address: Address
     definition: Definition[Any]
     layout: Layout
     missing: frozenset[str]
-    is_input: bool = False
 
 
 class RecordedMessage(NamedTuple):
@@ -120,8 +105,7 @@ class RecordingReader(ExitStack):
 
 class _RecordedFile:
     def __init__(self, path: Path, vehicle: str) -> None:
-        self.name = path.name
-        self._vehicle = vehicle
+        self.name, self._vehicle = path.name, vehicle
         self.boot_times: set[str] = set()
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
@@ -203,7 +187,7 @@ class _RecordedFile:
         if (boot := metadata.get("boot_time_utc_us", "")).isdecimal():
             self.boot_times.add(boot)
         missing = frozenset(metadata.get("missing", "").split())
-        return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
+        return RecordedStream(channel.topic, address, definition, layout, missing)
 
     def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:
         """Return the definition and layout of a schema; raise ValueError if they do not match the message."""
@@ -212,26 +196,26 @@ class _RecordedFile:
                 raise ValueError("the definitions in this file exceed the limit, which is the size of 250 PX4 topics")
             self._definition_budget -= len(schema.data) // 256
             text = schema.data.decode(errors="replace")
-            types = {field.name: field.type for field in read_msg(text)}
-            self._definition_budget -= 32 + len(types)
+            own = Layout("of the file", "", types={field.name: field.type for field in read_msg(text)})
+            self._definition_budget -= 32 + len(own.types)
             name = schema.name.rpartition("/")[2]
             try:
                 definition = ros2_types().get(schema.name) or define_msg(name, text)
-            except MsgError as exc:
+            except ValueError as exc:
                 definition = define_msg(name, text.replace("@range", "range"))
                 self.chunks.warn(f"ignored the ranges in the definition of {topic} ({exc})")
-            same = (each for each in definition.layouts.values() if [*each.types.items()] == [*types.items()])
-            self._layouts[schema.id] = definition, next(same, None) or self._own_layout(definition, types, topic)
+            same = (each for each in definition.layouts.values() if [*each.types.items()] == [*own.types.items()])
+            self._layouts[schema.id] = definition, next(same, None) or self._check_layout(own, definition, topic)
         return self._layouts[schema.id]
 
-    def _own_layout(self, known: Definition[Any], types: Mapping[str, FieldType], topic: str) -> Layout:
-        """Return the layout of a definition in no PX4 release; warn about unknown fields, which are left out."""
-        wrong = [name for name, kind in types.items() if kind not in known.known_types.get(name, {kind})]
-        if lacking := sorted({*wrong, *(known.always - types.keys())}):
+    def _check_layout(self, own: Layout, known: Definition[Any], topic: str) -> Layout:
+        """Return a layout that is in no PX4 release; warn about unknown fields, which are left out."""
+        wrong = [name for name, kind in own.types.items() if kind not in known.known_types.get(name, {kind})]
+        if lacking := sorted({*wrong, *(known.always - own.types.keys())}):
             raise ValueError(f"its definition of {', '.join(lacking)} matches no PX4 release")
-        if unknown := sorted(types.keys() - known.known_types.keys()):
+        if unknown := sorted(own.types.keys() - known.known_types.keys()):
             self.chunks.warn(f"left out {', '.join(unknown)} of {topic}, unknown to nedbus in {known.name}")
-        return Layout("of the file", "", types=types)
+        return own
 
 
 def _unpack(payload: bytes) -> bytes:

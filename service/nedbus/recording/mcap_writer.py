@@ -8,11 +8,11 @@ import errno
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, Final, Self, cast
+from typing import IO, Any, Final, cast
 
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
@@ -47,9 +47,11 @@ uint32 nanosec
 _LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # FATAL, ERROR, WARN, INFO, DEBUG, by PX4's severity
 
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
+_Streams = Iterable[tuple[Address, Provenance]]  # of each message
+_Times = Iterable[tuple[int, int, int]]  # log time [ns], publish time [ns] and sequence number of each message
 
 
-class RecordingWriter:
+class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     """Write messages to a new MCAP file; a context manager that finishes the file on exit.
 
     Each combination of address, definition and provenance has its own channel. Its layout is the current one; if no
@@ -62,8 +64,7 @@ class RecordingWriter:
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0) -> None:
-        self.path, self._boot_utc = Path(path), boot_utc
-        self.messages = 0
+        self.path, self._boot_utc, self.messages = Path(path), boot_utc, 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
         # Large chunks: the writer keeps an index per chunk and channel in memory.
@@ -85,7 +86,7 @@ class RecordingWriter:
         self,
         messages: MessageArray,
         definition: Definition[Any],
-        streams: Iterable[tuple[Address, Provenance]],
+        streams: _Streams,
         *,
         logged: Iterable[int],
         published: Iterable[int],
@@ -111,16 +112,12 @@ class RecordingWriter:
         self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file sequentially
 
     def _encode(
-        self,
-        messages: MessageArray,
-        definition: Definition[Any],
-        streams: Iterable[tuple[Address, Provenance]],
-        times: Iterable[tuple[int, int, int]],
+        self, messages: MessageArray, definition: Definition[Any], streams: _Streams, times: _Times
     ) -> Iterator[_Encoded]:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
         channels = self._channels.setdefault(definition, {})
         for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
-            channel, layout = channels.get(stream) or self._open_channel(definition, *stream)
+            channel, layout = channels.get(stream) or self._new_channel(definition, *stream)
             if layout not in encoded:
                 payloads = arrays_of(definition).encode_cdr(messages, layout)
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
@@ -152,28 +149,20 @@ class RecordingWriter:
             self._writer.finish()
             self._file.sync(end=b"")
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         if isinstance(exc[1], OutputError):
             self._file.raw.close()  # finishing the file would fail again
         else:
             self.close()
 
-    def _open_channel(
-        self, definition: Definition[Any], address: Address, provenance: Provenance
-    ) -> tuple[int, Layout]:
+    def _new_channel(self, definition: Definition[Any], address: Address, provenance: Provenance) -> tuple[int, Layout]:
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
-        metadata = {"vehicle": address.vehicle, "topic": address.topic}
-        if address.instance is not None:
-            metadata["instance"] = str(address.instance)
-        if provenance.source is not None:
-            metadata["source"] = provenance.source
-        if self._boot_utc:
-            metadata["boot_time_utc_us"] = str(self._boot_utc)
-        if provenance.missing:
-            metadata["missing"] = " ".join(sorted(provenance.missing))
+        known = {
+            "vehicle": address.vehicle, "topic": address.topic,
+            "instance": "" if address.instance is None else str(address.instance), "source": provenance.source or "",
+            "boot_time_utc_us": str(self._boot_utc or ""), "missing": " ".join(sorted(provenance.missing)),
+        }  # fmt: skip
+        metadata = {name: value for name, value in known.items() if value}
         channel = self._register(f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata)
         self._channels[definition][address, provenance] = channel, layout
         return channel, layout
@@ -207,8 +196,7 @@ class _AppendFile:
 
     def __init__(self, path: Path) -> None:
         self.raw = path.open("xb", buffering=0)
-        self._pending = bytearray()
-        self._offset = 0
+        self._pending, self._offset = bytearray(), 0
 
     def write(self, data: bytes) -> int:
         self._pending += data

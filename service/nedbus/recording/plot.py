@@ -49,6 +49,8 @@ _FLAGS: Final = (  # estimator flags
 )  # fmt: skip
 _COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy", "vz", "heading")}
 
+_Arrays = Sequence[tuple[Address, MessageArray]]
+
 
 class _Stream(NamedTuple):
     """A plotted stream: its messages, their times since the first message of all streams [s], and its colour."""
@@ -72,14 +74,7 @@ class _Mark(NamedTuple):
     end: float
 
 
-def draw(
-    streams: Sequence[tuple[Address, MessageArray]],
-    path: Path,
-    *,
-    title: str,
-    events: Iterable[Event] = (),
-    times: Times = _BOOT,
-) -> None:
+def draw(streams: _Arrays, path: Path, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT) -> None:
     """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
     Each stream must have at least one message.
@@ -100,9 +95,7 @@ def draw(
         raise OutputError(path, exc) from exc
 
 
-def draw_figure(
-    streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
-) -> Figure:
+def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT) -> Figure:
     """Return the figure that `draw` saves."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
     drawn = [
@@ -243,12 +236,10 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
             end = max(begin, last if span.until is None else min(span.until + offset, last))
             # Conditions that begin with the same event share a mark, which ends when the last condition ends.
             marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
-
-    def order(marks: list[_Mark]) -> tuple[int, float]:
-        return min((SEVERITIES.index(mark.event.severity), mark.begin) for mark in marks)
-
-    by_row = {row: sorted(marks.values(), key=lambda mark: mark.begin) for row, marks in rows.items()}
-    return dict(sorted(by_row.items(), key=lambda row: order(row[1])))
+    order = {
+        row: min((SEVERITIES.index(each.event.severity), each.begin) for each in rows[row].values()) for row in rows
+    }
+    return {row: sorted(rows[row].values(), key=lambda mark: mark.begin) for row in sorted(rows, key=order.__getitem__)}
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:

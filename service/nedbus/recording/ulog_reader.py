@@ -40,8 +40,7 @@ class UlogReader:
         self._checksums: dict[ulog.LoggedStream, int] = {}
         self._firsts: dict[ulog.LoggedStream, ulog.LoggedStream] = {}
         self.streams: dict[Address, ulog.LoggedStream] = {}
-        self.dropout = 0.0
-        self.damaged = False
+        self.dropout, self.damaged = 0.0, False
 
     @property
     def warnings(self) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Final
 
 from nedbus.errors import ConfigError, DecodeError, SourceError
 from nedbus.recording import RecordedMessage, RecordingReader
-from nedbus_msgs import Address, decode_with
+from nedbus_msgs import Address, decode_with, is_vehicle_input
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceMessage
@@ -69,7 +69,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
         return SourceMessage(due, address, {}, error=error, definition=definition)
     for name in recorded.stream.missing & definition.all_fields:
         fields.pop(name, None)
-    source = _INPUT if recorded.stream.is_input else None
+    source = _INPUT if is_vehicle_input(recorded.stream.ros2_topic) else None
     return SourceMessage(due, address, fields, definition=definition, source=source)
 
 

@@ -46,13 +46,13 @@ _STEP: Final = 1e-3  # s, step of the numerical derivatives
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
-_ARMED: Final = _BOOT - 1_000_000  # us since boot
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
 _ENDURANCE: Final = 1200.0  # s until the battery, then at 20 %, is replaced by a full one
 _BOOT_UTC: Final = 1_767_225_600_000_000  # us of Unix time at boot: start of 2026
 
 Vector = tuple[float, ...]  # north, east, down
+Values = dict[str, object]  # the fields of a message, by name
 
 
 class Truth(NamedTuple):
@@ -116,7 +116,7 @@ class Estimator:
         self._north, self._east = math.cos(direction), math.sin(direction)  # direction of the drift
         self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
 
-    def fields(self, truth: Truth) -> dict[str, object]:
+    def fields(self, truth: Truth) -> Values:
         """Return the local position; its limits are infinite, as EKF2 sends them."""
         state = self._at(truth.time)
         position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
@@ -134,7 +134,7 @@ class Estimator:
             **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
         }  # fmt: skip
 
-    def attitude(self, truth: Truth) -> dict[str, object]:
+    def attitude(self, truth: Truth) -> Values:
         """Return the attitude of a multicopter whose thrust causes the acceleration, without wind."""
         state, (ax, ay, az) = self._at(truth.time), truth.acceleration
         cos, sin = math.cos(truth.heading), math.sin(truth.heading)
@@ -147,7 +147,7 @@ class Estimator:
             "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"],
         }  # fmt: skip
 
-    def global_fields(self, truth: Truth) -> dict[str, object]:
+    def global_fields(self, truth: Truth) -> Values:
         """Return the global position, which the vehicle publishes only after the origin is known."""
         state = self._at(truth.time)
         x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
@@ -161,13 +161,13 @@ class Estimator:
             "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
         }  # fmt: skip
 
-    def status(self, truth: Truth) -> dict[str, object]:
+    def status(self, truth: Truth) -> Values:
         """Return the status: take-off, then a mission; while the position is invalid, a failsafe in altitude mode."""
         failsafe, is_mission = not self._at(truth.time).xy_valid, truth.time >= _CLIMB
         flown = _Status.NAVIGATION_STATE_AUTO_MISSION if is_mission else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
         mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
         return {
-            "armed_time": _ARMED, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
+            "armed_time": _BOOT - 1_000_000, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
             "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
             "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
             "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
@@ -199,14 +199,14 @@ class Estimator:
         moved, speed = _DRIFT * seconds**2, 2 * _DRIFT * seconds
         return (moved * self._north, moved * self._east), (speed * self._north, speed * self._east)
 
-    def _deviations(self, state: _State) -> dict[str, object]:
+    def _deviations(self, state: _State) -> Values:
         return {
             "eph": self._noise * 2 + _DRIFT * state.dead_reckoning**2, "epv": self._noise * 3,
             "dead_reckoning": state.dead_reckoning > 0,
         }  # fmt: skip
 
 
-def truth_fields(truth: Truth) -> dict[str, object]:
+def truth_fields(truth: Truth) -> Values:
     """Return the groundtruth message: variances and limits are 0, as simulators send them."""
     return {
         **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
@@ -217,9 +217,7 @@ def truth_fields(truth: Truth) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _motion(
-    position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool
-) -> dict[str, object]:
+def _motion(position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool) -> Values:
     """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
     latitude, longitude, altitude = truth.origin if has_origin else (math.nan,) * 3
     names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
@@ -236,7 +234,7 @@ def _motion(
     }  # fmt: skip
 
 
-def land_detected(truth: Truth) -> dict[str, object]:
+def land_detected(truth: Truth) -> Values:
     """Return the land detector's output: landed until take-off."""
     (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
     return {
@@ -246,7 +244,7 @@ def land_detected(truth: Truth) -> dict[str, object]:
     }  # fmt: skip
 
 
-def home(truth: Truth) -> dict[str, object]:
+def home(truth: Truth) -> Values:
     """Return the home position, with global coordinates once the origin is known."""
     known = truth.time >= _ORIGIN_SET
     latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
@@ -258,7 +256,7 @@ def home(truth: Truth) -> dict[str, object]:
     }  # fmt: skip
 
 
-def battery(truth: Truth) -> dict[str, object]:
+def battery(truth: Truth) -> Values:
     """Return the state of a battery that is discharged by a constant current."""
     discharged = _CURRENT * (truth.time % _ENDURANCE) / 3.6
     remaining = 1.0 - discharged / _CAPACITY
@@ -270,7 +268,7 @@ def battery(truth: Truth) -> dict[str, object]:
     }  # fmt: skip
 
 
-def gps(truth: Truth) -> dict[str, object]:
+def gps(truth: Truth) -> Values:
     """Return a noisy GNSS fix, or no fix before the origin is set and during a GPS outage."""
     time, is_started = truth.time, truth.time >= _ORIGIN_SET
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
@@ -292,7 +290,8 @@ def gps(truth: Truth) -> dict[str, object]:
     }  # fmt: skip
 
 
-Fields = Callable[[Truth], dict[str, object]]  # the fields of a message except `timestamp`
+Fields = Callable[[Truth], Values]  # except `timestamp`
+Streams = dict[Address, tuple[range, Fields]]  # the ticks and the fields of the messages
 
 
 def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
@@ -300,11 +299,7 @@ def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> R
     vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
     ticks = None if options.duration is None else round(options.duration / _TICK)
     streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)
-    chosen = {
-        address: stream
-        for address, stream in streams.items()
-        if stream[0] and (topics is None or address.topic in topics)
-    }
+    chosen = {at: each for at, each in streams.items() if each[0] and (topics is None or at.topic in topics)}
     if not chosen:
         asked = ", ".join(sorted(topics or ()))
         known = ", ".join(sorted({address.topic for address in streams}))
@@ -319,7 +314,7 @@ def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> R
     )
 
 
-def _streams(vehicle: str, seed: int, end: int) -> dict[Address, tuple[range, Fields]]:
+def _streams(vehicle: str, seed: int, end: int) -> Streams:
     """Return the ticks and the fields of all streams, in the order of their messages in one tick."""
     first, second = (Estimator(f"ekf {each}", seed, noise) for each, noise in enumerate((0.3, 0.5)))
     ins = Estimator("ins", seed, 0.05, aided=True)
@@ -342,7 +337,7 @@ def _streams(vehicle: str, seed: int, end: int) -> dict[Address, tuple[range, Fi
 
 
 def _messages(
-    chosen: Mapping[Address, tuple[range, Fields]], seed: int, ticks: int | None, origin: tuple[float, float, float]
+    chosen: Streams, seed: int, ticks: int | None, origin: tuple[float, float, float]
 ) -> Iterator[SourceMessage]:
     direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
     absent = {}  # fields of PX4's newest layout, with values that mean "not provided"

@@ -52,11 +52,9 @@ class Publisher(AbstractContextManager["Publisher"]):
         self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._new_timestamp = heartbeats.session.new_timestamp
-        self._registry = registry
-        self._owner = owner  # keeps the bus open
+        self._registry, self._owner = registry, owner  # the owner keeps the bus open
         self.definition = definition
-        self._codec = codec_of(definition)
-        self._all = definition.all_fields
+        self._codec, self._all = codec_of(definition), definition.all_fields
         self._encoding = self._declared = encoding_of(definition, source)
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # of the last message with missing fields
         topic = get_topic(address.topic)

@@ -112,11 +112,7 @@ class PublisherRegistry:
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
 
     def flush(
-        self,
-        publishers: Iterable[Publisher],
-        *,
-        timeout: float = FLUSH_TIMEOUT,
-        stop: threading.Event | None = None,
+        self, publishers: Iterable[Publisher], *, timeout: float = FLUSH_TIMEOUT, stop: threading.Event | None = None
     ) -> None:
         """Wait until readers have received all messages of these publishers; end after `timeout` s or on `stop`."""
         end = time.monotonic() + timeout

@@ -65,7 +65,8 @@ class Batch:
 
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
-    codec = decoder.codec(*arrivals[0][:3:2])  # may wait for a layout lookup
+    stream, _, raw, _, _ = arrivals[0]
+    codec = stream.codec or decoder.find_codec(stream, raw)  # may wait for a layout lookup
     definition = codec.definition if codec else DEFAULT
     blank = bytes(codec_of(definition).size)  # invalid placeholder for payloads of other layouts, decoded below
     own = codec.size if codec else -1

@@ -75,9 +75,7 @@ class Decoder:
     """Decode samples and count invalid ones; the reason is logged once per key, for the first 100 keys."""
 
     def __init__(self, layouts: LayoutLookup, *, prefix: str) -> None:
-        self.invalid = 0
-        self._layouts = layouts
-        self.prefix = prefix
+        self.invalid, self.prefix, self._layouts = 0, prefix, layouts
         self._warned: set[int] = set()  # hashes, because keys may be long
         self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject
 
@@ -111,16 +109,12 @@ class Decoder:
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     yield sample
 
-    def codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
-        """Return the codec of a sample; None if no publisher has its definition.
+    def find_codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
+        """Return the codec of the definition in the encoding, from its publisher; None if no publisher has it.
 
         `wait`: wait for a lookup in progress; never do so on a receiving thread.
         Raises DecodeError if the encoding identifies no message.
         """
-        return stream.codec or self._find_codec(stream, raw, wait=wait)
-
-    def _find_codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool) -> Codec[Any] | None:
-        """Return the codec of the definition in the encoding, from its publisher."""
         encoding = encoding_of(stream, raw)
         identity = identity_of(encoding)
         if identity is None:
@@ -135,7 +129,7 @@ class Decoder:
         """Return the fields of an unknown layout, which the hash in the encoding identifies; {} if there are none."""
         if stream.codec is None:
             return {}  # a definition that was looked up has a single layout
-        codec, name = self._find_codec(stream, raw, wait=wait), stream.codec.definition.name
+        codec, name = self.find_codec(stream, raw, wait=wait), stream.codec.definition.name
         return {error.layout: codec.definition.names} if codec and codec.definition.name == name else {}
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
@@ -143,7 +137,7 @@ class Decoder:
         stream, payload, raw, _, received = arrival
         if not payload:
             return None
-        codec = stream.codec or self.codec(stream, raw)
+        codec = stream.codec or self.find_codec(stream, raw)
         encoding = encoding_of(stream, raw)
         if codec is None:
             self.reject(stream.key, DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"), stream)
@@ -187,8 +181,8 @@ class Decoder:
             raise DecodeError(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
         if raw.kind == zenoh.SampleKind.DELETE:
             raise DecodeError("a delete sample, which nedbus publishers never send")
-        codec = self.codec(stream, raw, wait=False)  # None: decoded on read; the lookup may be done by then
-        if codec and len(payload) != codec.size:
+        codec = stream.codec or self.find_codec(stream, raw, wait=False)
+        if codec and len(payload) != codec.size:  # None: decoded on read; the lookup may be done by then
             try:
                 codec.decode(payload)
             except UnknownLayoutError as exc:

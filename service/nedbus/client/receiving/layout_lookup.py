@@ -65,8 +65,7 @@ class LayoutLookup:
     def __init__(
         self, find: Callable[[Mapping[SchemaId, Sender]], Schemas], *, now: Callable[[], float] = time.monotonic
     ) -> None:
-        self._find = find
-        self._now = now
+        self._find, self._now = find, now
         self._known: dict[SchemaId, _Known] = {}
         self._full = False
         self._errors = UnexpectedErrors(_log, "unexpected error in a lookup of definitions (logged once)")
@@ -96,8 +95,7 @@ class LayoutLookup:
     def wait(self, schema_id: SchemaId | None = None) -> None:
         """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
         with self._changed:
-            start = time.monotonic()
-            longest = TIMINGS.definition_timeout
+            start, longest = time.monotonic(), TIMINGS.definition_timeout
             budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
             is_pending = self._open.__len__ if schema_id is None else partial(self._open.__contains__, schema_id)
             self._changed.wait_for(lambda: self._closed or not is_pending(), longest if schema_id is None else budget)
@@ -193,12 +191,7 @@ class _Field:
     type: str
 
 
-@dataclass(slots=True)
-class _Layout:
-    fields: Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)]
-
-
-_LAYOUT: Final = TypeAdapter(_Layout)
+_FIELDS: Final = TypeAdapter(Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)])
 
 
 def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: str) -> Schemas:
@@ -228,7 +221,7 @@ def _parse(name: str, reply: object) -> Iterator[tuple[SchemaId, dict[str, str]]
     layouts = reply.get("layouts") if isinstance(reply, dict) else None
     for layout in layouts[:_MAX_REPLY_LAYOUTS] if isinstance(layouts, list) else ():
         with suppress(ValueError):
-            parsed = _LAYOUT.validate_python(layout)
-            fields = {field.name: field.type for field in parsed.fields}
-            if len(fields) == len(parsed.fields):
+            parsed = _FIELDS.validate_python(layout.get("fields") if isinstance(layout, dict) else None)
+            fields = {field.name: field.type for field in parsed}
+            if len(fields) == len(parsed):
                 yield (name, short_hash(name, {field: field_type(kind) for field, kind in fields.items()})), fields

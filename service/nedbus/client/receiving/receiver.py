@@ -29,9 +29,7 @@ from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
 
-RING_CAPACITY: Final = 16_384
-"""Samples that the ring holds between two polls: more than 0.2 s of the traffic of the largest fleet."""
-
+RING_CAPACITY: Final = 16_384  # samples between two polls: more than 0.2 s of the traffic of the largest fleet
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
@@ -49,8 +47,7 @@ class Receiver:
     """
 
     def __init__(self, session: Session, pending_queue: PendingQueue, *, history: bool = True) -> None:
-        self._session = session
-        self._queue, key_expr = pending_queue, pending_queue.name
+        self._session, self._queue, key_expr = session, pending_queue, pending_queue.name
         self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", key_expr)
         self._changing = threading.Lock()
         self._closed = False
@@ -156,9 +153,7 @@ class Receiver:
                 return
             batch = [handler.recv()]
             self._idle = False
-            if (item := handler.try_recv()) is not None:
-                batch.append(item)
-                drain(handler, batch)
+            drain(handler, batch)
         except zenoh.ZError:
             self._queue.end("its Zenoh session was closed")  # no effect after `close`
             return

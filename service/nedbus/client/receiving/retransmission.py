@@ -33,8 +33,7 @@ class Retransmission:
     """Send a queue's retransmission requests and collect the answers; a job of the I/O thread."""
 
     def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
-        self._session = session
-        self._queue = pending_queue
+        self._session, self._queue = session, pending_queue
         text = "%s: unexpected error, recovered messages discarded (logged once)"
         self._errors = UnexpectedErrors(_log, text, pending_queue.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}

@@ -13,27 +13,13 @@ from typing import Any, Final
 
 import zenoh
 
+from nedbus import transport
 from nedbus.errors import AddressError, ConfigError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Rejection, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
-from nedbus.transport import (
-    BRIDGED_ENCODING,
-    LONGEST_TOKEN,
-    PX4_TYPES,
-    Attachment,
-    LivelinessTokens,
-    PublisherToken,
-    Session,
-    Tls,
-    TopicKey,
-    check_endpoints,
-    node_token,
-    open_client,
-    px4_publishers_key_expr,
-    translate_zenoh_errors,
-)
+from nedbus.transport import Session, Tls, TopicKey
 from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
 
 from .streams import Definitions, NotAcceptedError, StreamRegistry
@@ -59,13 +45,11 @@ class Px4ZenohSource:
         self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
     ) -> None:
         if endpoint:
-            check_endpoints([endpoint], where="px4-zenoh")
+            transport.check_endpoints([endpoint], where="px4-zenoh")
         self._endpoints = (endpoint,) if endpoint else routers
         self._is_own = not endpoint or endpoint in routers
-        self._tls = tls
-        self._options = options
-        self._supplied = _read_definitions(options.msg)
-        self._vehicle = options.vehicle or vehicle
+        self._options, self._tls = options, tls
+        self._supplied, self._vehicle = _read_definitions(options.msg), options.vehicle or vehicle
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
         """Receive; raise SourceError if no router answers."""
@@ -75,7 +59,7 @@ class Px4ZenohSource:
                 session = router
             else:
                 try:
-                    session = open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
+                    session = transport.open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
                 except ConnectError as exc:
                     reason = "no Zenoh router answers; start one, or set another one with px4-zenoh:tcp/HOST:7447"
                     raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
@@ -96,15 +80,15 @@ class Px4ZenohNode:
     def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
         self._session, self._streams = session, streams
         self._pending: queue.SimpleQueue[zenoh.Sample | BaseException] = queue.SimpleQueue()
-        self._tokens = LivelinessTokens(session, px4_publishers_key_expr(domain))
+        self._tokens = transport.LivelinessTokens(session, transport.px4_publishers_key_expr(domain))
         self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
         self._subscriptions: dict[TopicKey, zenoh.LivelinessToken] = {}
         self._entities = 0
         self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
         self._reported = Counter[tuple[str, str]]()
-        key_expr = f"{'*' if domain is None else domain}/**/{PX4_TYPES}/*"
-        with translate_zenoh_errors():
+        key_expr = f"{'*' if domain is None else domain}/**/{transport.PX4_TYPES}/*"
+        with transport.translate_zenoh_errors():
             self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
         handler = self._subscriber.handler
         self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
@@ -146,7 +130,7 @@ class Px4ZenohNode:
         if sample.kind != zenoh.SampleKind.PUT:
             return None
         key, now = str(sample.key_expr), time.monotonic()
-        is_bridged = str(sample.encoding) == BRIDGED_ENCODING
+        is_bridged = str(sample.encoding) == transport.BRIDGED_ENCODING
         address: Address | None = None
         try:
             stream = self._streams.on_message(key, now)
@@ -161,7 +145,7 @@ class Px4ZenohNode:
                     _log.warning("%s: left out unknown fields %s; update nedbus", stream.key, names, extra=extra)
             definition, layout, unknown = form
             address = stream.address
-            attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
+            attachment = None if sample.attachment is None else transport.Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
                 if not stream.is_bridged:
                     extra = about("bridge_loop", source="px4-zenoh")
@@ -183,7 +167,7 @@ class Px4ZenohNode:
     def _on_token(self, text: str, *, alive: bool) -> None:
         now = time.monotonic()
         try:
-            token = PublisherToken.parse(text)
+            token = transport.PublisherToken.parse(text)
             if alive:
                 self._streams.add_publisher(token, now)
         except (AddressError, DecodeError, NotAcceptedError):
@@ -193,7 +177,7 @@ class Px4ZenohNode:
             if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
                 return
             if key.domain not in self._nodes:
-                self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
+                self._nodes[key.domain] = self._declare(transport.node_token(key.domain, self._zid, self._node))
             self._entities += 1
             self._subscriptions[key] = self._declare(key.token("MS", self._zid, self._node, self._entities))
         elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
@@ -203,7 +187,7 @@ class Px4ZenohNode:
                     self._nodes.pop(token.key.domain).undeclare()
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
-        with translate_zenoh_errors():
+        with transport.translate_zenoh_errors():
             return self._session.liveliness().declare_token(text)
 
     def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
@@ -212,7 +196,7 @@ class Px4ZenohNode:
                 sample = handler.recv()
                 if self._pending.qsize() >= _MAX_PENDING:
                     self._dropped[_TOO_FAST] += 1
-                elif len(sample.payload) > _MAX_PENDING_BYTES or len(str(sample.key_expr)) > LONGEST_TOKEN:
+                elif len(sample.payload) > _MAX_PENDING_BYTES or len(str(sample.key_expr)) > transport.LONGEST_TOKEN:
                     self._dropped[_TOO_LARGE] += 1
                 else:
                     self._pending.put(sample)

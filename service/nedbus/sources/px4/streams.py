@@ -32,8 +32,7 @@ _SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after whic
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each vehicle its own namespace or domain"
 
-Definitions = Mapping[str, Mapping[str, Definition[Any]]]
-"""Definitions supplied by the user, by DDS type and ROS 2 type hash."""
+Definitions = Mapping[str, Mapping[str, Definition[Any]]]  # supplied by the user, by DDS type and ROS 2 type hash
 
 
 class NotAcceptedError(Exception):
@@ -101,9 +100,7 @@ class StreamRegistry:
     """All keys with publishers or messages, and the stream that owns each address."""
 
     def __init__(self, options: Px4ZenohOptions, *, vehicle: str, supplied: Definitions | None = None) -> None:
-        self._options = options
-        self._supplied = supplied or {}
-        self._vehicle = vehicle
+        self._options, self._vehicle, self._supplied = options, vehicle, supplied or {}
         self._streams: dict[str, Px4Stream] = {}
         self._owners: dict[Address, Px4Stream] = {}
         self._reboots: dict[str, int] = {}  # by vehicle
@@ -140,8 +137,7 @@ class StreamRegistry:
     def wire_format_of(self, stream: Px4Stream) -> WireFormat:
         """Return the format of a stream's messages; raise NotAcceptedError if it is unknown."""
         definition, layout = self._layout_of(stream.key, stream.address.topic)
-        known = definition.known_types
-        unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
+        unknown = tuple(name for name, kind in layout.types.items() if kind not in definition.known_types.get(name, ()))
         stream.wire_format = WireFormat(definition, layout, unknown)
         stream.reboots = self._reboots.get(stream.address.vehicle, 0)
         return stream.wire_format
@@ -185,9 +181,7 @@ class StreamRegistry:
             if each.tokens or (each.wire_format and now - each.last_message < _EXPIRY) or now < each.ambiguous_until
         }
         known = {each.address.vehicle for each in self._streams.values()}
-        self._owners = {
-            address: each for address, each in self._owners.items() if self._streams.get(str(each.key)) is each
-        }
+        self._owners = {at: each for at, each in self._owners.items() if self._streams.get(str(each.key)) is each}
         self._reboots = {vehicle: count for vehicle, count in self._reboots.items() if vehicle in known}
         nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
         # A node without any message has a broken link, not silent topics.
