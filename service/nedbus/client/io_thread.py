@@ -18,7 +18,9 @@ from nedbus.log_event import UnexpectedErrors
 
 _log = logging.getLogger(__name__)
 
-TICK: Final = 0.06  # s; longer pauses are shortened to end at a multiple of it, so jobs are due at common times
+TICK: Final = 0.06
+"""Pauses of at least this length [s] are shortened to end at a multiple of it, so jobs are due at common times."""
+
 _MIN_PAUSE: Final = 0.002  # s between two calls of a job
 _RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
 

@@ -171,8 +171,7 @@ class LayoutLookup:
             text = "a layout of %s is newer than this reader; ignored fields: %s"
             _log.warning(text, name, unknown, extra=about("newer_layout", reason=reason))
         else:
-            text = "%s is not built in: using the publisher's definition"
-            _log.debug(text, name, extra=about("runtime_definition", reason=reason))
+            _log.debug("%s is not built in: using the publisher's definition, %s", name, reason)
         return True
 
     def _evict(self, size: int) -> bool:

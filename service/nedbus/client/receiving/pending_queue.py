@@ -33,12 +33,24 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-CAPACITY: Final = 65_536  # samples queued in mode `every`, about 45 MB; beyond that the oldest are dropped
-MAX_KEYS: Final = 10_000  # keys tracked, to bound memory; the least recently active are evicted and counted
-MAX_SILENCE: Final = 600.0  # s without a message or heartbeat after which a key above KEPT_KEYS is evicted
-KEPT_KEYS: Final = 1_000  # keys kept however long they are silent, to count the losses of a long outage
-MAX_HELD: Final = 131_072  # messages held back behind gaps, about 90 MB; beyond that gaps count as lost
-MAX_ACK_REQUESTS: Final = 1000  # pending acknowledgement requests; a well-behaved publisher has one per key
+CAPACITY: Final = 65_536
+"""Samples queued in mode `every`, about 45 MB; beyond that the oldest are dropped."""
+
+MAX_KEYS: Final = 10_000
+"""Keys tracked by a reader, to bound its memory; beyond that the least recently active are evicted and counted."""
+
+MAX_SILENCE: Final = 600.0
+"""Seconds without a message or heartbeat after which a key is evicted, if there are more than KEPT_KEYS."""
+
+KEPT_KEYS: Final = 1_000
+"""Keys kept however long they are silent, to count the losses of a long outage."""
+
+MAX_HELD: Final = 131_072
+"""Maximum number of messages held back behind gaps, about 90 MB; beyond it, gaps count as lost."""
+
+MAX_ACK_REQUESTS: Final = 1000
+"""Pending acknowledgement requests; a well-behaved publisher has one per key."""
+
 _MAX_BATCH: Final = 4096  # messages per batch
 _MAX_FRESH: Final = 1024  # samples queued with Zenoh's receive buffer; later ones are detached from it
 _MAX_WRITERS_OF_KEY: Final = 8  # beyond that the oldest writer without a gap is evicted

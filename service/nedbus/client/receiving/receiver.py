@@ -29,7 +29,9 @@ from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
 
-RING_CAPACITY: Final = 16_384  # samples between two polls: more than 0.2 s of the traffic of the largest fleet
+RING_CAPACITY: Final = 16_384
+"""Samples that the ring holds between two polls: more than 0.2 s of the traffic of the largest fleet."""
+
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again

@@ -15,7 +15,9 @@ from nedbus.transport import MAX_REPLIES
 from .decoder import Arrival, KeyState, detach
 
 NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
-MAX_GAP: Final = 2**30  # a larger step means that the publisher restarted or the message is late
+MAX_GAP: Final = 2**30
+"""Largest gap; a larger step means that the publisher restarted or the message is late."""
+
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
 _MAX_REORDERED: Final = 2**16  # a step back up to this size is a late message or a duplicate; a larger one is a restart
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
