@@ -100,7 +100,7 @@ class Px4ZenohNode:
         last: UnavailableTopics | None = None
         next_report = 0.0
         while True:
-            if not self._thread.is_alive():
+            if not self._thread.is_alive() and self._pending.empty():
                 raise SourceError("px4-zenoh", "receiving has stopped unexpectedly")
             new = self._dropped - self._reported
             for (where, reason), count in new.items():
