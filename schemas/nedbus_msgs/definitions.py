@@ -56,10 +56,9 @@ def define(
     size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
     if size > PAYLOAD_LIMIT:
         raise ValueError(f"a payload of {size} bytes, more than the limit of {PAYLOAD_LIMIT}")
-    annotated: dict[str, Any] = {
-        name: (Timestamp if name == "timestamp" else kind.annotation, Field(description=meanings.get(name)))
-        for name, kind in types.items()
-    }
+    described = {name: Field(description=meanings.get(name)) for name in types}
+    annotated: dict[str, Any] = {name: (kind.annotation, described[name]) for name, kind in types.items()}
+    annotated["timestamp"] = Timestamp, described["timestamp"]  # required
     model = create_model(name, __base__=Message, __doc__="A message defined at run time.", **annotated)
     model.LAYOUTS, model.RULES = (Layout("PX4", " ".join(types)),), rules  # the model has timestamp first
     model.DEFINITION = Definition(model)

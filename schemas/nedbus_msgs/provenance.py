@@ -86,7 +86,5 @@ def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
     source, missing = parts.get("source", ""), parts.get("missing", "")
     digits = math.ceil(len(definition.names) / 4)
     mask = int(missing, 16) if re.fullmatch(f"[0-9a-f]{{1,{digits}}}", missing) else 0
-    return Provenance(
-        source if _SOURCE.fullmatch(source) else None,
-        frozenset(name for index, name in enumerate(definition.names) if mask >> index & 1),
-    )
+    fields = frozenset(name for index, name in enumerate(definition.names) if mask >> index & 1)
+    return Provenance(source if _SOURCE.fullmatch(source) else None, fields)

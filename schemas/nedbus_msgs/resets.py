@@ -127,10 +127,8 @@ def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: 
     seconds = (message.timestamp - last.timestamp) / 1e6
     rates = _point(last, (f"v{each}" for each in fields))
     motion = [rate * seconds if math.isfinite(rate) else 0.0 for rate in rates]
-    observed = [
-        now - before - moved
-        for now, before, moved in zip(_point(message, fields), _point(last, fields), motion, strict=True)
-    ]
+    now, before = _point(message, fields), _point(last, fields)
+    observed = [new - old - moved for new, old, moved in zip(now, before, motion, strict=True)]
     tolerance = _TOLERANCE + math.hypot(*motion) / 2
     best = min((jump for jump in candidates if jump is not None), key=lambda jump: math.dist(jump, observed))
     return best if math.dist(best, observed) <= tolerance else None

@@ -110,11 +110,8 @@ class Selection:
 
     def matches(self, address: Address) -> bool:
         """Return whether an address is selected."""
-        return (
-            self.topic in (ANY, address.topic)
-            and self.vehicle in (ANY, address.vehicle)
-            and self.instance in (None, address.instance)
-        )
+        is_match = self.topic in (ANY, address.topic) and self.vehicle in (ANY, address.vehicle)
+        return is_match and self.instance in (None, address.instance)
 
     def key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression that matches the keys of these addresses."""

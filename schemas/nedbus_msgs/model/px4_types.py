@@ -102,9 +102,8 @@ class FieldType(str):
             text = core_schema.str_schema(max_length=self.size)
             return core_schema.no_info_after_validator_function(self._check_text, text)
         if self.length is not None:
-            return core_schema.tuple_positional_schema(
-                [field_type(self.base).core_schema(from_json=from_json)] * self.length
-            )
+            element = field_type(self.base).core_schema(from_json=from_json)
+            return core_schema.tuple_positional_schema([element] * self.length)
         if self.base == "bool":
             return core_schema.bool_schema()
         if not self.is_float:

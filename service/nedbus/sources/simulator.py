@@ -272,9 +272,8 @@ def gps(truth: Truth) -> Values:
     """Return a noisy GNSS fix, or no fix before the origin is set and during a GPS outage."""
     time, is_started = truth.time, truth.time >= _ORIGIN_SET
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
-    north, east, down = (
-        value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
-    )
+    noise = [0.3 * math.sin(time * rate) for rate in (1.7, 2.3, 3.1)]
+    north, east, down = (value + error for value, error in zip(truth.position, noise, strict=True))
     latitude, longitude = MapProjection(*truth.origin[:2]).reproject(north, east) if fix else (math.nan, math.nan)
     altitude = truth.origin[2] - down if fix else math.nan
     vx, vy, vz = truth.velocity if fix else (math.nan,) * 3

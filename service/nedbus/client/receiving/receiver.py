@@ -60,9 +60,8 @@ class Receiver:
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         with translate_zenoh_errors():
-            subscriber = zenoh.ext.declare_advanced_subscriber(
-                session, key_expr, zenoh.handlers.RingChannel(RING_CAPACITY), history=last
-            )
+            ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
+            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
         # Receive on the handler: a blocking receive on the subscriber prevents undeclaring it.
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
         self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
