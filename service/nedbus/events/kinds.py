@@ -148,7 +148,7 @@ _ROWS: Final = (
     ),
     Kind("lost", "watch", causes=("link_down", "overload")),
     Kind("rejected", "watch", kept_on_reboot=True),
-    Kind("overload", "watch"),
+    Kind("overload", "watch", fault=True),
     Kind("text", "watch", "LogMessage", row="PX4", phase=True, stateless=True),
     Kind(
         "heading_not_good", "info", _ESTIMATE, (*_SENSING, "reset", "landed"),

@@ -24,9 +24,9 @@ from .log_reassembly import Chunk
 _log = logging.getLogger(__name__)
 
 _SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted messages have `mavlink`
-_WINDOW: Final = 1.0  # s over which rate and delay are measured
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
+_WINDOW: Final = 1.0  # s over which rate and delay are measured
 _MAX_REQUESTS: Final = 10  # TIMESYNC requests that may be unanswered
 _FILE_HEADER: Final = 16  # bytes
 _RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
@@ -45,7 +45,8 @@ class LogStream:
         self._file: LogFile | None = None
         self._logged = LogStatus("idle")
         self._streamed: set[Address] = set()
-        self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
+        self._received = self._gaps = self._lost = self._undecodable = 0
+        self._lost_messages = 0.0  # estimate
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
         self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)  # times of unanswered TIMESYNC requests [ns]
@@ -59,6 +60,7 @@ class LogStream:
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
+        self._records = self._record_bytes = 0  # data
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
         self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
 
@@ -91,6 +93,8 @@ class LogStream:
             self._client.reject(str(exc))
             return
         self._undecodable += self._parser.undecodable - undecodable
+        sizes = [len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)]
+        self._records, self._record_bytes = self._records + len(sizes), self._record_bytes + sum(sizes)
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
                 if record.subscription not in self._streams:
@@ -130,6 +134,12 @@ class LogStream:
         if round_trip <= self._round_trip or abs(offset - self._offset) > tolerance:
             self._offset, self._round_trip = offset, round_trip
 
+    def add_delay(self, timestamp: object, now: float) -> None:
+        """Measure the age of a message that is published at time `now`, by the vehicle's clock."""
+        if self._round_trip < math.inf and isinstance(timestamp, int):
+            self._delays += now + self._offset - timestamp / 1e6
+            self._delayed += 1
+
     def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
         status = self._client.status
@@ -158,7 +168,7 @@ class LogStream:
         return LogStreamStatus(
             vehicle=self._name, state=state.state, reason=state.text, received=self._received, rate=self._rate,
             delay=self._delay, header_time=self._client.header_seconds, gaps=self._gaps, lost=self._lost,
-            lost_at_least=self._at_least, lost_at_most=self._at_most, undecodable=self._undecodable,
+            lost_messages=round(self._lost_messages), undecodable=self._undecodable,
             saved=str(self._file.path) if self._file else "",
         )  # fmt: skip
 
@@ -179,29 +189,19 @@ class LogStream:
         self._streams[subscription] = stream
 
     def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
-        timestamp = fields.get("timestamp")
-        if self._round_trip < math.inf and isinstance(timestamp, int):
-            self._delays += now + self._offset - timestamp / 1e6
-            self._delayed += 1
         self._streamed.add(stream.address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
         definition = stream.definition
-        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
+        return SourceMessage(now, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
-        """Count a gap; derive bounds on the number of lost records from the smallest and largest record size."""
+        """Count a gap; estimate the number of messages that it cuts or covers from their mean size so far."""
         self._gaps += 1
         self._lost += lost
-        smallest, largest = self._record_sizes()
-        least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
-        self._at_least += least
-        self._unreported += least
-        self._at_most += math.ceil(_CHUNK_SIZE * lost / smallest) + 1  # records are cut at both ends
+        before = round(self._lost_messages)
+        self._lost_messages += 1 + _CHUNK_SIZE * lost * self._records / max(1, self._record_bytes)
+        self._unreported += round(self._lost_messages) - before
         self._parser.gap()
-
-    def _record_sizes(self) -> tuple[int, int]:
-        sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
-        return min(sizes, default=_DATA_HEADER), max(sizes, default=_CHUNK_SIZE)
 
     def _save(self, chunk: Chunk, now: float) -> None:
         """Save a chunk; after an error stop saving, but continue publishing."""
