@@ -11,6 +11,7 @@ _NO_RECORD_BEGINS: Final = 255  # first_message_offset
 _MODULUS: Final = 2**16  # modulus of the sequence
 _MAX_STEP: Final = 2**15  # a larger sequence step means a duplicate
 _MARGIN: Final = 100  # messages that may be lost at once; PX4 loses up to 65 in a burst
+_BUFFERED: Final = 1.0  # s of messages that a full buffer on the way may drop without a visible pause
 _OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _MAX_STEP
 
 Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
@@ -79,7 +80,7 @@ class Reassembly:
         if now is not None:
             if lost:
                 lost += _MODULUS * max(0, round((self._rate.expected(now) - lost) / _MODULUS))
-                lost = lost if self._rate.explains(lost, now, margin=_MARGIN) else 1
+                lost = lost if self._rate.explains(lost, now + _BUFFERED, margin=_MARGIN) else 1
             self._rate.add(now)
         is_contiguous = self._synchronised and not lost
         self._synchronised = is_contiguous or first_message_offset != _NO_RECORD_BEGINS

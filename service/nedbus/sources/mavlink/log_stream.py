@@ -46,7 +46,8 @@ class LogStream:
         self._logged = LogStatus("idle")
         self._streamed: set[Address] = set()
         self._received = self._gaps = self._lost = self._undecodable = 0
-        self._lost_messages = 0.0  # estimate
+        self._records = self._record_bytes = 0  # data messages, whose mean size estimates the number of lost ones
+        self._lost_messages = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
         self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)  # times of unanswered TIMESYNC requests [ns]
@@ -60,7 +61,6 @@ class LogStream:
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
-        self._records = self._record_bytes = 0  # data
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
         self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
 
@@ -164,11 +164,12 @@ class LogStream:
             self._rate = self._window_bytes / seconds
             self._delay = self._delays / self._delayed if self._delayed else None
             self._window_start, self._window_bytes, self._delays, self._delayed = now, 0, 0.0, 0
+        self._estimate_lost()  # a gap may precede the first message
         state = self._client.status
         return LogStreamStatus(
             vehicle=self._name, state=state.state, reason=state.text, received=self._received, rate=self._rate,
             delay=self._delay, header_time=self._client.header_seconds, gaps=self._gaps, lost=self._lost,
-            lost_messages=round(self._lost_messages), undecodable=self._undecodable,
+            lost_messages=self._lost_messages, undecodable=self._undecodable,
             saved=str(self._file.path) if self._file else "",
         )  # fmt: skip
 
@@ -195,13 +196,16 @@ class LogStream:
         return SourceMessage(now, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
-        """Count a gap; estimate the number of messages that it cuts or covers from their mean size so far."""
         self._gaps += 1
         self._lost += lost
-        before = round(self._lost_messages)
-        self._lost_messages += 1 + _CHUNK_SIZE * lost * self._records / max(1, self._record_bytes)
-        self._unreported += round(self._lost_messages) - before
+        self._estimate_lost()
         self._parser.gap()
+
+    def _estimate_lost(self) -> None:
+        """Update the number of lost messages: each gap cuts one, and covers others by their mean size so far."""
+        covered = _CHUNK_SIZE * self._lost * self._records / max(1, self._record_bytes)
+        before, self._lost_messages = self._lost_messages, max(self._lost_messages, round(self._gaps + covered))
+        self._unreported += self._lost_messages - before
 
     def _save(self, chunk: Chunk, now: float) -> None:
         """Save a chunk; after an error stop saving, but continue publishing."""

@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LinkLoad, LiveSource, SourceMessage, parse_source
+from nedbus.sources.mavlink import log_stream
 from nedbus.sources.mavlink import source as mavlink_source
 from nedbus.sources.mavlink.link import open_link
 from tests.flights.ulogs import write_raw_log
@@ -77,6 +78,7 @@ class Px4:
 def test_delay_includes_the_time_that_messages_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While the publisher waits for half of each second, `delay` is that of the publication, and no late data is ok."""
     monkeypatch.setattr(mavlink_source, "_STATUS_INTERVAL", 0.25)
+    monkeypatch.setattr(log_stream, "_WINDOW", 0.75)
     path = write_raw_log(tmp_path / "a.ulg", {"battery_status": ("uint64_t timestamp;int32_t cell_count;", "Qi")}, [])
     port = free_port()
     source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?log=1").open_source(vehicle="1"))

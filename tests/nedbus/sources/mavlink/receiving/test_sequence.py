@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
+
+import pytest
 
 from nedbus.sources.mavlink.log_reassembly import Reassembly
 from nedbus.sources.mavlink.sequence import PacketRate, SequenceCounter
+from tests.peers.px4_log_stream import STREAMS, datagrams, stream_message
 
 HEADER = b"ULog\x01\x12\x35\x01" + bytes(20)
 
@@ -44,6 +48,27 @@ def test_random_sequence_numbers_lose_little() -> None:
         lost_data += reassembly.add(rng.randrange(2**16), 4, 0, b"data", number / 20).lost
     assert lost < 460
     assert lost_data < 2 * 460
+
+
+@pytest.mark.logs
+@pytest.mark.slow
+@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
+@pytest.mark.parametrize(("path", "lost", "lost_data"), [
+    (STREAMS.parent / "link_cut_20s_in_flight.bin.gz", 21, 1475),  # MAVLink's sequence is unknown after the cut
+    (STREAMS.parent / "foreign_stop_in_flight.bin.gz", 0, 0),
+    (STREAMS / "ulog_stream_lossy1.bin.gz", 607, 237),
+    (STREAMS / "ulog_stream_session.bin.gz", 63, 615 + 3433),  # a reader that paused for 5 s
+], ids=lambda each: getattr(each, "name", ""))  # fmt: skip
+def test_losses_of_recorded_links(path: Path, lost: int, lost_data: int) -> None:
+    """Losses of a real PX4 (SITL) at the recorded times are counted in full: no gap is taken for a restart."""
+    counter, reassembly, found, found_data = SequenceCounter(), Reassembly(), 0, 0
+    for seconds, from_vehicle, frame in datagrams(path):
+        if from_vehicle and frame[6] == 1:
+            found += counter.add(frame[4], seconds)
+            if message := stream_message(frame):
+                content = message.sequence, len(message.data), message.offset, message.data
+                found_data += reassembly.add(*content, seconds).lost
+    assert (found, found_data) == (lost, lost_data)
 
 
 def test_gap_of_more_than_65536_messages_is_counted_in_full() -> None:
