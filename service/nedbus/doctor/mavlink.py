@@ -44,10 +44,11 @@ def check_mavlink(link: str) -> Iterator[Finding]:
         seen = f"no MAVLink among the packets from {list_names(sorted(senders))} (total: {senders.total()})"
         advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
+    # Ground stations and cameras are normal, but not alone.
+    reported = {ids: fault for ids, fault in faults.items() if not systems or not all(ids) or not ignore_reason(*ids)}
     yield from limit_findings(
         Finding("mavlink", f"{link} system {system} component {component}", "wrong", fault)
-        for (system, component), fault in sorted(faults.items())
-        if system not in systems or not ignore_reason(system, component)
+        for (system, component), fault in sorted(reported.items())
     )
     ordered = sorted(systems.items())
     yield from limit_findings(_check_system(link, number, messages) for number, messages in ordered)
@@ -69,7 +70,7 @@ def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[
         if link.peer is not None and now >= next_heartbeat:  # some peers send only to addresses that they received from
             next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
-        for data, peer in link.read(_READ_TIMEOUT):
+        for data, peer, _ in link.read(_READ_TIMEOUT):
             name = ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
             if name in senders or len(senders) < _MAX_SENDERS:
                 senders[name] += 1

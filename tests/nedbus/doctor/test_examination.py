@@ -602,6 +602,8 @@ def test_mavlink_traffic_produces_findings() -> None:
     findings = check_link(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)
     find(findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7")
     assert not any("component 100" in each.subject for each in findings)
+    findings = check_link(*packets_of(7, heartbeat, position), *packets_of(255, heartbeat, component=190))
+    assert not [each for each in findings if each.check == "mavlink" and each.state != "ok"], "a ground station"
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
         findings = diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")

@@ -24,9 +24,9 @@ from .log_reassembly import Chunk
 _log = logging.getLogger(__name__)
 
 _SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted messages have `mavlink`
-_WINDOW: Final = 1.0  # s over which rate and delay are measured
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
+_WINDOW: Final = 1.0  # s over which rate and delay are measured
 _MAX_REQUESTS: Final = 10  # TIMESYNC requests that may be unanswered
 _FILE_HEADER: Final = 16  # bytes
 _RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
@@ -45,7 +45,9 @@ class LogStream:
         self._file: LogFile | None = None
         self._logged = LogStatus("idle")
         self._streamed: set[Address] = set()
-        self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
+        self._received = self._gaps = self._lost = self._undecodable = 0
+        self._records = self._record_bytes = 0  # data messages, whose mean size estimates the number of lost ones
+        self._lost_messages = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
         self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)  # times of unanswered TIMESYNC requests [ns]
@@ -92,6 +94,8 @@ class LogStream:
             self._client.reject(str(exc))
             return
         self._undecodable += self._parser.undecodable - undecodable
+        sizes = [len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)]
+        self._records, self._record_bytes = self._records + len(sizes), self._record_bytes + sum(sizes)
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
                 if record.subscription not in self._streams:
@@ -131,6 +135,12 @@ class LogStream:
         if round_trip <= self._round_trip or abs(offset - self._offset) > tolerance:
             self._offset, self._round_trip = offset, round_trip
 
+    def add_delay(self, timestamp: object, now: float) -> None:
+        """Measure the age of a message that is published at time `now`, by the vehicle's clock."""
+        if self._round_trip < math.inf and isinstance(timestamp, int):
+            self._delays += now + self._offset - timestamp / 1e6
+            self._delayed += 1
+
     def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
         status = self._client.status
@@ -156,11 +166,12 @@ class LogStream:
             self._rate = self._window_bytes / seconds
             self._delay = self._delays / self._delayed if self._delayed else None
             self._window_start, self._window_bytes, self._delays, self._delayed = now, 0, 0.0, 0
+        self._estimate_lost()  # a gap may precede the first message
         state = self._client.status
         return LogStreamStatus(
             vehicle=self._name, state=state.state, reason=state.text, received=self._received, rate=self._rate,
             delay=self._delay, header_time=self._client.header_seconds, gaps=self._gaps, lost=self._lost,
-            lost_at_least=self._at_least, lost_at_most=self._at_most, undecodable=self._undecodable,
+            lost_messages=self._lost_messages, undecodable=self._undecodable,
             saved=str(self._file.path) if self._file else "",
         )  # fmt: skip
 
@@ -181,29 +192,22 @@ class LogStream:
         self._streams[subscription] = stream
 
     def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
-        timestamp = fields.get("timestamp")
-        if self._round_trip < math.inf and isinstance(timestamp, int):
-            self._delays += now + self._offset - timestamp / 1e6
-            self._delayed += 1
         self._streamed.add(stream.address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
         definition = stream.definition
-        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
+        return SourceMessage(now, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
-        """Count a gap; derive bounds on the number of lost records from the smallest and largest record size."""
         self._gaps += 1
         self._lost += lost
-        smallest, largest = self._record_sizes()
-        least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
-        self._at_least += least
-        self._unreported += least
-        self._at_most += math.ceil(_CHUNK_SIZE * lost / smallest) + 1  # records are cut at both ends
+        self._estimate_lost()
         self._parser.gap()
 
-    def _record_sizes(self) -> tuple[int, int]:
-        sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
-        return min(sizes, default=_DATA_HEADER), max(sizes, default=_CHUNK_SIZE)
+    def _estimate_lost(self) -> None:
+        """Update the number of lost messages: each gap cuts one, and covers others by their mean size so far."""
+        covered = _CHUNK_SIZE * self._lost * self._records / max(1, self._record_bytes)
+        before, self._lost_messages = self._lost_messages, max(self._lost_messages, round(self._gaps + covered))
+        self._unreported += self._lost_messages - before
 
     def _save(self, chunk: Chunk, now: float) -> None:
         """Save a chunk; after an error stop saving, but continue publishing."""

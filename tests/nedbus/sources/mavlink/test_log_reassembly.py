@@ -42,9 +42,11 @@ class CountingReassembly(Reassembly):
         self.counts = Counter[Verdict]()
         self.lost = self.bytes = self.skipped = 0
 
-    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:
+    def add(
+        self, sequence: int, length: int, first_message_offset: int, data: Sequence[int], now: float | None = None
+    ) -> Chunk:
         """Add the next message and count the result."""
-        chunk = super().add(sequence, length, first_message_offset, data)
+        chunk = super().add(sequence, length, first_message_offset, data, now)
         self.counts[chunk.verdict] += 1
         self.lost += chunk.lost
         self.bytes += len(chunk.data)
@@ -136,7 +138,7 @@ def test_gap_skips_to_next_record() -> None:
     assert add(reassembly, plain(3, offset=255)) == Chunk("unsynchronised", lost=2)
     assert add(reassembly, plain(4, offset=255)) == Chunk("unsynchronised")
     assert add(reassembly, plain(6, b"end-begin", offset=4)) == Chunk("delivered", b"begin", lost=1)
-    assert add(reassembly, plain(7, offset=255)) == Chunk("delivered", b"data")
+    assert add(reassembly, plain(7, offset=255)) == Chunk("delivered", b"data", offset=255)
     assert (reassembly.lost, reassembly.skipped, reassembly.bytes) == (3, 12, SIZE + 9)
 
 
