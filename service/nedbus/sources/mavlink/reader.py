@@ -166,7 +166,8 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
         elif kind == "HEARTBEAT":
             if vehicle is None:
-                client = LogStreamClient(self._options.log, system=SYSTEM, component=COMPONENT)
+                ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
+                client = LogStreamClient(options.log, **ids, header=options.header)
                 vehicle = self.vehicles[received.system] = _Vehicle(received.system, client, received.peer)
             vehicle.peer = received.peer
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -174,6 +175,8 @@ class LogReceiver:
         elif vehicle is not None and kind == "COMMAND_ACK":
             target = message.target_system, message.target_component
             self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
+        elif vehicle is not None and kind == "TIMESYNC" and message.tc1:
+            self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
         elif vehicle is not None and vehicle.clock.add(message, now):
             vehicle.client.on_reboot()
             vehicle.reassembly = Reassembly()
@@ -183,6 +186,8 @@ class LogReceiver:
         for command in commands:
             if command.kind == "acknowledge":
                 message: Any = dialect.MAVLink_logging_ack_message(vehicle.system, AUTOPILOT, command.sequence)
+            elif command.kind == "ping":
+                message = dialect.MAVLink_timesync_message(0, command.sequence)
             else:
                 parameters = [COMMANDS[command.kind], 0, *(0,) * 7]
                 message = dialect.MAVLink_command_long_message(vehicle.system, AUTOPILOT, *parameters)
