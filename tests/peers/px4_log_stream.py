@@ -280,6 +280,16 @@ class Px4LogStream:
         if self._failure:
             raise self._failure
 
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last HEARTBEAT had the armed flag."""
+        return bool(unpack(self._heartbeat)[1][6] & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def change_owner(self, ids: tuple[int, int]) -> None:
+        """Address the stream to another client from now on."""
+        assert self._stream
+        self._stream.ids = ids
+
     def trigger(self, event: Event) -> None:
         """Cause an event now."""
         self._triggered.append(event)

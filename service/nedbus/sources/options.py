@@ -147,6 +147,11 @@ class MavlinkOptions(Options):
     header: Annotated[float, Field(ge=1, le=600)] | None = Field(
         None, description="seconds that the header of a ULog stream may take, 1 to 600 (default: 10)"
     )
+    state: str = Field(
+        "",
+        description="a folder for the state of ULog streams, which a restarted service continues, or 0 for none"
+        " (default: ulog-streams in $STATE_DIRECTORY, or in $XDG_STATE_HOME/nedbus)",
+    )
     save: Annotated[str, AfterValidator(_check_save)] = Field(
         "", description="a folder in which each ULog stream is saved as a .ulg file; requires log="
     )

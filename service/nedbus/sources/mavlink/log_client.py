@@ -24,7 +24,7 @@ _DECAY: Final = 0.98  # decay of the longest interval between messages, per mess
 
 LogReason = Literal[
     "not_px4", "armed", "taken", "bandwidth", "unsupported", "failed", "no_answer", "no_data", "slow_link", "stalled",
-    "silent", "stopped_elsewhere", "link_lost", "unreadable",
+    "silent", "stopped_elsewhere", "link_lost", "unreadable", "left",
 ]  # fmt: skip
 _TEXTS: Final[Mapping[LogReason, str]] = {
     "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
@@ -47,6 +47,7 @@ _TEXTS: Final[Mapping[LogReason, str]] = {
     "stopped_elsewhere": "PX4 stopped the ULog stream, probably because another client requested it",
     "link_lost": "no message arrived from the vehicle for {:.1f} s; the link seems to be lost",
     "unreadable": "the ULog stream cannot be read, because {}",
+    "left": "the ULog stream of the armed vehicle continues, for the next process",
 }
 _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_TEMPORARILY_REJECTED: "taken",
@@ -101,7 +102,7 @@ class LogStreamClient:
         self._log, self._ids, self._longest_header = log, (system, component), header
         self._owner = "another client"
         self.header_seconds: float | None = None
-        self._is_px4 = self._armed = False
+        self._is_px4 = self._armed = self._is_left = False
         self._reset()
 
     def _reset(self) -> None:
@@ -138,6 +139,15 @@ class LogStreamClient:
         elif self.status.reason == "link_lost":
             self._resume(now)  # PX4 continues to stream without a client
         return self.tick(now)
+
+    def adopt(self, now: float) -> None:
+        """Continue a stream of an earlier process that is addressed to this client, and whose definitions are known."""
+        self._awaited, self._has_header, self._has_sent_command = None, True, True
+        self._resume(now)
+
+    def leave(self) -> None:
+        """Let `stop` leave the stream of an armed vehicle running; like `reject`, may be called on any thread."""
+        self._is_left = True
 
     def on_reboot(self) -> None:
         """Handle a reboot of the vehicle, which ends the stream."""
@@ -226,13 +236,16 @@ class LogStreamClient:
         return []
 
     def reject(self, reason: str) -> None:
-        """Stop the current stream, which cannot be read; unlike all other methods, may be called on any thread."""
+        """Stop the current stream, which cannot be read; unlike most methods, may be called on any thread."""
         self._unreadable = reason
 
     def stop(self, now: float) -> list[Command]:
         """End this client's stream; call `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
         if self._awaited == "pong":
             self._awaited = None
+        if self._is_left and self._armed and self.status.state == "streaming":
+            self._enter("stopped", "left", now)
+            return []
         is_ours = self.status.state in ("header", "streaming") or self._awaited == "data"
         self._enter("stopping" if is_ours or self._awaited else "stopped", None, now)
         return self._send("stop", now) if is_ours else []

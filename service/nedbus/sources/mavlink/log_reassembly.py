@@ -49,6 +49,15 @@ class Reassembly:
         self._last: int | None = None  # last sequence; None before the first stream
         self._synchronised = False
 
+    @property
+    def is_new(self) -> bool:
+        """True before the first stream."""
+        return self._last is None
+
+    def resume(self, sequence: int) -> None:
+        """Continue a stream whose last known message has this sequence; the next record begins a contiguous part."""
+        self._last, self._synchronised = sequence, False
+
     def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:
         """Add the next message; `data` may lack trailing zeros, which MAVLink 2 does not transmit."""
         content = bytes(data[:length]).ljust(length, b"\0")

@@ -17,6 +17,7 @@ from .boot_clock import BootClock
 from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
+from .saved_stream import read_stream, state_path
 
 # Ids of a companion computer: its loss, unlike that of a ground station, triggers no failsafe.
 SYSTEM: Final = 245
@@ -91,6 +92,7 @@ class _Vehicle:
     peer: Peer
     reassembly: Reassembly = field(default_factory=Reassembly)
     clock: BootClock = field(default_factory=BootClock)
+    refusal: str = ""  # why the stream of an earlier process cannot be continued
 
 
 class LogReceiver:
@@ -149,22 +151,8 @@ class LogReceiver:
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self.vehicles.get(received.system)
         if kind.startswith("LOGGING_DATA"):
-            target = message.target_system, message.target_component
-            if vehicle is None or not vehicle.client.accepts(*target):
-                if target != (SYSTEM, COMPONENT):
-                    return received
-                where = f"{self._reader.name} system {received.system}"
-                return Rejection(where, f"{kind} of a stream that was not requested")
-            begins = False
-            if not is_full:
-                fields = message.sequence, message.length, message.first_message_offset, message.data
-                chunk = vehicle.reassembly.add(*fields)
-                received, begins = received._replace(chunk=chunk), chunk.begins
-                if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
-                    vehicle.clock.confirm()
-            is_acked = kind == "LOGGING_DATA_ACKED"
-            self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
-        elif kind == "HEARTBEAT":
+            return self._process_data(received, vehicle, is_full=is_full)
+        if kind == "HEARTBEAT":
             if vehicle is None:
                 ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
                 client = LogStreamClient(options.log, **ids, header=options.header)
@@ -179,8 +167,57 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
         elif vehicle is not None and vehicle.clock.add(message, now):
             vehicle.client.on_reboot()
-            vehicle.reassembly = Reassembly()
+            vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received
+
+    def _process_data(self, received: Received, vehicle: _Vehicle | None, *, is_full: bool) -> Received | Rejection:
+        """Acknowledge and reassemble data of the ULog stream; see `_process`."""
+        message, kind, now = received.message, received.message.get_type(), received.time
+        target = message.target_system, message.target_component
+        is_ours = target == (SYSTEM, COMPONENT)
+        if vehicle and is_ours and vehicle.reassembly.is_new and message.sequence and not vehicle.refusal:
+            if is_full or vehicle.client.status.state in ("stopping", "stopped"):
+                return received
+            if (adopted := self._adopt(vehicle, now)) or not vehicle.refusal:
+                return received._replace(chunk=adopted)
+        if vehicle is None or not vehicle.client.accepts(*target):
+            if not is_ours:
+                return received
+            where, reason = (
+                f"{self._reader.name} system {received.system}",
+                f"{kind} of a stream that was not requested",
+            )
+            if vehicle is not None and vehicle.refusal:
+                where, reason = f"{where}, ULog stream", "the ULog stream of an earlier process cannot be continued"
+                reason += f", because {vehicle.refusal}; it restarts after disarming, or at once with log=armed"
+            return Rejection(where, reason)
+        begins = False
+        if not is_full:
+            fields = message.sequence, message.length, message.first_message_offset, message.data
+            chunk = vehicle.reassembly.add(*fields)
+            received, begins = received._replace(chunk=chunk), chunk.begins
+            if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
+                vehicle.clock.confirm()
+        is_acked = kind == "LOGGING_DATA_ACKED"
+        self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
+        return received
+
+    def _adopt(self, vehicle: _Vehicle, now: float) -> Chunk | None:
+        """Continue the stream of an earlier process; return its definitions, or None while its boot is unknown.
+
+        The message that shows it is not used: an acknowledged one is repeated, and any other one counts as lost.
+        """
+        try:
+            saved = read_stream(state_path(self._options, self._reader.name, vehicle.system), vehicle.system)
+            if vehicle.clock.newest is None:
+                return None
+            saved.check_boot(vehicle.clock.newest, now)
+        except ValueError as exc:
+            vehicle.refusal = str(exc)
+            return None
+        vehicle.client.adopt(now)
+        vehicle.reassembly.resume(saved.sequence)
+        return Chunk("delivered", saved.definitions, begins=True)
 
     def _execute(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
         for command in commands:
