@@ -130,7 +130,7 @@ class LogStreamStatus(_UntrustedReply):
     `header_time`: time that sending the header took [s]; the log on the SD card has a gap of this length.
     `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_messages`: ULog messages lost with them, estimated
     from the number of messages per LOGGING_DATA. `undecodable`: data messages without a usable definition.
-    `saved`: the path of the saved log.
+    `saved`: the path of the saved log. `unsaved`: bytes that could not be saved, although `save=` is set.
     """
 
     vehicle: str = ""
@@ -145,6 +145,7 @@ class LogStreamStatus(_UntrustedReply):
     lost_messages: int = 0
     undecodable: int = 0
     saved: str = ""
+    unsaved: int = 0
 
     @property
     def text(self) -> str:
@@ -159,6 +160,7 @@ class LogStreamStatus(_UntrustedReply):
             f"{self.gaps} gap{'s' * (self.gaps > 1)}, {lost}" if self.gaps else "",
             f"{self.undecodable} without a definition" if self.undecodable else "",
             f"saved to {self.saved}" if self.saved else "",
+            f"{self.unsaved} bytes not saved" if self.unsaved else "",
         )
         return ", ".join(filter(None, parts))
 

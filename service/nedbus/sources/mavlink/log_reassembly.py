@@ -56,6 +56,15 @@ class Reassembly:
         self._synchronised = False
         self._rate = PacketRate()
 
+    @property
+    def is_new(self) -> bool:
+        """True before the first stream."""
+        return self._last is None
+
+    def resume(self, sequence: int) -> None:
+        """Continue a stream whose last known message has this sequence; the next record begins a contiguous part."""
+        self._last, self._synchronised = sequence, False
+
     def add(
         self, sequence: int, length: int, first_message_offset: int, data: Sequence[int], now: float | None = None
     ) -> Chunk:

@@ -15,8 +15,9 @@ from .boot_clock import BootClock
 from .fields import DECODED
 from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
-from .log_reassembly import Reassembly
+from .log_reassembly import Chunk, Reassembly
 from .receive_queue import Received, ReceiveQueue
+from .saved_stream import read_stream, state_path
 from .sequence import SequenceCounter
 
 # Ids of a companion computer: its loss, unlike that of a ground station, triggers no failsafe.
@@ -96,6 +97,7 @@ class _Vehicle:
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     reassembly: Reassembly = field(default_factory=Reassembly)
     clock: BootClock = field(default_factory=BootClock)
+    refusal: str = ""  # why the stream of an earlier process cannot be continued
 
 
 class LogReceiver:
@@ -150,7 +152,8 @@ class LogReceiver:
             if len(self.vehicles) == _MAX_VEHICLES:
                 reason = f"a link has up to {_MAX_VEHICLES}; give the others a link of their own"
                 return Rejection(f"{self._reader.name} further vehicles", reason)
-            client = LogStreamClient(self._options.log, system=SYSTEM, component=COMPONENT)
+            ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
+            client = LogStreamClient(options.log, **ids, header=options.header)
             vehicle = self.vehicles[system] = _Vehicle(system, client, received.peer)
         received = received._replace(lost=vehicle.sequence.add(received.sequence, now))
         return self._follow_stream(vehicle, received) if self._options.log else received
@@ -158,35 +161,74 @@ class LogReceiver:
     def _follow_stream(self, vehicle: _Vehicle, received: Received) -> Received | Rejection:
         message, kind, now = received.message, received.message.get_type(), received.time
         if kind.startswith("LOGGING_DATA"):
-            target = message.target_system, message.target_component
-            if not vehicle.client.accepts(*target):
-                if target != (SYSTEM, COMPONENT):
-                    return received
-                where = f"{self._reader.name} system {received.system}"
-                return Rejection(where, f"{kind} of a stream that was not requested")
-            fields = message.sequence, message.length, message.first_message_offset, message.data
-            chunk = vehicle.reassembly.add(*fields, now)
-            received = received._replace(chunk=chunk)
-            if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
-                vehicle.clock.confirm()
-            is_acked = kind == "LOGGING_DATA_ACKED"
-            self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=chunk.begins))
-        elif kind == "HEARTBEAT":
+            return self._process_data(received, vehicle)
+        if kind == "HEARTBEAT":
             vehicle.peer = received.peer
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             self._execute(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
         elif kind == "COMMAND_ACK":
             target = message.target_system, message.target_component
             self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
+        elif kind == "TIMESYNC" and message.tc1:
+            self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
         elif vehicle.clock.add(message, now):
             vehicle.client.on_reboot()
-            vehicle.reassembly = Reassembly()
+            vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received
+
+    def _process_data(self, received: Received, vehicle: _Vehicle) -> Received | Rejection:
+        """Acknowledge and reassemble data of the ULog stream; see `_process`."""
+        message, kind, now = received.message, received.message.get_type(), received.time
+        target = message.target_system, message.target_component
+        is_ours = target == (SYSTEM, COMPONENT)
+        if is_ours and vehicle.reassembly.is_new and message.sequence and not vehicle.refusal:
+            if vehicle.client.status.state in ("stopping", "stopped"):
+                return received
+            if (adopted := self._adopt(vehicle, now)) or not vehicle.refusal:
+                return received._replace(chunk=adopted)
+        if not vehicle.client.accepts(*target):
+            if not is_ours:
+                return received
+            where, reason = (
+                f"{self._reader.name} system {received.system}",
+                f"{kind} of a stream that was not requested",
+            )
+            if vehicle.refusal:
+                where, reason = f"{where}, ULog stream", "the ULog stream of an earlier process cannot be continued"
+                reason += f", because {vehicle.refusal}; it restarts after disarming, or at once with log=armed"
+            return Rejection(where, reason)
+        fields = message.sequence, message.length, message.first_message_offset, message.data
+        chunk = vehicle.reassembly.add(*fields, now)
+        received = received._replace(chunk=chunk)
+        if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
+            vehicle.clock.confirm()
+        is_acked = kind == "LOGGING_DATA_ACKED"
+        self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=chunk.begins))
+        return received
+
+    def _adopt(self, vehicle: _Vehicle, now: float) -> Chunk | None:
+        """Continue the stream of an earlier process; return its definitions, or None while its boot is unknown.
+
+        The message that shows it is not used: an acknowledged one is repeated, and any other one counts as lost.
+        """
+        try:
+            saved = read_stream(state_path(self._options, self._reader.name, vehicle.system), vehicle.system)
+            if vehicle.clock.newest is None:
+                return None
+            saved.check_boot(vehicle.clock.newest, now)
+        except ValueError as exc:
+            vehicle.refusal = str(exc)
+            return None
+        vehicle.client.adopt(now)
+        vehicle.reassembly.resume(saved.sequence)
+        return Chunk("delivered", saved.definitions, begins=True)
 
     def _execute(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
         for command in commands:
             if command.kind == "acknowledge":
                 message: Any = dialect.MAVLink_logging_ack_message(vehicle.system, AUTOPILOT, command.sequence)
+            elif command.kind == "ping":
+                message = dialect.MAVLink_timesync_message(0, command.sequence)
             else:
                 parameters = [COMMANDS[command.kind], 0, *(0,) * 7]
                 message = dialect.MAVLink_command_long_message(vehicle.system, AUTOPILOT, *parameters)

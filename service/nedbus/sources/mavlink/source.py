@@ -24,6 +24,7 @@ from .link import AUTOPILOT, DuplicateIds, Link, Peer, open_link, parse_link
 from .log_stream import LogStream
 from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from .receive_queue import Received
+from .saved_stream import StreamFile, state_path
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -103,9 +104,11 @@ class _LinkSession:
 
     def close(self) -> None:
         """Stop the ULog streams, and close their files."""
+        for log in self._logs.values():
+            log.leave()
         self._receiver.close()
         for log in self._logs.values():
-            log.close()
+            log.end()
 
     def _handle(self, received: Received) -> Iterator[SourceMessage | Rejection]:
         message, system, now, chunk = received.message, received.system, received.time, received.chunk
@@ -130,6 +133,8 @@ class _LinkSession:
                 extra = about("rebooted", address, source=self._name)
                 _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
             yield item
+        if log and chunk and chunk.verdict in ("delivered", "unsynchronised") and vehicle.clock.newest is not None:
+            log.state.update(message.sequence, vehicle.clock.newest, now)
 
     def _log_unsent(self) -> None:
         with self._sending:
@@ -142,7 +147,8 @@ class _LinkSession:
         """Return the ULog stream of a vehicle; None without `log=`."""
         if system not in self._logs and self._options.log:
             client = self._receiver.vehicles[system].client
-            self._logs[system] = LogStream(self._name_of(system), self._options, client)
+            state = StreamFile(state_path(self._options, self._name, system), system)
+            self._logs[system] = LogStream(self._name_of(system), self._options, client, state)
         return self._logs.get(system)
 
     def _name_of(self, system: int) -> str:

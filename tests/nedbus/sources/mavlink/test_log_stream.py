@@ -406,8 +406,12 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
                 message = dialect.MAVLink_logging_data_message(*target, sequence, min(length, 255), offset, data)
             hostile.sendto(message.pack(mav), ("127.0.0.1", port))
             with suppress(BlockingIOError):
+                mav.srcSystem = 66
                 for command in mav.parse_buffer(hostile.recv(2048)) or []:
-                    if command.get_type() == "COMMAND_LONG":
+                    if command.get_type() == "TIMESYNC":
+                        answer: Any = dialect.MAVLink_timesync_message(1, command.ts1)
+                        hostile.sendto(answer.pack(mav), ("127.0.0.1", port))
+                    elif command.get_type() == "COMMAND_LONG":
                         answer = dialect.MAVLink_command_ack_message(command.command, 0, 0, 0, 245, 191)
                         hostile.sendto(answer.pack(mav), ("127.0.0.1", port))
                         sent[str(command.command)] += 1

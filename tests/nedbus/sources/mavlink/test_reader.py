@@ -24,14 +24,14 @@ WAITING = 1000  # messages
 
 
 class Autopilot:
-    """TCP server of a vehicle: accepts one connection, sends messages, and counts the received STARTs."""
+    """TCP server of a vehicle: accepts one connection, sends messages, answers TIMESYNC, and counts STARTs."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
         self.link = f"tcp:127.0.0.1:{self._server.getsockname()[1]}"
         self._mav, self._parser = dialect.MAVLink(None, 9, 1), dialect.MAVLink(None)
         self._connection: socket.socket | None = None
-        self._starts = 0
+        self._starts = self.answers = 0
 
     def pack(self, *messages: Any) -> list[bytes]:
         """Return the messages as bytes, with consecutive sequence numbers."""
@@ -59,6 +59,9 @@ class Autopilot:
         for each in self._parser.parse_buffer(data) or []:
             is_command = each.get_type() == "COMMAND_LONG"
             self._starts += is_command and each.command == dialect.MAV_CMD_LOGGING_START
+            if each.get_type() == "TIMESYNC":
+                self.send(*self.pack(dialect.MAVLink_timesync_message(1, each.ts1)))
+                self.answers += 1
         return self._starts
 
     def close(self) -> None:
