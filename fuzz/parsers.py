@@ -180,7 +180,7 @@ def parse_mavlink(data: bytes) -> int:
     options = MavlinkOptions(log=frozenset({"1", "take"}), topics=("*",))
     link: Any = _Link(frames(data))
     reader = LinkReader(link, name="fuzz")
-    receiver = LogReceiver(reader, options, lambda *_: None)
+    receiver = LogReceiver(reader, options, link.answer)
     vehicles: dict[int, Vehicle] = {}
     logs: dict[int, LogStream] = {}
     count = 0
@@ -254,11 +254,20 @@ class _Link:
 
     def __init__(self, pieces: Iterator[bytes]) -> None:
         self._pieces = pieces
+        self._answers: list[bytes] = []
+
+    def answer(self, message: Any, _: object) -> None:
+        """Answer TIMESYNC, because the ULog stream is requested only once the round trip is known."""
+        if message.get_type() == "TIMESYNC":
+            answer: Any = dialect.MAVLink_timesync_message(1, message.ts1)
+            self._answers.append(answer.pack(dialect.MAVLink(None, 1, 1)))
 
     def read(self, _: float) -> Iterator[Packet]:
         """Yield all bytes at once."""
         for piece in self._pieces:
             yield Packet(piece, None, time.monotonic())
+            while self._answers:
+                yield Packet(self._answers.pop(0), None, time.monotonic())
         raise _EndOfInput
 
     def send(self, data: bytes, peer: object) -> None:

@@ -6,6 +6,7 @@ from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.sources.log_header import COUNT_PER_TOPIC, DEFAULT_COUNT, FIXED_COUNT, PROCESSING
 from nedbus.timings import TIMINGS
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
@@ -15,10 +16,6 @@ _RESTARTS: Final = 2  # after START was accepted, but no data arrived
 _PINGS: Final = 3  # TIMESYNC requests before START; the shortest round trip counts, the others may have been queued
 _MIN_COUNT: Final = 32  # messages of a header before its duration is estimated, or fewer if they took `_MIN_TIME`
 _MIN_TIME: Final = 1.0  # s
-_EXPECTED_COUNT: Final = 470  # messages of a header with PX4's default topics: 410 with PX4 1.17, 468 with 1.18
-_FIXED_COUNT: Final = 230  # messages of a header without topics: parameters and their defaults, and event metadata
-_COUNT_PER_TOPIC: Final = 2.5  # 2.4 were measured with 16 and 22 topics, 1.8 with 101
-_PROCESSING: Final = 0.004  # s that PX4 needs for a message, in addition to the round trip
 _STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
 _DECAY: Final = 0.98  # decay of the longest interval between messages, per message
 
@@ -78,12 +75,6 @@ class Command(NamedTuple):
     sequence: int = 0
 
 
-def expected_header(round_trip: float, topics: int | None = None) -> float:
-    """Return the expected duration [s] of a header with this number of topics; None for PX4's default topics."""
-    count = _EXPECTED_COUNT if topics is None else _FIXED_COUNT + topics * _COUNT_PER_TOPIC
-    return count * (round_trip + _PROCESSING)
-
-
 class LogStreamClient:
     """Request the stream, acknowledge it, and detect its end, which PX4 does not announce.
 
@@ -111,7 +102,7 @@ class LogStreamClient:
         self._awaited: Literal["pong", "start", "stop", "data"] | None = None
         self._pings: set[int] = set()  # times of unanswered TIMESYNC requests [ns]
         self._round_trips: list[float] = []  # since START became due [s]
-        self._expected_count = _EXPECTED_COUNT  # messages of the next header
+        self._expected_count = DEFAULT_COUNT  # messages of the next header
         self._due = 0.0  # deadline of the awaited event, or else time of the next START
         self._tries = self._restarts = 0
         self._has_sent_command = self._took_over = False
@@ -281,7 +272,7 @@ class LogStreamClient:
     def _start(self, now: float) -> list[Command]:
         """Send START, unless the header would take too long; without an answer to TIMESYNC, START will show it."""
         self._awaited = None
-        interval = min(self._round_trips, default=0.0) + _PROCESSING
+        interval = min(self._round_trips, default=0.0) + PROCESSING
         is_allowed = self._may_start() and self._allows(self._expected_count, interval, now)
         return self._send("start", now) if is_allowed else []
 
@@ -291,7 +282,7 @@ class LogStreamClient:
         expected = elapsed + count * interval
         if expected <= limit:
             return True
-        topics = int((limit / interval - _FIXED_COUNT) / _COUNT_PER_TOPIC) if interval else 0
+        topics = int((limit / interval - FIXED_COUNT) / COUNT_PER_TOPIC) if interval else 0
         fit = f"the header of {topics} topics" if topics > 0 else "none, because of the vehicle's parameters alone"
         self._has_header = False
         self._enter("refused", "slow_link", now, expected, 1e3 * interval, limit, fit, math.ceil(1.2 * expected))

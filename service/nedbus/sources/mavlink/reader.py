@@ -97,6 +97,7 @@ class _Vehicle:
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     reassembly: Reassembly = field(default_factory=Reassembly)
     clock: BootClock = field(default_factory=BootClock)
+    is_known: bool = False  # a heartbeat has arrived
     refusal: str = ""  # why the stream of an earlier process cannot be continued
 
 
@@ -163,7 +164,7 @@ class LogReceiver:
         if kind.startswith("LOGGING_DATA"):
             return self._process_data(received, vehicle)
         if kind == "HEARTBEAT":
-            vehicle.peer = received.peer
+            vehicle.peer, vehicle.is_known = received.peer, True
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             self._execute(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
         elif kind == "COMMAND_ACK":
@@ -181,7 +182,7 @@ class LogReceiver:
         message, kind, now = received.message, received.message.get_type(), received.time
         target = message.target_system, message.target_component
         is_ours = target == (SYSTEM, COMPONENT)
-        if is_ours and vehicle.reassembly.is_new and message.sequence and not vehicle.refusal:
+        if is_ours and vehicle.is_known and vehicle.reassembly.is_new and message.sequence and not vehicle.refusal:
             if vehicle.client.status.state in ("stopping", "stopped"):
                 return received
             if (adopted := self._adopt(vehicle, now)) or not vehicle.refusal:
