@@ -17,10 +17,12 @@ from pymavlink.generator.mavcrc import x25crc
 from nedbus import ulog
 from nedbus.errors import SourceError
 from nedbus.recording import RecordingReader
-from nedbus.sources import Rejection, SourceMessage
+from nedbus.sources import SourceMessage
 from nedbus.sources.mavlink.fields import CONVERSIONS
+from nedbus.sources.mavlink.link import Packet
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.mavlink.reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
+from nedbus.sources.mavlink.receive_queue import Received
 from nedbus.sources.mavlink.vehicle import Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import (
@@ -178,18 +180,18 @@ def parse_mavlink(data: bytes) -> int:
     options = MavlinkOptions(log=frozenset({"1", "take"}), topics=("*",))
     link: Any = _Link(frames(data))
     reader = LinkReader(link, name="fuzz")
-    receiver = LogReceiver(reader, options, lambda *_: None)
+    receiver = LogReceiver(reader, options, link.answer)
     vehicles: dict[int, Vehicle] = {}
     logs: dict[int, LogStream] = {}
     count = 0
     with closing(receiver), suppress(_EndOfInput):
         while True:
             for item in receiver.read(1.0):
-                if isinstance(item, Rejection):
+                if not isinstance(item, Received):
                     continue
                 now, system = item.time, item.system
                 vehicle = vehicles.setdefault(system, Vehicle(str(system), options))
-                vehicle.track_sequence(item.sequence, now, counted=item.chunk.lost if item.chunk else 0)
+                vehicle.count_lost(item.lost, now, counted=item.chunk.lost if item.chunk else 0)
                 found = [vehicle.handle(item.message, now)]
                 if item.chunk is not None:
                     log = logs.setdefault(system, LogStream(str(system), options, receiver.vehicles[system].client))
@@ -248,14 +250,24 @@ class _Link:
 
     stream = True
     peer = None
+    dropped = 0
 
     def __init__(self, pieces: Iterator[bytes]) -> None:
         self._pieces = pieces
+        self._answers: list[bytes] = []
 
-    def read(self, _: float) -> Iterator[tuple[bytes, None]]:
+    def answer(self, message: Any, _: object) -> None:
+        """Answer TIMESYNC, because the ULog stream is requested only once the round trip is known."""
+        if message.get_type() == "TIMESYNC":
+            answer: Any = dialect.MAVLink_timesync_message(1, message.ts1)
+            self._answers.append(answer.pack(dialect.MAVLink(None, 1, 1)))
+
+    def read(self, _: float) -> Iterator[Packet]:
         """Yield all bytes at once."""
         for piece in self._pieces:
-            yield piece, None
+            yield Packet(piece, None, time.monotonic())
+            while self._answers:
+                yield Packet(self._answers.pop(0), None, time.monotonic())
         raise _EndOfInput
 
     def send(self, data: bytes, peer: object) -> None:

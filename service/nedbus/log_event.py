@@ -58,7 +58,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     # a reader
     "invalid": Event("a received message or reply cannot be decoded"),
     "newer_layout": Event("messages have a newer layout than this version of nedbus supports"),
-    "dropped": Event("a reader, or the link to a vehicle, is too slow, and messages are dropped"),
+    "dropped": Event("a reader, a host, or the link to a vehicle is too slow, and messages are dropped"),
     "incomplete": Event("a limit or a timeout was reached: vehicles, streams or replies are missing"),
     "slow_reader": Event("a lossless publisher waits for a slow reader, or stops waiting for it"),
     # a link

@@ -192,6 +192,13 @@ def find_mistakes(
     return settings, mistakes
 
 
+def state_folder() -> Path:
+    """Return the folder of state that outlives a process: systemd's StateDirectory, or that of the XDG directories."""
+    if given := os.environ.get("STATE_DIRECTORY"):
+        return Path(given.partition(":")[0])
+    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state", "nedbus").expanduser()
+
+
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
     """Return the error for a setting, located by file, line and column, or by the name of the flag or variable."""
     path, setter = settings._file, settings.set_by(name) or name

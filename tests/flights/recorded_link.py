@@ -37,7 +37,7 @@ class _Receiver(LogReceiver):
 
     def process(self, received: Received) -> Received | Rejection:
         self.tick(received.time)
-        return self._process(received, is_full=False)
+        return self._process(received)
 
 
 def play(path: Path, options: MavlinkOptions) -> Iterator[tuple[float, SourceMessage | Rejection | None]]:

@@ -36,7 +36,7 @@ class Listener:
             self.messages.append(event)
         elif isinstance(event, UnavailableTopics):
             self.unavailable = event
-        elif event is not None:
+        elif isinstance(event, Rejection):
             self.rejections.append(event)
 
     def step_until(self, condition: Callable[[], object], *, what: str) -> None:

@@ -170,6 +170,7 @@ class _Stream:
 
     ids: tuple[int, int]
     is_on_link: bool = True
+    port: int = 0
     sequence: int = 0
     expected: int | None = None
     pending: deque[Message] = field(default_factory=deque)
@@ -184,11 +185,12 @@ class _Stream:
 
 
 class _Request(NamedTuple):
-    """A command queued for the logger; `during_stop`: received before STOP was accepted."""
+    """A command queued for the logger; `during_stop`: received before STOP was accepted; `port`: of its link."""
 
     command: int
     ids: tuple[int, int]
     during_stop: bool = False
+    port: int = -1
 
 
 class Px4LogStream:
@@ -198,11 +200,14 @@ class Px4LogStream:
     `loss`, `burst`: fraction of datagrams to the client that are dropped, and the number dropped in a row.
     `reorder`: fraction of datagrams that arrive up to five datagrams late.
     `round_trip`: minimum time from a message to its acknowledgement [s]; default in real time: as recorded.
+    Answers to TIMESYNC take the part of it that exceeds the recorded one, which is the processing time of PX4.
     `refusal`: MAV_RESULT of every START. `answers`: whether a logger runs, and sends COMMAND_ACK.
     `unsent`: number of STARTs that are accepted without sending data.
     `owner`: ids of the client that initially owns the stream; `is_owner_on_link`: it is on this link.
     `events`: by time in the recording [s]. `on_send`: called with each frame.
     `waits`: hold the recording before its START until the client sends one.
+    `second_port`: of a client on a second link, which has the telemetry, too. Like PX4, the vehicle sends the stream to
+    the client whose START was accepted first, until a STOP arrives on the link of that client.
 
     `commands`: received MAV_CMDs. `dropped`: lost LOGGING_DATA, counted when a later one arrives.
     `late`: number of reordered LOGGING_DATA.
@@ -228,6 +233,7 @@ class Px4LogStream:
         is_owner_on_link: bool = False,
         events: Mapping[float, Event] | None = None,
         waits: bool = True,
+        second_port: int | None = None,
         deadline: float = 100.0,
         on_send: Callable[[bytes], object] = lambda _: None,
     ) -> None:
@@ -240,9 +246,12 @@ class Px4LogStream:
         self._refusal, self._answers, self._unsent, self._waits = refusal, answers, unsent, waits
         self._events, self._on_send = deque(sorted((events or {}).items())), on_send
         self._triggered: deque[Event] = deque()
+        self._ports = [port] if second_port is None else [port, second_port]
+        self._streamer: tuple[int, tuple[int, int]] | None = None  # port and ids of the client that has the stream
         self._mav = dialect.MAVLink(None, recording.system, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
         self._crc_extra: dict[int, int] = {}
+        self._answers_due: deque[tuple[float, int, int]] = deque()  # to TIMESYNC: when, its time, the port
         self._held: list[tuple[int, bytes, int]] = []  # late frames: the number of the frame that they follow
         self._frames = self._drops_left = self._data_sent = self._newest = 0
         self._unnoticed: list[int] = []  # LOGGING_DATA that were dropped since the last one that arrived
@@ -271,6 +280,16 @@ class Px4LogStream:
         if self._failure:
             raise self._failure
 
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last HEARTBEAT had the armed flag."""
+        return bool(unpack(self._heartbeat)[1][6] & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def change_owner(self, ids: tuple[int, int]) -> None:
+        """Address the stream to another client from now on."""
+        assert self._stream
+        self._stream.ids = ids
+
     def trigger(self, event: Event) -> None:
         """Cause an event now."""
         self._triggered.append(event)
@@ -279,7 +298,8 @@ class Px4LogStream:
         """Restart the recording and the vehicle's clock."""
         self._index, self._clock, self._checked = 0, 0.0, time.monotonic()
         self._stream = None
-        self._stop_from: tuple[int, int] | None = None  # ids of the client whose STOP is under way
+        self._stop_from: _Request | None = None  # the STOP that is under way
+        self._streamer = None
         self._queue: deque[_Request] = deque()
         self._is_held = self._waits
 
@@ -287,6 +307,9 @@ class Px4LogStream:
         try:
             while not self._closing.is_set() and time.monotonic() < self._end:
                 self._receive()
+                while self._answers_due and self._answers_due[0][0] <= time.monotonic():
+                    _, sent, port = self._answers_due.popleft()
+                    self._send(dialect.MAVLink_timesync_message(self._boot_ns(), sent), port=port)
                 while self._triggered:
                     self._apply(self._triggered.popleft())
                 while self._events and self._events[0][0] <= self._clock:
@@ -310,31 +333,32 @@ class Px4LogStream:
         select.select([self._socket], [], [], self._idle_time())
         with suppress(BlockingIOError):
             while True:
-                for message in self._mav.parse_buffer(self._socket.recv(2048)) or []:
+                data, (_, port) = self._socket.recvfrom(2048)
+                for message in self._mav.parse_buffer(data) or []:
                     if not self._is_gone:
-                        self._handle(message, time.monotonic())
+                        self._handle(message, time.monotonic(), port)
 
     def _idle_time(self) -> float:
         entries = self.recording.entries
-        if (self._stream and self._stream.pending) or not self._has_room():
+        if (self._stream and self._stream.pending) or self._answers_due or not self._has_room():
             return 0.0005
         if self._is_held or self._index == len(entries):
             return _MAX_IDLE
         return min(_MAX_IDLE, max(0.0, entries[self._index].time - self._clock)) if self._speed else 0.0
 
-    def _handle(self, message: Any, now: float) -> None:
+    def _handle(self, message: Any, now: float, port: int) -> None:
         ids, stream = (message.get_srcSystem(), message.get_srcComponent()), self._stream
         match message.get_type():
             case "COMMAND_LONG":
                 self.commands.append(message.command)
                 if message.command in (START, STOP) and self._answers:
-                    self._queue.append(_Request(message.command, ids, self._stop_from is not None))
+                    self._queue.append(_Request(message.command, ids, self._stop_from is not None, port))
                 self._is_held = self._is_held and message.command != START
             case "LOGGING_ACK" if stream and stream.sends and stream.acknowledged is None:
                 if message.sequence == stream.pending[0].sequence:
                     stream.acknowledged = max(now, stream.sent - _REPEAT * (stream.sends - 1) + self._round_trip)
             case "TIMESYNC" if message.tc1 == 0:
-                self._send(dialect.MAVLink_timesync_message(self._boot_ns(), message.ts1))
+                self._answers_due.append((now + max(0.0, self._round_trip - _ROUND_TRIP), message.ts1, port))
 
     def _boot_ns(self) -> int:
         """Return the time of the vehicle, interpolated from its recorded replies to TIMESYNC."""
@@ -349,7 +373,9 @@ class Px4LogStream:
             self._send_pending(stream, now)
         elif now >= self._busy_until:
             if self._stop_from:
-                self._answer(STOP, dialect.MAV_RESULT_ACCEPTED, self._stop_from)
+                self._answer(self._stop_from, dialect.MAV_RESULT_ACCEPTED)
+                if self._streamer and self._streamer[0] == self._stop_from.port:
+                    self._streamer = None
                 self._stream = self._stop_from = None
             elif self._queue:
                 self._execute(self._queue.popleft(), now)
@@ -373,28 +399,30 @@ class Px4LogStream:
     def _execute(self, request: _Request, now: float) -> None:
         if request.command == STOP:
             if self._stream is None:
-                self._answer(STOP, dialect.MAV_RESULT_ACCEPTED, request.ids)
+                self._answer(request, dialect.MAV_RESULT_ACCEPTED)
                 return
-            self._answer(STOP, dialect.MAV_RESULT_IN_PROGRESS, request.ids)
-            self._stop_from = request.ids
+            self._answer(request, dialect.MAV_RESULT_IN_PROGRESS)
+            self._stop_from = request
             if self._stream.is_on_link:
                 self._append_tail(self._stream)
             else:
                 self._busy_until = now + _TAIL
         elif self._refusal is not None:
-            self._answer(START, self._refusal, request.ids)
+            self._answer(request, self._refusal)
         elif self._stream:
-            self._answer(START, dialect.MAV_RESULT_TEMPORARILY_REJECTED, request.ids)
+            self._answer(request, dialect.MAV_RESULT_TEMPORARILY_REJECTED)
         else:
-            self._answer(START, dialect.MAV_RESULT_ACCEPTED, request.ids)
+            self._answer(request, dialect.MAV_RESULT_ACCEPTED)
             if request.during_stop or self._unsent:  # the first message of this stream is never delivered
                 self._unsent, self._busy_until = max(0, self._unsent - 1), now + _BLOCKED
             else:
-                self._stream = self._begin(request.ids)
+                self._stream = self._begin(request)
 
-    def _begin(self, ids: tuple[int, int]) -> _Stream:
+    def _begin(self, request: _Request) -> _Stream:
         """Return a stream with the header and the definitions of topics that appeared since."""
-        recording, stream = self.recording, _Stream(ids)
+        if self._streamer is None or len(self._ports) == 1:
+            self._streamer = request.port, request.ids
+        recording, stream = self.recording, _Stream(self._streamer[1], port=self._streamer[0])
         self._unnoticed = []
         for each in recording.header:
             stream.append(each)
@@ -474,17 +502,21 @@ class Px4LogStream:
         data = message.data.ljust(_DATA_SIZE, b"\0")
         self._data_sent += not message.acked
         number = 0 if message.acked else self._data_sent
-        self._send(kind(*stream.ids, message.sequence, len(message.data), message.offset, [*data]), number)
+        self._send(kind(*stream.ids, message.sequence, len(message.data), message.offset, [*data]), number, stream.port)
 
-    def _answer(self, command: int, result: int, ids: tuple[int, int]) -> None:
-        if ids != _OTHER_LINK:
-            self._send(dialect.MAVLink_command_ack_message(command, result, 0, 0, *ids))
+    def _answer(self, request: _Request, result: int) -> None:
+        if request.ids != _OTHER_LINK:
+            ack = dialect.MAVLink_command_ack_message(request.command, result, 0, 0, *request.ids)
+            self._send(ack, port=request.port)
 
-    def _send(self, message: Any, number: int = 0) -> None:
-        self._transmit(message.pack(self._mav), number)
+    def _send(self, message: Any, number: int = 0, port: int = 0) -> None:
+        self._transmit(message.pack(self._mav), number, port)
 
-    def _transmit(self, frame: bytes, number: int = 0) -> None:
-        """Send, drop or delay a frame; `number`: index of a LOGGING_DATA message, from 1; 0 for other frames."""
+    def _transmit(self, frame: bytes, number: int = 0, port: int = 0) -> None:
+        """Send, drop or delay a frame; `number`: index of a LOGGING_DATA message, from 1; 0 for other frames.
+
+        `port`: of the link; 0 for all links. A delayed frame arrives on the first link.
+        """
         self._release()
         self._frames += 1
         if is_heartbeat(frame):
@@ -500,7 +532,8 @@ class Px4LogStream:
         else:
             self._arrive(number)
             self._on_send(frame)
-            self._socket.sendto(frame, ("127.0.0.1", self._port))
+            for each in [port] if port else self._ports:
+                self._socket.sendto(frame, ("127.0.0.1", each))
 
     def _release(self, *, everything: bool = False) -> None:
         """Send the delayed frames that are due."""

@@ -1,5 +1,6 @@
 """Parser for PX4's .msg files: fields with types, units, ranges and meanings; errors have line and column."""
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
@@ -167,6 +168,7 @@ def _range_of(field: MsgField) -> InRange | None:
     if found is None or field.type.base == "bool" or field.type.is_text:
         return None
     least, greatest, or_ = float(found[2] or "-inf"), float(found[4] or "inf"), float(invalid[1]) if invalid else None
-    if least > greatest:
+    lowest, highest = (-math.inf, math.inf) if field.type.is_float else field.type.limits
+    if max(least, lowest) > min(greatest, highest):
         raise ValueError(f"no number is in the @range of {field.name}, from {least:.9g} to {greatest:.9g}")
     return InRange(field.name, least, greatest, or_=or_, is_array=field.type.is_array)

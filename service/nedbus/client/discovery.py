@@ -125,12 +125,12 @@ class LogStreamStatus(_UntrustedReply):
 
     `state`: "streaming" while messages are published from the stream; otherwise they are converted from MAVLink.
     `reason`: why there is no stream, and what to do about it.
-    `received`: bytes so far. `rate`: bytes per second over the last second. `delay`: mean age of messages on arrival,
-    by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
+    `received`: bytes so far. `rate`: bytes per second over the last second. `delay`: mean age of messages when
+    published, by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
     `header_time`: time that sending the header took [s]; the log on the SD card has a gap of this length.
-    `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds on the number of
-    ULog messages lost, which MAVLink does not report. `undecodable`: data messages without a usable definition.
-    `saved`: the path of the saved log.
+    `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_messages`: ULog messages lost with them, estimated
+    from the number of messages per LOGGING_DATA. `undecodable`: data messages without a usable definition.
+    `saved`: the path of the saved log. `unsaved`: bytes that could not be saved, although `save=` is set.
     """
 
     vehicle: str = ""
@@ -142,15 +142,15 @@ class LogStreamStatus(_UntrustedReply):
     header_time: float | None = None
     gaps: int = 0
     lost: int = 0
-    lost_at_least: int = 0
-    lost_at_most: int = 0
+    lost_messages: int = 0
     undecodable: int = 0
     saved: str = ""
+    unsaved: int = 0
 
     @property
     def text(self) -> str:
         """All values except the vehicle, in one line; the reason and the file name are untrusted text."""
-        lost = f"{self.lost_at_least} to {self.lost_at_most} messages lost"
+        lost = f"{self.lost} LOGGING_DATA lost with about {self.lost_messages} messages"
         parts = (
             self.state,
             self.reason,
@@ -160,6 +160,7 @@ class LogStreamStatus(_UntrustedReply):
             f"{self.gaps} gap{'s' * (self.gaps > 1)}, {lost}" if self.gaps else "",
             f"{self.undecodable} without a definition" if self.undecodable else "",
             f"saved to {self.saved}" if self.saved else "",
+            f"{self.unsaved} bytes not saved" if self.unsaved else "",
         )
         return ", ".join(filter(None, parts))
 
@@ -171,7 +172,9 @@ class SourceStatus(_UntrustedReply):
     `state`: starting, waiting, running, retrying, done or failed; empty if not reported.
     `published`, `rejected`: messages since the service started. `done`, `total`: progress of this run,
     in messages, or in bytes of a log.
-    `lost`: messages lost before they reached a live source that detects losses. `reboots`: reboots of vehicles.
+    `lost`: messages lost before a live source that detects losses published them, with `log_streams` an estimate.
+    `dropped`: those of them that its host dropped. `overload`: how the host does not keep up, "" if it does.
+    `reboots`: reboots of vehicles.
     `stale`: addresses of a live source without a message for 3 s.
     `not_carried`: names of vehicles' messages for which this source has no definition. `silent`: addresses that a
     vehicle announces without sending messages, while messages of its other topics arrive.
@@ -188,6 +191,8 @@ class SourceStatus(_UntrustedReply):
     rejected: int = 0
     rejections: dict[str, int] = field(default_factory=dict)
     lost: int = 0
+    dropped: int = 0
+    overload: str = ""
     reboots: int = 0
     done: int = 0
     total: int | None = None

@@ -142,8 +142,13 @@ class Daemon:
     def update_events(self, measures: Sequence[SourceMeasures] | None = None) -> EventLog:
         """Update and return the event log; `measures`: current measurements, if already available."""
         measured: dict[str, str] = {}
-        for source in self.measures if measures is None else measures:
+        measures = self.measures if measures is None else measures
+        for source in measures:
             measured |= source.states
+        dropped, is_behind = (
+            sum(each.status.dropped for each in measures),
+            any(each.status.overload for each in measures),
+        )
         mains = [vehicle.main for vehicle in list(self.event_log.vehicles.values()) if vehicle.main is not None]
         shared = set() if self._registry is None else self._registry.shared_vehicles()
         present = set() if self._registry is None else {each.vehicle for each in tuple(self._registry.publishers)}
@@ -151,7 +156,7 @@ class Daemon:
         states |= {main: "duplicate" for main in states if main.vehicle in shared}
         is_link_lost = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_link_lost else ""
-        self.event_log.update(clock.steady(), states, link=link, present=present)
+        self.event_log.update(clock.steady(), states, link=link, dropped=dropped, is_behind=is_behind, present=present)
         return self.event_log
 
     def report(self, *, within: float = 0.0) -> AccountReport:

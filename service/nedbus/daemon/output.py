@@ -13,7 +13,7 @@ from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegist
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.events import EventLog
 from nedbus.log_event import about
-from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
+from nedbus.sources import LinkLoad, Rejection, ReplayRun, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
@@ -59,6 +59,7 @@ class SourceOutput:
         self.rejections: Counter[str] = Counter()  # messages by violated rule
         self.unavailable = UnavailableTopics()  # topics that vehicles publish but a live source does not deliver now
         self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
+        self.load = LinkLoad()  # of a live source
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
         self._text = text
@@ -123,8 +124,8 @@ class SourceOutput:
                 stream.publisher.close()
                 stream.publisher = None
 
-    def publish(self, message: SourceMessage) -> None:
-        """Validate a message of a claimed address, and publish or reject it."""
+    def publish(self, message: SourceMessage, received: float | None = None) -> None:
+        """Validate a message of a claimed address, and publish or reject it; `received`: time, by default now."""
         stream = self._streams[message.address]
         if stream.publisher is None:
             raise KeyError(message.address)
@@ -143,7 +144,10 @@ class SourceOutput:
             return
         self.durations.add(time.perf_counter() - start)
         self.published += 1
-        stream.health.add(fields, received=round(self._now() * 1e9), lost=message.lost)
+        now = self._now()
+        received = now if received is None else received
+        latency = now - received if now - received > TIMINGS.lateness else None  # it waited in this service
+        stream.health.add(fields, received=round(received * 1e9), latency=latency, lost=message.lost)
         if message.dropout:
             self._event_log.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
         self._event_log.add(message.address, fields, clock.steady(), lost=message.lost)
@@ -181,8 +185,8 @@ class SourceOutput:
                 event = "stream_resumed" if resumed else "published"
                 _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
             self._republish_retained(message)
-        stream.last_received, stream.last = self._now(), message
-        self.publish(message)
+        stream.last_received, stream.last = message.due or self._now(), message
+        self.publish(message, stream.last_received)
 
     def expire_stale(self) -> bool:
         """Stop publishing stale live addresses; return True if any address is still published.
@@ -243,6 +247,13 @@ class SourceOutput:
             self._silent.update(new)
             text = f"announced, nothing arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
+
+    def note_load(self, load: LinkLoad) -> None:
+        """Store the load of a link; log the start and the end of an overload."""
+        if bool(load.overload) != bool(self.load.overload):
+            text = load.overload or f"the overload has ended; dropped so far: {load.dropped}"
+            _log.warning("%s: %s", self._name, text, extra=about("dropped", source=self._name))
+        self.load = load
 
     def _republish_retained(self, message: SourceMessage) -> None:
         """After an outage, republish the last messages of topics without a rate, unless the vehicle has rebooted."""

@@ -12,7 +12,7 @@ from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceS
 from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.events import EventLog
 from nedbus.log_event import about
-from nedbus.sources import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
+from nedbus.sources import LinkLoad, LiveItem, LiveSource, Rejection, ReplayRun, ReplaySource, Source, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
@@ -26,7 +26,6 @@ _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
 _MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
 
-_Item = SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
 
@@ -122,6 +121,8 @@ class Worker:
             rejected=output.rejected,
             rejections=dict(output.rejections),
             lost=output.lost,
+            dropped=output.load.dropped,
+            overload=output.load.overload,
             reboots=output.reboots,
             done=run.done(self._done) if run else self._done,
             total=run.total if run else None,
@@ -234,7 +235,7 @@ class Worker:
 
     def _listen(self, source: LiveSource) -> None:
         """Publish the messages of a live source, which yields None several times a second while no message arrives."""
-        with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # live sources are generators
+        with closing(cast("Generator[LiveItem]", source.listen(self._router))) as items:  # live sources are generators
             next_poll = 0.0
             for item in items:
                 now = self._message_start = self._clock.now()
@@ -244,6 +245,8 @@ class Worker:
                     self._output.reject(item)
                 elif isinstance(item, UnavailableTopics):
                     self._output.note(item)
+                elif isinstance(item, LinkLoad):
+                    self._output.note_load(item)
                 elif isinstance(item, LogStreamStatus):
                     self._output.log_streams[item.vehicle] = item
                 elif item is not None:

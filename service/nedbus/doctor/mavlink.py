@@ -1,6 +1,7 @@
 """Check of a MAVLink link: packets, messages, positions and the ULog stream; needs the extra `mavlink`."""
 
 import errno
+import math
 import struct
 import time
 from collections import Counter
@@ -11,7 +12,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.sources import DuplicateIds, Link, ignore_reason, open_link
+from nedbus.sources import DuplicateIds, Link, expected_header, ignore_reason, open_link
 from nedbus.timings import TIMINGS
 
 from .finding import Finding, limit_findings, list_names
@@ -44,10 +45,11 @@ def check_mavlink(link: str) -> Iterator[Finding]:
         seen = f"no MAVLink among the packets from {list_names(sorted(senders))} (total: {senders.total()})"
         advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
+    # Ground stations and cameras are normal, but not alone.
+    reported = {ids: fault for ids, fault in faults.items() if not systems or not all(ids) or not ignore_reason(*ids)}
     yield from limit_findings(
         Finding("mavlink", f"{link} system {system} component {component}", "wrong", fault)
-        for (system, component), fault in sorted(faults.items())
-        if system not in systems or not ignore_reason(system, component)
+        for (system, component), fault in sorted(reported.items())
     )
     ordered = sorted(systems.items())
     yield from limit_findings(_check_system(link, number, messages) for number, messages in ordered)
@@ -69,7 +71,7 @@ def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[
         if link.peer is not None and now >= next_heartbeat:  # some peers send only to addresses that they received from
             next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
-        for data, peer in link.read(_READ_TIMEOUT):
+        for data, peer, _ in link.read(_READ_TIMEOUT):
             name = ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
             if name in senders or len(senders) < _MAX_SENDERS:
                 senders[name] += 1
@@ -88,6 +90,9 @@ def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[
                     if _is_px4(message):
                         request = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
                         link.send(request.pack(sender), peer)
+                        link.send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()).pack(sender), peer)
+                    elif message.get_type() == "TIMESYNC" and message.tc1:
+                        message.round_trip = (time.monotonic_ns() - message.ts1) / 1e9
     return senders, systems, faults
 
 
@@ -128,5 +133,14 @@ def _check_log(link: str, number: int, messages: Sequence[Any]) -> Finding:
         return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 (file and MAVLink), and restart PX4")
     size = sum(len(message.get_msgbuf()) for message in messages)
     seen = f"PX4 found; the link carries {size / TIMINGS.listen / 1000:.0f} kB/s"
-    advice = f"for all fields of all topics, run 'nedbus serve --source \"mavlink:{link}?log=1\"' (docs/live.md)"
+    options = "log=1"
+    round_trips = [trip for each in messages if 0 <= (trip := getattr(each, "round_trip", -1)) < TIMINGS.listen]
+    if round_trips:
+        trip = min(round_trips)
+        few, most = expected_header(trip, topics=16), expected_header(trip)
+        seen += f"; round trip {1e3 * trip:.0f} ms: the header of the ULog stream blocks PX4's logger for {few:.0f} s"
+        seen += f" with logger_topics.txt, {most:.0f} s with the default topics"
+        if most > TIMINGS.log_header:
+            options += f"&header={math.ceil(1.2 * most)}"
+    advice = f"for all fields of all topics, run 'nedbus serve --source \"mavlink:{link}?{options}\"' (docs/live.md)"
     return Finding("mavlink", name, "ok", seen, advice)

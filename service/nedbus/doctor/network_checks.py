@@ -100,6 +100,8 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
     elif state in {"waiting", "starting"}:
         advice = "check that the vehicle sends to the service; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
         yield Finding("source", name, "warning", f"{state}: no message yet", advice)
+    if source.overload:
+        yield Finding("source", name, "wrong", source.overload[:_MAX_TEXT], "stop other programs on its host")
     if source.silent:
         advice = "PX4 may be losing them: remove rel= from all lines of its zenoh/pub.csv (docs/live.md)"
         seen = f"announced, but silent while other topics arrive: {list_names(source.silent, 20)}"
@@ -114,7 +116,7 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
             seen = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
             yield Finding("source", stream, "warning", seen, "see 'The ULog stream' in docs/live.md")
         if log.gaps:
-            seen = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages; gaps: {log.gaps}"
+            seen = f"the ULog stream lost {log.lost} LOGGING_DATA, about {log.lost_messages} messages; gaps: {log.gaps}"
             advice = "raise the rate of the link, or log fewer topics; see the table of rates in docs/live.md"
             yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:

@@ -154,7 +154,7 @@ _ROWS: Final = (
     ),
     Kind("lost", "watch", causes=("link_down", "overload")),
     Kind("rejected", "watch", kept_on_reboot=True),
-    Kind("overload", "watch"),
+    Kind("overload", "watch", fault=True),
     Kind(
         "heading_not_good", "info", _ESTIMATE, (*_SENSING, "reset", "landed"),
         flags={"heading_good_for_control": "heading"}, bad=False, begin="heading not good for control",

@@ -1,6 +1,7 @@
 """Access rule of all HTTP servers: refuse requests that other websites make through a browser on this network."""
 
 import ipaddress
+import re
 import socket
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -8,6 +9,7 @@ from functools import cache
 from typing import Final
 
 _ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # scrapers and probes may use any host name
+_HOST: Final = re.compile(r"(\[[^\]]*\]|[^:]*)(?::\d*)?")
 
 
 def why_refused(
@@ -39,8 +41,8 @@ def why_refused(
 
 
 def _is_own_name(host: str, *, is_local: bool) -> bool:
-    name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
-    name = name.lower().removesuffix(".")
+    found = _HOST.fullmatch(host)
+    name = found[1].strip("[]").lower().removesuffix(".") if found else ""
     with suppress(ValueError):
         return bool(ipaddress.ip_address(name))
     return name == "localhost" or name in _names() or (name != "" and "." not in name and not is_local)

@@ -76,6 +76,8 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_messages_rejected":
         (_COUNTER, ("source", "rule"), "Messages rejected by validation and not published, by violated rule"),
     "nedbus_source_lost": (_COUNTER, _SOURCE, "Messages lost before they reached the source"),
+    "nedbus_source_dropped": (_COUNTER, _SOURCE, "Lost messages that this host dropped, because it is overloaded"),
+    "nedbus_source_overloaded": (_GAUGE, _SOURCE, "1 while this host does not keep up with the link, else 0"),
     "nedbus_source_addresses":
         (_GAUGE, _SOURCE, "Addresses of a replay, or those a live source currently publishes; 0 while nothing arrives"),
     "nedbus_source_state": (_GAUGE, ("source", "state"), "1 for the current state of a source, 0 for the others"),
@@ -85,10 +87,9 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_log_stream_bytes": (_COUNTER, _LOG_STREAM, "Bytes received from a vehicle's ULog stream"),
     "nedbus_log_stream_gaps": (_COUNTER, _LOG_STREAM, "Sequence gaps in a vehicle's ULog stream"),
     "nedbus_log_stream_lost": (_COUNTER, _LOG_STREAM, "Lost LOGGING_DATA messages of a vehicle's ULog stream"),
-    "nedbus_log_stream_messages_lost":
-        (_COUNTER, (*_LOG_STREAM, "bound"), "Lower and upper bound of the number of ULog messages lost in gaps"),
+    "nedbus_log_stream_messages_lost": (_COUNTER, _LOG_STREAM, "Estimated number of ULog messages lost in gaps"),
     "nedbus_log_stream_undecodable": (_COUNTER, _LOG_STREAM, "ULog messages without a usable definition"),
-    "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of ULog messages on arrival"),
+    "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of ULog messages when published"),
     "nedbus_log_stream_header_seconds":
         (_GAUGE, _LOG_STREAM, "Transfer time of the last ULog header; the vehicle's own log has a gap of this length"),
     "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
@@ -221,6 +222,8 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
         "nedbus_messages_rejected":
             [((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()],
         "nedbus_source_lost": [((label,), status.lost) for label, status in of.items()],
+        "nedbus_source_dropped": [((label,), status.dropped) for label, status in of.items()],
+        "nedbus_source_overloaded": [((label,), bool(status.overload)) for label, status in of.items()],
         "nedbus_source_addresses": [((label,), len(status.addresses)) for label, status in of.items()],
         "nedbus_source_state":
             [((label, state), state == status.state) for label, status in of.items() for state in STATES],
@@ -233,7 +236,9 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
 
 def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any, ...]]]:
     streams = [((each.vehicle, label), each) for label, status in of.items() for each in status.log_streams]
-    columns = {"bytes": "received", "gaps": "gaps", "lost": "lost", "undecodable": "undecodable"}
+    columns = {"bytes": "received", "messages_lost": "lost_messages"} | {
+        each: each for each in ("gaps", "lost", "undecodable")
+    }
     seconds = {"delay_seconds": "delay", "header_seconds": "header_time"}
     rows: dict[str, list[tuple[Any, ...]]] = {
         f"nedbus_log_stream_{name}": [
@@ -242,11 +247,6 @@ def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any
         for name, attribute in (columns | seconds).items()
     }
     rows["nedbus_log_stream_active"] = [(labels, each.state == "streaming") for labels, each in streams]
-    rows["nedbus_log_stream_messages_lost"] = [
-        ((*labels, bound), count)
-        for labels, each in streams
-        for bound, count in (("least", each.lost_at_least), ("most", each.lost_at_most))
-    ]
     return rows
 
 

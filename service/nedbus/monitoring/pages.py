@@ -35,7 +35,7 @@ def vehicles_page(report: AccountReport) -> Page:
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
-    """Return why a service is not ready: no router, a refused vehicle, or a silent source; [] if it is ready."""
+    """Return why a service is not ready: no router, a refused vehicle, a silent source, or an overload; [] if ready."""
     if not daemon.ready.is_set():
         what = "waiting for a router at" if daemon.role == "client" else "starting a router on"
         return [f"the service is {what} {' or '.join(daemon.endpoints)}"]
@@ -48,6 +48,8 @@ def why_not_ready(daemon: Daemon) -> list[str]:
         if silent or source.state in {"starting", "retrying", "failed"}:
             what = "nothing arrives" if silent else source.state
             reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
+        if source.overload:
+            reasons.append(f"{source.source}: {source.overload}")
     return reasons
 
 

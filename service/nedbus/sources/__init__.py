@@ -3,5 +3,16 @@
 from .conversion import convert
 from .file_events import MAX_FILE_EVENTS, FileEvents, Flights, follow, read_file_events
 from .kinds import SOURCE_KINDS, parse_source, source_text_of_file
+from .log_header import expected_header
 from .mavlink.link import DuplicateIds, Link, ignore_reason, open_link, parse_link
-from .source import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
+from .source import (
+    LinkLoad,
+    LiveItem,
+    LiveSource,
+    Rejection,
+    ReplayRun,
+    ReplaySource,
+    Source,
+    SourceMessage,
+    UnavailableTopics,
+)

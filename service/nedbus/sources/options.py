@@ -144,6 +144,14 @@ class MavlinkOptions(Options):
         description="1 to request the ULog stream of each PX4 on the link, armed to start it in flight as well, take"
         " to end the stream of another client, or armed,take",
     )
+    header: Annotated[float, Field(ge=1, le=600)] | None = Field(
+        None, description="seconds that the header of a ULog stream may take, 1 to 600 (default: 10)"
+    )
+    state: str = Field(
+        "",
+        description="a folder for the state of ULog streams, which a restarted service continues, or 0 for none"
+        " (default: ulog-streams in $STATE_DIRECTORY, or in $XDG_STATE_HOME/nedbus)",
+    )
     save: Annotated[str, AfterValidator(_check_save)] = Field(
         "", description="a folder in which each ULog stream is saved as a .ulg file; requires log="
     )

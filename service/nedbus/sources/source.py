@@ -15,7 +15,7 @@ from .options import RecordedOptions, SimulatorOptions
 class SourceMessage:
     """One message from a source, not yet validated.
 
-    `due`: in a replay, seconds since the start of the recording; live messages are due on arrival.
+    `due`: in a replay, seconds since the start of the recording; of a live message, its arrival, monotonic, or 0.
     `fields`: by name, in any PX4 layout.
     `lost`: number of messages lost between the vehicle and the source, just before this one.
     `rebooted`: True for the first message after the vehicle rebooted.
@@ -44,6 +44,18 @@ class Rejection:
     reason: str
     address: Address | None = None
     count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LinkLoad:
+    """How well this host keeps up with a link; yielded on change.
+
+    `dropped`: messages that this host has dropped, which count as lost, too. `overload`: description of an overload,
+    "" if there is none.
+    """
+
+    dropped: int = 0
+    overload: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,13 +111,14 @@ class ReplaySource:
         return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
 
+LiveItem = SourceMessage | Rejection | UnavailableTopics | LinkLoad | LogStreamStatus | None
+
+
 @runtime_checkable
 class LiveSource(Protocol):
     """A source that receives from vehicles; its addresses become known as messages arrive."""
 
-    def listen(
-        self, router: Session | None
-    ) -> Iterator[SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None]:
+    def listen(self, router: Session | None) -> Iterator[LiveItem]:
         """Yield events until the iterator is closed; yield None at least twice a second while idle.
 
         `router`: the service's Zenoh session if the service is a router; borrowed, so do not close it.

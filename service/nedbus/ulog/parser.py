@@ -57,11 +57,11 @@ class UlogParser:
     `verify`: return a message only if a valid record follows it, and resynchronise after damage; for files, which have
     no checksums. Without it, the lengths are trusted, and less than 65 KiB held; for transports with checksums.
     `subscriptions`: the current ones with a decodable format, by message id.
-    `undecodable`: number of data messages without a matching subscription.
+    `undecodable`: number of data messages without a matching subscription; `mismatched`: those of another length.
     """
 
     def __init__(self, *, verify: bool) -> None:
-        self.undecodable = 0
+        self.undecodable = self.mismatched = 0
         self._verify = verify
         self._is_readable = True
         self._formats = Formats()
@@ -284,6 +284,8 @@ class UlogParser:
             self._records.append(Data(subscription, self._buffer[at + _DATA_HEADER : at + used]))
         elif kind == ord("D"):
             self.undecodable += 1
+            message_id = int.from_bytes(self._buffer[at + _HEADER : at + _DATA_HEADER], "little")
+            self.mismatched += message_id in self.subscriptions
         elif kind in READERS or inspected.validity == "invalid":
             reason = f"the record at byte {self._offset + at} is damaged"
         if reason:

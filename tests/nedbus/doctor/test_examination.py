@@ -12,7 +12,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -578,6 +578,27 @@ def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes
     return [each.pack(encoder) for each in messages]  # type: ignore[attr-defined] # pymavlink has no types
 
 
+def check_round_trip(delay: float) -> list[Finding]:
+    """Run the doctor on a link with a PX4 that answers TIMESYNC after this delay [s]."""
+    port, encoder, parser = free_port(), mavlink.MAVLink(None, 7, 1), mavlink.MAVLink(None)
+    heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    with socket.socket(type=socket.SOCK_DGRAM) as vehicle:
+        vehicle.setblocking(False)
+
+        def send() -> None:
+            with suppress(BlockingIOError):
+                for message in parser.parse_buffer(vehicle.recv(2048)) or []:
+                    if message.get_type() == "TIMESYNC":
+                        time.sleep(delay)
+                        answer = mavlink.MAVLink_timesync_message(1, message.ts1)
+                        vehicle.sendto(answer.pack(encoder), ("127.0.0.1", port))
+                return
+            vehicle.sendto(heartbeat.pack(encoder), ("127.0.0.1", port))
+
+        with repeating(send):
+            return diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{port}", listen=0.5)
+
+
 def test_mavlink_traffic_produces_findings() -> None:
     """Packets, messages, positions, ULog stream, ignored senders and a port in use produce findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
@@ -589,6 +610,8 @@ def test_mavlink_traffic_produces_findings() -> None:
     assert "requests it" in find(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
     find(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
     assert "?log=1" in find(findings, "mavlink", "ok", "system 7: PX4 found; the link carries").advice
+    finding = find(check_round_trip(0.04), "mavlink", "ok", r"round trip \d+ ms: the header of the ULog stream blocks")
+    assert "?log=1&header=" in finding.advice
     (backend,) = struct.unpack("<f", struct.pack("<i", 1))
     parameter = mavlink.MAVLink_param_value_message(b"SDLOG_BACKEND", backend, mavlink.MAV_PARAM_TYPE_INT32, 1, 0)
     data = mavlink.MAVLink_logging_data_message(255, 190, 7, 1, 0, [0] * 249)
@@ -602,6 +625,8 @@ def test_mavlink_traffic_produces_findings() -> None:
     findings = check_link(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)
     find(findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7")
     assert not any("component 100" in each.subject for each in findings)
+    findings = check_link(*packets_of(7, heartbeat, position), *packets_of(255, heartbeat, component=190))
+    assert not [each for each in findings if each.check == "mavlink" and each.state != "ok"], "a ground station"
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
         findings = diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")

@@ -129,7 +129,16 @@ def test_website_with_rebound_name_reads_nothing(
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example:9464@127.0.0.1", "[evil.example]", "127.0.0.1 evil.example", ":9464", ""]
+    "host",
+    [
+        "evil.example:9464@127.0.0.1",
+        "[evil.example]",
+        "[::1].evil.example",
+        "127.0.0.1:evil.example",
+        "127.0.0.1 evil.example",
+        ":9464",
+        "",
+    ],
 )
 def test_malformed_host_header_is_refused(servers: list[Server], host: str) -> None:
     """A Host header that names no host is refused where a foreign name is."""

@@ -139,6 +139,14 @@ def test_empty_range_raises(annotation: str, limits: str) -> None:
     assert define_msg("Right", "uint64 timestamp\nfloat32 x  # @range 1, 1\n").rules
 
 
+@pytest.mark.parametrize("field", ["uint8 x  # @range 256,300", "uint8[2] x  # @range -5,-1", "int8 x  # @range 128,"])
+def test_range_outside_the_type_raises(field: str) -> None:
+    """A range without any number of the field's type would reject every message, too; one that overlaps does not."""
+    with pytest.raises(MsgError, match="line 2, column 1: no number is in the @range of x, from"):
+        define_msg("Wrong", f"uint64 timestamp\n{field}\n")
+    assert define_msg("Right", "uint64 timestamp\nuint8 x  # @range 255, 300\n").rules
+
+
 @pytest.mark.parametrize("length", ["[x]", "[0]", "[-1]", "[1_0]", "[", "[2000]", "[<=3]"])
 def test_invalid_length_of_an_array_of_messages_raises(length: str) -> None:
     text = f"uint64 timestamp\nPart{length} parts\n===\nMSG: px4_msgs/Part\nbool flag\n"

@@ -127,6 +127,8 @@ class _Check:
         elif failed and self._vehicle is None:
             source = failed[0]
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
+        elif overloaded := [each for each in self.sources if each.overload]:
+            yield f"{to_text(overloaded[0].source)}: {to_text(overloaded[0].overload, 300)}"
         elif not self.ages and (self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)):
             states = ", ".join(f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self.sources)
             others = sorted({each.vehicle for each in self._publishers} - {self._vehicle})[:20]

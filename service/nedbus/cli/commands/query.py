@@ -99,8 +99,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(f"\nservice {name}, nedbus {version}, as {role}")
         rows = [
             [*map(to_text, (
-                each.source, each.state, each.published, each.rejected, each.lost, each.reboots, each.retries,
-                each.error or (f"{len(each.stale)} gone" if each.stale else "-"),
+                each.source, each.state, each.published, each.rejected,
+                f"{'~' * any(log.gaps for log in each.log_streams)}{each.lost}", each.reboots, each.retries,
+                each.error or each.overload or (f"{len(each.stale)} gone" if each.stale else "-"),
             ))]
             for each in service.sources
         ]  # fmt: skip

@@ -114,3 +114,9 @@ CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]]
     "BATTERY_STATUS": ("battery_status", _battery),
 }
 """Topic and conversion function of each MAVLink message."""
+
+DECODED: Final = {
+    *CONVERSIONS, "ALTITUDE", "COMMAND_ACK", "ESTIMATOR_STATUS", "GPS_GLOBAL_ORIGIN", "LOGGING_DATA",
+    "LOGGING_DATA_ACKED", "STATUSTEXT", "SYSTEM_TIME", "SYS_STATUS", "TIMESYNC",
+}  # fmt: skip
+"""Names of all MAVLink messages that are used; of others, only the header is."""

@@ -5,12 +5,16 @@ import os
 import re
 import select
 import socket
+import struct
+import sys
 import threading
+import time
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from nedbus import clock
 from nedbus.errors import ConfigError, SourceError
 
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
@@ -23,12 +27,26 @@ _MAX_READ: Final = 65535  # bytes
 _MAX_UNSENT: Final = 4096  # bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
 _RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
 _CONNECT_TIMEOUT: Final = 3.0  # s
+_TIMESTAMPS, _DROPS = (
+    35,
+    40,
+)  # Linux's SO_TIMESTAMPNS and SO_RXQ_OVFL: arrival of a datagram, and drops before it
+_TIME: Final = struct.Struct("qq")  # s and ns since the epoch
+_MAX_CONTROL: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 
 
+class Packet(NamedTuple):
+    """Bytes from a peer. `time`: arrival at this host, monotonic [s], even if they were read later."""
+
+    data: bytes
+    peer: Peer
+    time: float
+
+
 class _UdpLink:
-    """A UDP socket; `peer` is None if it listens."""
+    """A UDP socket; `peer` is None if it listens. `dropped`: datagrams dropped because they were read too late."""
 
     stream, baud = False, None
 
@@ -37,6 +55,9 @@ class _UdpLink:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        for option in (_TIMESTAMPS, _DROPS) if sys.platform == "linux" else ():
+            self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
+        self.dropped, self._drained = 0, time.monotonic()
         self.close = self._socket.close
         self.peer: Peer = None if listens else address
         if listens:
@@ -46,13 +67,29 @@ class _UdpLink:
                 self.close()
                 raise
 
-    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield received datagrams with their senders; wait up to `timeout` seconds for the first."""
+    def read(self, timeout: float) -> Iterator[Packet]:
+        """Yield received datagrams; wait up to `timeout` seconds for the first."""
         if not _wait(self._socket, timeout):
+            self._drained = time.monotonic()
             return
         with suppress(BlockingIOError, ConnectionError):  # ICMP: the peer is not listening yet
             for _ in range(_MAX_DATAGRAMS):
-                yield self._socket.recvfrom(_MAX_READ)
+                data, control, _, peer = self._socket.recvmsg(_MAX_READ, _MAX_CONTROL)
+                now = time.monotonic()
+                yield Packet(data, peer, max(self._drained, now - self._read_control(control)))
+            return
+        self._drained = time.monotonic()
+
+    def _read_control(self, control: Iterable[tuple[int, int, bytes]]) -> float:
+        """Note the number of dropped datagrams; return how long this one waited by the system's clock [s]."""
+        waited = 0.0
+        for _, kind, value in control:
+            if kind == _DROPS:
+                self.dropped = int.from_bytes(value, sys.byteorder)
+            elif kind == _TIMESTAMPS:
+                seconds, nanoseconds = _TIME.unpack(value)
+                waited = max(0.0, (clock.utc_ns() - nanoseconds) / 1e9 - seconds)
+        return waited
 
     def send(self, frame: bytes, peer: Peer) -> bool:
         """Send a frame without blocking; return False if that fails, such as in a full buffer."""
@@ -68,7 +105,7 @@ class _UdpLink:
 class _StreamLink:
     """A TCP connection, or a serial port if `baud` is set; a read may return a partial message."""
 
-    stream = True
+    stream, dropped = True, 0
 
     def __init__(self, file: Any, peer: Peer, baud: int | None = None) -> None:
         os.set_blocking(file.fileno(), False)
@@ -78,8 +115,8 @@ class _StreamLink:
         self._unsent = bytearray()  # whole frames; the first may be sent in part
         self._sending = threading.Lock()
 
-    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield received bytes with their sender, and send queued frames; wait up to `timeout` seconds."""
+    def read(self, timeout: float) -> Iterator[Packet]:
+        """Yield received bytes, and send queued frames; wait up to `timeout` seconds."""
         if ready := _wait(self._file, timeout, select.POLLOUT * bool(self._unsent)):
             self._flush()
         if ready & ~select.POLLOUT:
@@ -87,7 +124,7 @@ class _StreamLink:
                 data = os.read(self._file.fileno(), _MAX_READ)
                 if not data:
                     raise ConnectionResetError(None, "the peer closed the connection")
-                yield data, self.peer
+                yield Packet(data, self.peer, time.monotonic())
 
     def send(self, frame: bytes, _: Peer) -> bool:
         """Send or queue a whole frame without blocking; return False if the queue is full. Raises OSError."""

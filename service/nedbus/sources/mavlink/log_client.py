@@ -6,20 +6,22 @@ from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.sources.log_header import COUNT_PER_TOPIC, DEFAULT_COUNT, FIXED_COUNT, PROCESSING
 from nedbus.timings import TIMINGS
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
 
 _TRIES: Final = 3  # transmissions of an unanswered command
 _RESTARTS: Final = 2  # after START was accepted, but no data arrived
-_MIN_COUNT: Final = 32  # messages of a header before its duration is estimated
-_EXPECTED_COUNT: Final = 400  # messages of a header; 274 to 410 were measured
+_PINGS: Final = 3  # TIMESYNC requests before START; the shortest round trip counts, the others may have been queued
+_MIN_COUNT: Final = 32  # messages of a header before its duration is estimated, or fewer if they took `_MIN_TIME`
+_MIN_TIME: Final = 1.0  # s
 _STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
 _DECAY: Final = 0.98  # decay of the longest interval between messages, per message
 
 LogReason = Literal[
     "not_px4", "armed", "taken", "bandwidth", "unsupported", "failed", "no_answer", "no_data", "slow_link", "stalled",
-    "silent", "stopped_elsewhere", "link_lost", "unreadable",
+    "silent", "stopped_elsewhere", "link_lost", "unreadable", "left",
 ]  # fmt: skip
 _TEXTS: Final[Mapping[LogReason, str]] = {
     "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
@@ -35,12 +37,14 @@ _TEXTS: Final[Mapping[LogReason, str]] = {
     "no_data": "PX4 accepted MAV_CMD_LOGGING_START, but sends no data; if another link receives the stream, stop it"
     " there, or reboot the vehicle",
     "slow_link": "the header of the ULog stream would take {:.0f} s, at {:.0f} ms for each acknowledged message, and"
-    " block PX4's logger meanwhile; use a link with a shorter round trip",
+    " block PX4's logger meanwhile; {:.0f} s are allowed, enough for {}; use a link with a shorter round trip, or set"
+    " header={:.0f}",
     "stalled": "the header of the ULog stream stalled for {:.1f} s; PX4 may not receive the acknowledgements",
     "silent": "the ULog stream seems to have ended; no data arrived for {:.1f} s",
     "stopped_elsewhere": "PX4 stopped the ULog stream, probably because another client requested it",
     "link_lost": "no message arrived from the vehicle for {:.1f} s; the link seems to be lost",
     "unreadable": "the ULog stream cannot be read, because {}",
+    "left": "the ULog stream of the armed vehicle continues, for the next process",
 }
 _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_TEMPORARILY_REJECTED: "taken",
@@ -65,9 +69,9 @@ class LogStatus(NamedTuple):
 
 
 class Command(NamedTuple):
-    """A message to send: a command to the autopilot, or LOGGING_ACK with this sequence."""
+    """A message to send: a command to the autopilot, LOGGING_ACK with this sequence, TIMESYNC with this time [ns]."""
 
-    kind: Literal["start", "stop", "acknowledge"]
+    kind: Literal["start", "stop", "acknowledge", "ping"]
     sequence: int = 0
 
 
@@ -79,21 +83,26 @@ class LogStreamClient:
 
     `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
     Without "take", a rejected client stops only a stream addressed to its own ids, left by an earlier process.
-    `system`, `component`: the MAVLink ids of this client.
+    `system`, `component`: the MAVLink ids of this client. `header`: the longest header [s]; None for the default.
     `header_seconds`: duration of the last header; None until it is complete.
     """
 
-    def __init__(self, log: Set[Literal["1", "armed", "take"]], *, system: int, component: int) -> None:
-        self._log, self._ids = log, (system, component)
+    def __init__(
+        self, log: Set[Literal["1", "armed", "take"]], *, system: int, component: int, header: float | None = None
+    ) -> None:
+        self._log, self._ids, self._longest_header = log, (system, component), header
         self._owner = "another client"
         self.header_seconds: float | None = None
-        self._is_px4 = self._armed = False
+        self._is_px4 = self._armed = self._is_left = False
         self._reset()
 
     def _reset(self) -> None:
         self.status = LogStatus("idle")
         self._unreadable = ""  # reason given to `reject`, until the next `tick`
-        self._awaited: Literal["start", "stop", "data"] | None = None
+        self._awaited: Literal["pong", "start", "stop", "data"] | None = None
+        self._pings: set[int] = set()  # times of unanswered TIMESYNC requests [ns]
+        self._round_trips: list[float] = []  # since START became due [s]
+        self._expected_count = DEFAULT_COUNT  # messages of the next header
         self._due = 0.0  # deadline of the awaited event, or else time of the next START
         self._tries = self._restarts = 0
         self._has_sent_command = self._took_over = False
@@ -121,6 +130,15 @@ class LogStreamClient:
         elif self.status.reason == "link_lost":
             self._resume(now)  # PX4 continues to stream without a client
         return self.tick(now)
+
+    def adopt(self, now: float) -> None:
+        """Continue a stream of an earlier process that is addressed to this client, and whose definitions are known."""
+        self._awaited, self._has_header, self._has_sent_command = None, True, True
+        self._resume(now)
+
+    def leave(self) -> None:
+        """Let `stop` leave the stream of an armed vehicle running; like `reject`, may be called on any thread."""
+        self._is_left = True
 
     def on_reboot(self) -> None:
         """Handle a reboot of the vehicle, which ends the stream."""
@@ -174,6 +192,14 @@ class LogStreamClient:
             self._end_stop(now)
         return []
 
+    def on_timesync(self, sent: int, now: float) -> list[Command]:
+        """Handle an answer to TIMESYNC; ignore it unless it answers this client's request, sent at this time [ns]."""
+        if sent not in self._pings or self._awaited != "pong":
+            return []
+        self._pings.remove(sent)
+        self._round_trips.append(now - sent / 1e9)
+        return self._ping(now) if len(self._round_trips) < _PINGS else self._start(now)
+
     def tick(self, now: float) -> list[Command]:
         """Return the commands that are due."""
         if self._unreadable and self.status.state in ("header", "streaming"):
@@ -184,8 +210,8 @@ class LogStreamClient:
         state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
         is_lost = silence > TIMINGS.log_link
         if is_lost and state in ("header", "streaming"):
-            self._awaited = None
-            self._enter("ended", "link_lost", now, silence)
+            self._awaited, self._has_header = None, state == "streaming"  # PX4 gave up on the header
+            self._enter("ended", "link_lost" if self._has_header else "stalled", now, silence)
         elif self._awaited is not None:
             return self._on_timeout(now, is_lost=is_lost) if now >= self._due else []
         elif state in ("header", "streaming"):
@@ -195,17 +221,22 @@ class LogStreamClient:
         if self._may_start():
             if state in ("idle", "waiting_for_disarm"):
                 self._enter("starting", None, now)
-            return self._send("start", now)
+            return self._ping(now)
         if state in ("idle", "starting"):
             self._enter("waiting_for_disarm", "armed", now)
         return []
 
     def reject(self, reason: str) -> None:
-        """Stop the current stream, which cannot be read; unlike all other methods, may be called on any thread."""
+        """Stop the current stream, which cannot be read; unlike most methods, may be called on any thread."""
         self._unreadable = reason
 
     def stop(self, now: float) -> list[Command]:
         """End this client's stream; call `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
+        if self._awaited == "pong":
+            self._awaited = None
+        if self._is_left and self._armed and self.status.state == "streaming":
+            self._enter("stopped", "left", now)
+            return []
         is_ours = self.status.state in ("header", "streaming") or self._awaited == "data"
         self._enter("stopping" if is_ours or self._awaited else "stopped", None, now)
         return self._send("stop", now) if is_ours else []
@@ -219,7 +250,7 @@ class LogStreamClient:
             values = (self._owner,) if reason == "taken" else values
             self.status = LogStatus(state, reason, _TEXTS[reason].format(*values) if reason else "")
         if self._awaited is None:
-            is_slow = reason in ("bandwidth", "unsupported", "slow_link", "unreadable")
+            is_slow = reason in ("bandwidth", "unsupported", "slow_link", "stalled", "no_data", "unreadable")
             is_over = state in ("refused", "ended")
             self._due = now + (TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0)
 
@@ -228,21 +259,46 @@ class LogStreamClient:
         self._due = now + TIMINGS.log_answer * (2**tries if kind == "start" else 1)
         return [Command(kind)]
 
+    def _ping(self, now: float) -> list[Command]:
+        """Measure the round trip, before START."""
+        ping = round(now * 1e9)
+        if self._awaited != "pong":
+            self._tries, self._round_trips = 0, []
+            self._pings.clear()
+        self._awaited, self._tries, self._due = "pong", self._tries + 1, now + TIMINGS.log_answer
+        self._pings.add(ping)
+        return [Command("ping", ping)]
+
+    def _start(self, now: float) -> list[Command]:
+        """Send START, unless the header would take too long; without an answer to TIMESYNC, START will show it."""
+        self._awaited = None
+        interval = min(self._round_trips, default=0.0) + PROCESSING
+        is_allowed = self._may_start() and self._allows(self._expected_count, interval, now)
+        return self._send("start", now) if is_allowed else []
+
+    def _allows(self, count: int, interval: float, now: float, elapsed: float = 0.0) -> bool:
+        """Return whether the header may take as long as `count` more messages need; if not, refuse the stream."""
+        limit = self._longest_header or TIMINGS.log_header
+        expected = elapsed + count * interval
+        if expected <= limit:
+            return True
+        topics = int((limit / interval - FIXED_COUNT) / COUNT_PER_TOPIC) if interval else 0
+        fit = f"the header of {topics} topics" if topics > 0 else "none, because of the vehicle's parameters alone"
+        self._has_header = False
+        self._enter("refused", "slow_link", now, expected, 1e3 * interval, limit, fit, math.ceil(1.2 * expected))
+        return False
+
     def _end_stop(self, now: float) -> None:
         self._awaited = None
         state, reason, _ = self.status
         self._enter("stopped" if state == "stopping" else state, reason, now)
         self._due = max(self._due, now + TIMINGS.log_timeout)
 
-    def _restart(self, now: float) -> list[Command]:
-        """Restart the stream: send STOP now, and START after its acknowledgement or timeout."""
-        self._has_header = False
+    def _take_over(self, now: float) -> list[Command]:
+        """Send STOP now, and START after its acknowledgement or timeout."""
+        self._took_over, self._has_header = True, False
         self._enter("starting", None, now)
         return self._send("stop", now)
-
-    def _take_over(self, now: float) -> list[Command]:
-        self._took_over = True
-        return self._restart(now)
 
     def _resume(self, now: float) -> None:
         """Assume that a silent stream continues, until `_check_silence` finds that it does not."""
@@ -251,18 +307,16 @@ class LogStreamClient:
 
     def _end_header(self, now: float) -> None:
         self.header_seconds, self._acked_in_row = self._last_acked - self._header_start, 0
+        self._expected_count = self._header_messages
         self._enter("streaming", None, now)
 
     def _check_header(self, now: float) -> list[Command]:
         """Stop a stream whose header takes too long, or is expected to."""
         elapsed, count = now - self._header_start, self._header_messages
-        round_trip = (elapsed - self._header_pause) / max(1, count - 2)
-        expected = elapsed + round_trip * max(0, _EXPECTED_COUNT - count)
-        if (expected if count >= _MIN_COUNT else elapsed) <= TIMINGS.log_header:
-            return []
-        self._has_header = False
-        self._enter("refused", "slow_link", now, expected, 1e3 * round_trip)
-        return self._send("stop", now)
+        interval = (elapsed - self._header_pause) / max(1, count - 2)
+        is_known = count >= _MIN_COUNT or elapsed >= _MIN_TIME
+        remaining = max(0, self._expected_count - count) if is_known else 0
+        return [] if self._allows(remaining, interval, now, elapsed) else self._send("stop", now)
 
     def _on_start_result(self, result: int, now: float) -> list[Command]:
         state, self._awaited = self.status.state, None
@@ -297,12 +351,17 @@ class LogStreamClient:
             self._end_stop(now)
         elif state == "stopping":  # START was not answered, so there is no stream to stop
             self._enter("stopped", None, now)
+        elif awaited == "pong" and not is_lost:
+            self._awaited = "pong"
+            return self._ping(now) if is_repeated else self._start(now)
         elif awaited == "data" and not is_lost:
+            # The data may go to another client, so no STOP: if nobody acknowledges it, PX4 gives up.
             self._restarts += 1
             if self._restarts <= _RESTARTS:
-                return self._restart(now)
-            self._enter("refused", "no_data", now)
-            return self._send("stop", now)
+                self._enter("starting", None, now)
+                self._due = now + TIMINGS.log_timeout
+            else:
+                self._enter("refused", "no_data", now)
         elif is_lost or not self._may_start():
             if state == "starting":
                 self._enter("idle", None, now)

@@ -2,10 +2,11 @@
 
 import logging
 import math
+import os
 import struct
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -20,32 +21,47 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .log_client import LogStatus, LogStreamClient
 from .log_reassembly import Chunk
+from .saved_stream import StreamFile
 
 _log = logging.getLogger(__name__)
 
 _SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted messages have `mavlink`
-_WINDOW: Final = 1.0  # s over which rate and delay are measured
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
+_WINDOW: Final = 1.0  # s over which rate and delay are measured
 _MAX_REQUESTS: Final = 10  # TIMESYNC requests that may be unanswered
 _FILE_HEADER: Final = 16  # bytes
 _RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
 _DROPOUT: Final = struct.Struct("<HBH")  # a record of type O: duration [ms]
 _MAX_DROPOUT: Final = 2**16 - 1  # ms
 _MAX_SAME_NAME: Final = 100
+_FILE_INTERVAL: Final = 5.0  # s between two files of a vehicle
+_MAX_PENDING: Final = 2**22  # bytes of a stream that wait for its file
 
 
 class LogStream:
-    """ULog stream of one vehicle, used on the thread of the source; `client` is used on the thread of the link."""
+    """ULog stream of one vehicle, used on the thread of the source; `client` is used on the thread of the link.
 
-    def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
+    `state`: the state file of the stream.
+    """
+
+    def __init__(
+        self, name: str, options: MavlinkOptions, client: LogStreamClient, state: StreamFile | None = None
+    ) -> None:
+        self.state = state or StreamFile(None, 0)
         self._name, self._client, self._address = name, client, Address(name, DEFAULT_TOPIC)
         self._topics = options.chosen_topics
         self._folder = Path(options.save).expanduser() if options.save else None
         self._file: LogFile | None = None
+        self._next_file = -math.inf  # time of the next file, because a vehicle may send one header after another
+        self._pending: deque[tuple[float, bytes]] = deque()  # the stream before its file: gaps [s], and what follows
+        self._pending_size = self._unsaved = 0  # bytes
+        self._is_pending = False
         self._logged = LogStatus("idle")
         self._streamed: set[Address] = set()
-        self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
+        self._received = self._gaps = self._lost = self._undecodable = 0
+        self._records = self._record_bytes = 0  # data messages, whose mean size estimates the number of lost ones
+        self._lost_messages = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
         self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)  # times of unanswered TIMESYNC requests [ns]
@@ -56,6 +72,8 @@ class LogStream:
 
     def _restart(self) -> None:
         """Discard the definitions and the clock offset, because the vehicle may have rebooted."""
+        self._streamed.clear()
+        self._has_data = False
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
@@ -75,12 +93,11 @@ class LogStream:
     def add(self, chunk: Chunk, now: float) -> Iterator[SourceMessage | Rejection]:
         """Yield the messages that a chunk completes."""
         if chunk.begins:
-            self._restart()
             self.close()
+            self._restart()
         if chunk.lost:
             self._count_gap(chunk.lost)
         self._save(chunk, now)
-        self._last_chunk = now
         if not chunk.data:
             return
         self._received += len(chunk.data)
@@ -92,6 +109,10 @@ class LogStream:
             self._client.reject(str(exc))
             return
         self._undecodable += self._parser.undecodable - undecodable
+        sizes = [len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)]
+        self._records, self._record_bytes = self._records + len(sizes), self._record_bytes + sum(sizes)
+        yield from self._check_definitions(is_first=not undecodable)
+        self._save_definitions(records, now)
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
                 if record.subscription not in self._streams:
@@ -112,6 +133,14 @@ class LogStream:
         yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
         yield from [Rejection(where, self._texts.problem, count=0)] * (self._texts.problem != problem)
 
+    def _check_definitions(self, *, is_first: bool) -> Iterator[Rejection]:
+        """Report messages without a definition once; reject a continued stream if a definition does not match."""
+        if self._parser.mismatched and self._client.header_seconds is None:
+            self._client.reject("its definitions changed while no process received it")
+        elif self._parser.undecodable and is_first:
+            reason = "messages of topics whose definitions were lost are counted as undecodable until the next stream"
+            yield Rejection(f"{self._name} ULog stream, topics", reason, count=0)
+
     def request_time(self) -> int:
         """Return the time to send in a TIMESYNC request, by which its answer is recognised [ns]."""
         self._requests.append(time.monotonic_ns())
@@ -131,6 +160,12 @@ class LogStream:
         if round_trip <= self._round_trip or abs(offset - self._offset) > tolerance:
             self._offset, self._round_trip = offset, round_trip
 
+    def add_delay(self, timestamp: object, now: float) -> None:
+        """Measure the age of a message that is published at time `now`, by the vehicle's clock."""
+        if self._round_trip < math.inf and isinstance(timestamp, int):
+            self._delays += now + self._offset - timestamp / 1e6
+            self._delayed += 1
+
     def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
         status = self._client.status
@@ -140,32 +175,53 @@ class LogStream:
             return
         self._logged = status
         if status.state == "streaming":
-            header = self._client.header_seconds or 0.0
-            text = f"; the log on the SD card lacks the {header:.1f} s in which the header was sent"
+            header = self._client.header_seconds
+            text = f"; the log on the SD card lacks the {header or 0.0:.1f} s in which the header was sent"
+            if header is None:
+                text = "; it continues the one of an earlier process"
             text, self._new_header = text if self._new_header else " again", False
             extra = about("log_stream", self._address)
             _log.info("vehicle %s: receiving the ULog stream%s", self._name, text, extra=extra)
+        elif status.reason == "left":
+            _log.info("vehicle %s: %s", self._name, status.text, extra=about("log_stream", self._address))
         elif status.reason is not None:
             extra = about("log_stream", self._address, reason=status.text)
             _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
         """Return the status, with rate and delay measured since the last call."""
+        if self._file is not None and not self._file.exists:
+            self._stop_saving(f"{self._file.path} was deleted")
         seconds = now - self._window_start
         if seconds >= _WINDOW:
             self._rate = self._window_bytes / seconds
             self._delay = self._delays / self._delayed if self._delayed else None
             self._window_start, self._window_bytes, self._delays, self._delayed = now, 0, 0.0, 0
+        self._estimate_lost()  # a gap may precede the first message
         state = self._client.status
         return LogStreamStatus(
             vehicle=self._name, state=state.state, reason=state.text, received=self._received, rate=self._rate,
             delay=self._delay, header_time=self._client.header_seconds, gaps=self._gaps, lost=self._lost,
-            lost_at_least=self._at_least, lost_at_most=self._at_most, undecodable=self._undecodable,
-            saved=str(self._file.path) if self._file else "",
+            lost_messages=self._lost_messages, undecodable=self._undecodable,
+            saved=str(self._file.path) if self._file and state.state != "refused" else "", unsaved=self._unsaved,
         )  # fmt: skip
+
+    def leave(self) -> None:
+        """Before `LogStreamClient.stop`: leave the stream of an armed vehicle running if its state is saved."""
+        if self.state.is_current:
+            self._client.leave()
+
+    def end(self) -> None:
+        """Close all files; delete the state of a stream that was stopped."""
+        self.log_changes()
+        self.state.close(remove=self._client.status[:2] == ("stopped", None))
+        self.close()
 
     def close(self) -> None:
         """Close the saved file."""
+        self._unsaved += self._pending_size if self._has_data else 0
+        self._pending.clear()
+        self._pending_size, self._is_pending = 0, False
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -181,46 +237,76 @@ class LogStream:
         self._streams[subscription] = stream
 
     def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
-        timestamp = fields.get("timestamp")
-        if self._round_trip < math.inf and isinstance(timestamp, int):
-            self._delays += now + self._offset - timestamp / 1e6
-            self._delayed += 1
         self._streamed.add(stream.address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
         definition = stream.definition
-        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
+        return SourceMessage(now, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
-        """Count a gap; derive bounds on the number of lost records from the smallest and largest record size."""
         self._gaps += 1
         self._lost += lost
-        smallest, largest = self._record_sizes()
-        least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
-        self._at_least += least
-        self._unreported += least
-        self._at_most += math.ceil(_CHUNK_SIZE * lost / smallest) + 1  # records are cut at both ends
+        self._estimate_lost()
         self._parser.gap()
 
-    def _record_sizes(self) -> tuple[int, int]:
-        sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
-        return min(sizes, default=_DATA_HEADER), max(sizes, default=_CHUNK_SIZE)
+    def _estimate_lost(self) -> None:
+        """Update the number of lost messages: each gap cuts one, and covers others by their mean size so far."""
+        covered = _CHUNK_SIZE * self._lost * self._records / max(1, self._record_bytes)
+        before, self._lost_messages = self._lost_messages, max(self._lost_messages, round(self._gaps + covered))
+        self._unreported += self._lost_messages - before
 
     def _save(self, chunk: Chunk, now: float) -> None:
         """Save a chunk; after an error stop saving, but continue publishing."""
+        gap = now - (self._last_chunk or now) if chunk.lost else 0.0
+        self._last_chunk, self._is_pending = now, self._is_pending or chunk.begins
+        if self._is_pending:
+            self._pending.append((gap, chunk.data))
+            self._pending_size += len(chunk.data)
+            if self._pending_size > _MAX_PENDING:
+                self._stop_saving(f"the stream has more than {_MAX_PENDING} bytes before its first message")
+        elif self._file is not None:
+            self._write(self._file, [(gap, chunk.data)])
+        elif self._folder is not None:
+            self._unsaved += len(chunk.data)
+
+    def _write(self, file: "LogFile", parts: Iterable[tuple[float, bytes]]) -> None:
         try:
-            if chunk.begins and self._folder is not None:
-                self._file = LogFile(self._folder, self._name)
-                extra = about("log_stream", self._address)
-                _log.info("vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=extra)
-            if self._file is not None:
-                if chunk.lost:
-                    self._file.mark_gap(now - (self._last_chunk or now))
-                self._file.write(chunk.data)
+            for gap, data in parts:
+                if gap:
+                    file.mark_gap(gap)
+                file.write(data)
         except OSError as exc:
-            error = OutputError(self._file.path if self._file else Path(exc.filename), exc)
-            self.close()
-            extra = about("log_stream", self._address, reason=str(error))
-            _log.error("vehicle %s: stopped saving the ULog stream: %s", self._name, error, extra=extra)
+            self._unsaved += len(data)
+            self._stop_saving(str(OutputError(file.path, exc)))
+
+    def _save_definitions(self, records: Iterable[ulog.Record], now: float) -> None:
+        """Update the state file; create the log file with the first message, but not more often than every 5 s."""
+        for record in records:
+            if isinstance(record, ulog.Data) and not self._has_data:
+                self._has_data = True
+                self.state.write(b"".join(data for _, data in [*self._pending][:-1]))
+            elif isinstance(record, ulog.Subscription) and self._has_data:
+                body = struct.pack("<BH", record.multi_id, record.message_id) + record.name.encode()
+                self.state.append(struct.pack("<HB", len(body), ord("A")) + body)
+        if not (self._has_data and self._is_pending) or (self._folder and now < self._next_file):
+            return
+        pending, self._pending, self._is_pending, self._pending_size = self._pending, deque(), False, 0
+        if self._folder is None:
+            return
+        self._next_file = now + _FILE_INTERVAL
+        try:
+            self._file = LogFile(self._folder, self._name)
+        except OSError as exc:
+            self._unsaved += sum(len(data) for _, data in pending)
+            self._stop_saving(str(OutputError(Path(exc.filename), exc)))
+            return
+        extra = about("log_stream", self._address)
+        _log.info("vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=extra)
+        self._write(self._file, pending)
+
+    def _stop_saving(self, reason: str) -> None:
+        self.close()
+        extra = about("log_stream", self._address, reason=reason)
+        _log.error("vehicle %s: stopped saving the ULog stream: %s", self._name, reason, extra=extra)
 
 
 class LogFile:
@@ -234,6 +320,11 @@ class LogFile:
         self._size = 0
         self._partial = bytearray()  # the last record, until it is complete
         self._begins = True
+
+    @property
+    def exists(self) -> bool:
+        """Whether the file is still in a folder."""
+        return os.fstat(self._file.fileno()).st_nlink > 0
 
     def write(self, data: bytes) -> None:
         """Append bytes of the stream; only whole records reach the file."""

@@ -10,11 +10,10 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.client import LogStreamStatus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
-from nedbus.sources.source import Rejection, SourceMessage
+from nedbus.sources.source import LiveItem, Rejection, SourceMessage
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.ulog import LOG_MESSAGE
@@ -23,7 +22,9 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 from .fields import CONVERSIONS
 from .link import AUTOPILOT, DuplicateIds, Link, Peer, open_link, parse_link
 from .log_stream import LogStream
-from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver, Received
+from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
+from .receive_queue import Received
+from .saved_stream import StreamFile, state_path
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ class MavlinkSource:
         self._link = link
         self._options = options
 
-    def listen(self, _: Session | None) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
+    def listen(self, _: Session | None) -> Iterator[LiveItem]:
         """Receive messages; raise SourceError if the link cannot be opened or fails."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
@@ -72,18 +73,16 @@ class _LinkSession:
         self._peers: dict[int, Peer] = {}
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
-        reader = LinkReader(link, name=name)
-        self._receiver = LogReceiver(reader, options, self._send) if options.log else None
-        self._read = (self._receiver or reader).read
+        self._receiver = LogReceiver(LinkReader(link, name=name), options, self._send)
 
-    def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
+    def run(self) -> Iterator[LiveItem]:
         next_requests = next_status = 0.0
         while True:
-            for item in self._read(TIMINGS.source_tick):
-                if isinstance(item, Rejection):
-                    yield item
-                else:
+            for item in self._receiver.read(TIMINGS.source_tick):
+                if isinstance(item, Received):
                     yield from self._handle(item)
+                else:
+                    yield item
             yield None
             now = time.monotonic()
             if now >= next_requests:
@@ -105,10 +104,11 @@ class _LinkSession:
 
     def close(self) -> None:
         """Stop the ULog streams, and close their files."""
-        if self._receiver is not None:
-            self._receiver.close()
         for log in self._logs.values():
-            log.close()
+            log.leave()
+        self._receiver.close()
+        for log in self._logs.values():
+            log.end()
 
     def _handle(self, received: Received) -> Iterator[SourceMessage | Rejection]:
         message, system, now, chunk = received.message, received.system, received.time, received.chunk
@@ -118,7 +118,7 @@ class _LinkSession:
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
-        vehicle.track_sequence(received.sequence, now, counted=chunk.lost if chunk else None)
+        vehicle.count_lost(received.lost, now, counted=chunk.lost if chunk else None)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
             log.add_timesync(message.tc1, message.ts1, now)
@@ -126,11 +126,15 @@ class _LinkSession:
         streamed = log.add(chunk, now) if log and chunk else ()
         for each in chain([converted] if converted else [], streamed):
             item = vehicle.report(each, log) if isinstance(each, SourceMessage) else each
+            if log is not None and isinstance(item, SourceMessage) and item.source:
+                log.add_delay(item.fields.get("timestamp"), time.monotonic())
             if isinstance(item, SourceMessage) and item.rebooted:
                 address = Address(item.address.vehicle, DEFAULT_TOPIC)
                 extra = about("rebooted", address, source=self._name)
                 _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
             yield item
+        if log and chunk and chunk.verdict in ("delivered", "unsynchronised") and vehicle.clock.newest is not None:
+            log.state.update(message.sequence, vehicle.clock.newest, now)
 
     def _log_unsent(self) -> None:
         with self._sending:
@@ -140,9 +144,11 @@ class _LinkSession:
             _log.warning(text, self._name, count, extra=about("dropped", source=self._name))
 
     def _log_of(self, system: int) -> LogStream | None:
-        """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
-        if system not in self._logs and self._receiver and (found := self._receiver.vehicles.get(system)):
-            self._logs[system] = LogStream(self._name_of(system), self._options, found.client)
+        """Return the ULog stream of a vehicle; None without `log=`."""
+        if system not in self._logs and self._options.log:
+            client = self._receiver.vehicles[system].client
+            state = StreamFile(state_path(self._options, self._name, system), system)
+            self._logs[system] = LogStream(self._name_of(system), self._options, client, state)
         return self._logs.get(system)
 
     def _name_of(self, system: int) -> str:

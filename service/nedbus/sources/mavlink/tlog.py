@@ -16,6 +16,7 @@ from nedbus.sources.source import Rejection, ReplayRun, SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Definition
 
 from .reader import new_parser, parse
+from .sequence import SequenceCounter
 from .vehicle import Vehicle
 
 _LOOKAHEAD: Final = 1000  # messages read when a file is opened, for the initial list of addresses
@@ -47,7 +48,7 @@ class TlogReader:
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages, once; raise SourceError if there are none."""
-        vehicles: dict[int, Vehicle] = {}
+        vehicles: dict[int, tuple[Vehicle, SequenceCounter]] = {}
         parser, due, last = new_parser(), 0, 0
         for stamp, frame in self._frames():
             due, last = due + (stamp - last if last and 0 < stamp - last <= _MAX_GAP else 0), stamp
@@ -56,9 +57,10 @@ class TlogReader:
                     self.damaged += len(frame) if item.where == str(self._path) else 0
                     continue
                 if item.system not in vehicles:
-                    vehicles[item.system] = Vehicle(self._vehicle or str(item.system), self._options)
-                vehicle = vehicles[item.system]
-                vehicle.track_sequence(item.sequence, item.time)
+                    name = self._vehicle or str(item.system)
+                    vehicles[item.system] = Vehicle(name, self._options), SequenceCounter()
+                vehicle, sequence = vehicles[item.system]
+                vehicle.count_lost(sequence.add(item.sequence, item.time), item.time)
                 found = vehicle.handle(item.message, item.time)
                 if found is None or found.address is None:
                     continue

@@ -99,27 +99,21 @@ class Vehicle:
         """Discard all state and request everything again, after silence or a reboot."""
         self._stored: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
         self._last: dict[Address, int] = {}  # newest timestamps
-        self._sequence: int | None = None
         self._texts = _StatusTexts()
         self._started = now
         self._arrivals: dict[int, float] = {}  # last arrival of each requested message
         self._pending = [*self._rates] * _FIRST_ROUNDS
         self._next_round = now + _REQUEST_INTERVAL
 
-    def track_sequence(self, sequence: int, now: float, *, counted: int | None = None) -> None:
-        """Count the messages of any type lost before this one.
+    def count_lost(self, lost: int, now: float, *, counted: int | None = None) -> None:
+        """Count the messages of any type lost before one that arrived at time `now`, -1 if it had been counted as lost.
 
         `counted`: those that the ULog stream has counted, if this is one of its messages.
         """
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
-        step = 1 if self._sequence is None else (sequence - self._sequence) % 256
-        if step > 128:  # out of order: the message was counted as lost
-            self.lost = max(0, self.lost - 1)
-        elif step:  # else a duplicate
-            self.lost = max(0, self.lost + step - 1 - (counted or 0))
-            self._sequence = sequence
+        self.lost = max(0, self.lost + lost - (counted or 0))
         if counted is not None:
             self._certain = self.lost
 
@@ -187,7 +181,7 @@ class Vehicle:
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(topic, fields, timestamp, now)
-        return self.report(SourceMessage(0.0, address, fields), log)
+        return self.report(SourceMessage(now, address, fields), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:

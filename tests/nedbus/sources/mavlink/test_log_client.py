@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import cache
 from typing import Any, Final, Literal
@@ -29,9 +30,11 @@ StateAndReason = tuple[LogState, LogReason | None]
 class Session:
     """A client, a manually stepped vehicle, the commands sent, and each state with its reason."""
 
-    def __init__(self, *log: Log, armed: bool = False, autopilot: int = PX4) -> None:
-        self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
-        self.autopilot, self.armed, self.now = autopilot, armed, 1000.0
+    def __init__(
+        self, *log: Log, armed: bool = False, autopilot: int = PX4, header: float | None = None
+    ) -> None:  # fmt: skip
+        self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1], header=header)
+        self.autopilot, self.armed, self.now, self.round_trip = autopilot, armed, 1000.0, 0.001
         self.sent: list[Command] = []
         self.states: list[StateAndReason] = [("idle", None)]
         self.texts: list[str] = []
@@ -40,14 +43,19 @@ class Session:
     @property
     def commands(self) -> list[str]:
         """START and STOP, without acknowledgements."""
-        return [each.kind for each in self.sent if each.kind != "acknowledge"]
+        return [each.kind for each in self.sent if each.kind in ("start", "stop")]
 
     @property
     def acknowledged(self) -> list[int]:
         return [each.sequence for each in self.sent if each.kind == "acknowledge"]
 
     def add(self, commands: list[Command]) -> None:
+        """Collect commands; answer TIMESYNC after the round trip."""
         self.sent += commands
+        for each in commands:
+            if each.kind == "ping" and self.round_trip:
+                self.now += self.round_trip
+                self.add(self.client.on_timesync(each.sequence, self.now))
         if self.client.status[:2] != self.states[-1]:
             self.states.append(self.client.status[:2])
             self.texts.append(self.client.status.text)
@@ -88,11 +96,11 @@ class Session:
             self.receive()
             self.add(self.client.tick(self.now))
 
-    def start(self) -> None:
+    def start(self, interval: float = 0.004) -> None:
         """Start a stream; receive its header and its first second."""
         self.wait(0.1)
         self.answer(START, ACCEPTED)
-        self.header()
+        self.header(round_trip=interval)
         self.stream()
 
 
@@ -132,7 +140,9 @@ def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
     assert session.states[-1] == ("starting", None)
     session.answer(START, ACCEPTED, (0, 0))  # MAVLink 1 has no ids
     session.wait(1.5)
-    assert session.commands == ["start", "stop"]
+    assert session.commands == ["start"]
+    session.wait(TIMINGS.log_timeout)
+    assert session.commands == ["start", "start"]
 
 
 @pytest.mark.parametrize(
@@ -313,32 +323,30 @@ class TestOwnership:
 class TestNoData:
     """PX4 accepts START but sends no data if START follows STOP too soon, or if another link has the stream."""
 
-    def test_start_without_data_is_followed_by_restart(self, session: Session) -> None:
-        """Without data, STOP is sent 1 s after START was accepted, and START 2.5 s after STOP was accepted."""
+    def test_start_without_data_is_repeated_without_stop(self, session: Session) -> None:
+        """START is repeated when PX4 has given up, after 3.5 s; STOP might end the stream of another client."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
-        session.wait(0.8)
+        session.wait(TIMINGS.log_answer + TIMINGS.log_timeout - 0.2)
         assert session.commands == ["start"]
         session.wait(0.4)
-        assert session.commands == ["start", "stop"]
-        session.answer(STOP, ACCEPTED)
-        session.wait(TIMINGS.log_timeout - 0.2)
-        assert session.commands == ["start", "stop"]
-        session.wait(0.4)
+        assert session.commands == ["start", "start"]
         session.answer(START, ACCEPTED)
         session.header()
         session.stream()
         assert session.states[1:] == [("starting", None), ("header", None), ("streaming", None)]
 
     def test_start_without_data_fails_after_three_attempts(self, session: Session) -> None:
-        """After three attempts without data the state is "refused", reason "no_data"; START is retried every 30 s."""
+        """After three attempts without data the state is "refused", reason "no_data"; the next one is 5 minutes later.
+
+        Each attempt blocks the vehicle's logger for 2.5 s.
+        """
         session.wait(0.1)
-        for attempts in (3, 4):
-            for _ in range(150):
+        for attempts, steps in ((3, 1480), (4, 100)):
+            for _ in range(steps):
                 session.answer(START, ACCEPTED)
-                session.answer(STOP, ACCEPTED)
                 session.wait(0.2)
-            assert session.commands == ["start", "stop"] * attempts
+            assert session.commands == ["start"] * attempts
         assert session.states[1:] == [("starting", None), ("refused", "no_data")]
 
     def test_late_data_of_earlier_stream_is_not_a_new_stream(self, session: Session) -> None:
@@ -346,8 +354,8 @@ class TestNoData:
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.receive(sequence=300)
-        session.wait(1.2)
-        assert session.commands == ["start", "stop"]
+        session.wait(TIMINGS.log_answer + TIMINGS.log_timeout + 0.2)
+        assert session.commands == ["start", "start"]
 
     def test_header_replaces_lost_command_ack(self, session: Session) -> None:
         """If the header arrives without a COMMAND_ACK, START is not repeated."""
@@ -405,6 +413,83 @@ class TestHeader:
         session.stream()
         assert session.client.status.state == "streaming"
 
+    @pytest.mark.parametrize("round_trip", [0.04, 0.08, 0.16, 2.0])
+    def test_no_start_if_the_header_would_take_too_long(self, session: Session, round_trip: float) -> None:
+        """The round trip is measured with TIMESYNC before START, which would block the vehicle's logger."""
+        session.round_trip = round_trip
+        session.wait(10)
+        assert session.states[-1] == ("refused", "slow_link")
+        assert re.search(rf"would take \d+ s, at {1e3 * round_trip + 4:.0f} ms for", session.client.status.text)
+        assert "because of the vehicle's parameters alone" in session.client.status.text
+        session.wait(2 * TIMINGS.log_slow_retry)
+        assert session.commands == []
+        session.round_trip = 0.001
+        session.wait(TIMINGS.log_slow_retry)
+        assert session.commands[:1] == ["start"]
+
+    def test_refusal_names_number_of_topics_that_fit_and_longer_limit(self, session: Session) -> None:
+        """At 26 ms per message 10 s are enough for 61 topics, and header=15 for all; then START is sent."""
+        session.round_trip = 0.022
+        session.wait(2)
+        text = session.client.status.text
+        assert "10 s are allowed, enough for the header of 61 topics" in text
+        assert text.endswith("or set header=15")
+        patient = Session(header=15)
+        patient.round_trip = 0.022
+        patient.start(interval=0.026)
+        assert patient.client.status.state == "streaming"
+        assert patient.commands == ["start"]
+
+    def test_shortest_of_three_round_trips_counts(self, session: Session) -> None:
+        """A TIMESYNC that waited in a queue, or was lost, does not prevent START."""
+        session.round_trip = 0.0  # no answers
+        session.wait(0.1)
+        for delay in (0.2, 0.01, 0.3):
+            session.now += delay
+            session.add(session.client.on_timesync(session.sent[-1].sequence, session.now))
+        assert session.commands == ["start"]
+
+    def test_start_is_sent_without_an_answer_to_timesync(self, session: Session) -> None:
+        """A vehicle that does not answer TIMESYNC receives START after three requests."""
+        session.round_trip = 0.0
+        session.wait(2.8)
+        assert [each.kind for each in session.sent] == ["ping"] * 3
+        session.wait(0.5)
+        assert session.commands == ["start"]
+
+    def test_answers_to_other_clients_do_not_start_the_stream(self, session: Session) -> None:
+        """An answer to TIMESYNC counts once, and only if it answers a request of this client."""
+        session.round_trip = 0.0
+        session.wait(0.1)
+        first = session.sent[-1].sequence
+        for sent in (first + 1, first, first, first):
+            session.now += 0.01
+            session.add(session.client.on_timesync(sent, session.now))
+        assert session.commands == []
+
+    def test_header_that_slows_down_is_aborted_after_a_second(self, session: Session) -> None:
+        """On a link of 57,600 baud each message takes longer than the one before; PX4's logger is released early."""
+        session.wait(0.1)
+        session.answer(START, ACCEPTED)
+        began = session.now
+        for number, wait in enumerate((0.1, 0.16, 0.28, 0.49, 0.73, 1.1, 1.5, 2.1)):
+            session.receive(acked=True, begins=number == 0)
+            session.now += wait
+        assert session.states[-1] == ("refused", "slow_link")
+        assert session.commands == ["start", "stop"]
+        assert len(session.acknowledged) <= 4
+        assert session.now - began > 5
+
+    def test_link_outage_during_header_delays_the_next_start(self, session: Session) -> None:
+        """PX4 gives up on a header after 2.5 s without the link; the next START follows 5 minutes later."""
+        session.wait(0.1)
+        session.answer(START, ACCEPTED)
+        session.header(10)
+        session.wait(4, heartbeats=False)
+        assert session.states[-1] == ("ended", "stalled")
+        session.wait(TIMINGS.log_slow_retry - 10)
+        assert session.commands == ["start"]
+
     def test_lost_messages_do_not_abort_header(self, session: Session) -> None:
         """A lost message delays the header by 50 ms; one loss in twenty does not count as a long round trip."""
         session.wait(0.1)
@@ -424,8 +509,10 @@ class TestHeader:
             session.now += 0.05
         session.wait(1)
         assert session.states[-1] == ("ended", "stalled")
-        session.wait(TIMINGS.log_retry)
-        assert session.commands == ["start", "start"]
+        session.wait(TIMINGS.log_slow_retry - 10)
+        assert session.commands == ["start"]
+        session.wait(20)
+        assert session.commands[:2] == ["start", "start"]
 
     def test_header_of_slow_stream_completes_on_rejected_start(self, session: Session) -> None:
         """With few slow topics no data follows for seconds; the rejection of START proves that the stream exists."""
@@ -634,6 +721,9 @@ class Replay:
 
     def _add(self, commands: list[Command]) -> None:
         self.acknowledged += [each.sequence for each in commands if each.kind == "acknowledge"]
+        for each in commands:
+            if each.kind == "ping":
+                self._add(self.client.on_timesync(each.sequence, each.sequence / 1e9 + 0.001))
         if self.client.status[:2] != self.states[-1]:
             self.states.append(self.client.status[:2])
 

@@ -15,6 +15,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources.mavlink.log_client import Command, LogStreamClient
+from nedbus.timings import Timings
 from tests.peers.px4_log_stream import START, STOP, STREAMS, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
@@ -41,39 +42,51 @@ def recorded_bytes(name: str) -> int:
 class Link:
     """A client on a UDP port; counts what it receives, and collects each state with its reason."""
 
-    def __init__(self, *log: Log, acknowledges: bool = True) -> None:
-        self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
+    def __init__(
+        self, *log: Log, acknowledges: bool = True, header: float | None = None, ids: tuple[int, int] = OURS
+    ) -> None:
+        self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1], header=header)
         self.reassembly = CountingReassembly()
         self.states: list[StateAndReason] = [("idle", None)]
         self.bytes = self.rejected = 0
         self.peer: Px4LogStream
         self._acknowledges = acknowledges
-        self._mav = dialect.MAVLink(None, *OURS)
+        self._mav = dialect.MAVLink(None, *ids)
+        self.sent: list[str] = []  # kinds of commands
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.05)
         self._vehicle: Any = None  # address of the vehicle
         self._boot = 0
 
+    @property
+    def port(self) -> int:
+        """The port of this link."""
+        return int(self._socket.getsockname()[1])
+
     @contextmanager
     def play(self, name: str, **options: Any) -> Iterator[Link]:
         """Start a vehicle that plays a recording."""
-        with self._socket, Px4LogStream(recording(name), self._socket.getsockname()[1], **options) as self.peer:
+        with self._socket, Px4LogStream(recording(name), self.port, **options) as self.peer:
             yield self
 
     def run(self, until: Callable[[], object]) -> None:
         """Receive until a condition holds."""
-        end, client = time.monotonic() + DEADLINE, self.client
+        end = time.monotonic() + DEADLINE
         while not until():
             assert time.monotonic() < end, self.states
-            commands: list[Command] = []
-            with suppress(TimeoutError):
-                frame, self._vehicle = self._socket.recvfrom(2048)
-                for message in self._mav.parse_buffer(frame) or []:
-                    commands += self._handle(message, time.monotonic())
-            self._send(commands + client.tick(time.monotonic()))
-            if client.status[:2] != self.states[-1]:
-                self.states.append(client.status[:2])
+            self.step()
+
+    def step(self) -> None:
+        """Receive a message, or wait for 50 ms."""
+        client, commands = self.client, list[Command]()
+        with suppress(TimeoutError):
+            frame, self._vehicle = self._socket.recvfrom(2048)
+            for message in self._mav.parse_buffer(frame) or []:
+                commands += self._handle(message, time.monotonic())
+        self._send(commands + client.tick(time.monotonic()))
+        if client.status[:2] != self.states[-1]:
+            self.states.append(client.status[:2])
 
     def expect_states(self, *states: StateAndReason) -> None:
         """Receive until the state has changed as often as expected, and compare the changes."""
@@ -87,9 +100,12 @@ class Link:
         self.run(lambda: self.client.status.state == "stopped")
 
     def _send(self, commands: list[Command]) -> None:
+        self.sent += [each.kind for each in commands if each.kind in ("start", "stop")]
         for kind, sequence in commands:
             message: Any = dialect.MAVLink_logging_ack_message(1, 1, sequence)
-            if kind != "acknowledge":
+            if kind == "ping":
+                message = dialect.MAVLink_timesync_message(0, sequence)
+            elif kind != "acknowledge":
                 message = dialect.MAVLink_command_long_message(1, 1, START if kind == "start" else STOP, *(0,) * 8)
             if self._acknowledges or kind != "acknowledge":
                 self._socket.sendto(message.pack(self._mav), self._vehicle)
@@ -101,6 +117,8 @@ class Link:
         if kind == "COMMAND_ACK":
             ids = message.target_system, message.target_component
             return client.on_command_ack(message.command, message.result, *ids, now)
+        if kind == "TIMESYNC":
+            return client.on_timesync(message.ts1, now)
         if kind.startswith("LOGGING_DATA"):
             if not client.accepts(message.target_system, message.target_component):
                 self.rejected += 1
@@ -212,10 +230,52 @@ class TestAbnormalStreams:
         assert link.states[-1] == ("streaming", None)
         assert link.peer.commands == [START]
 
-    def test_long_round_trip_aborts_header(self) -> None:
-        """With a round trip of 80 ms the header is aborted, because it would take half a minute."""
-        with Link().play("flight1", round_trip=0.08) as link:
-            link.expect_states(("starting", None), ("header", None), ("refused", "slow_link"))
+    @pytest.mark.parametrize("round_trip", [0.044, 0.08])
+    def test_long_round_trip_prevents_start(self, round_trip: float) -> None:
+        """With a round trip of 40 ms or more no START is sent, because the header would block the logger for 17 s."""
+        with Link().play("flight1", round_trip=round_trip) as link:
+            link.expect_states(("starting", None), ("refused", "slow_link"))
             measured = re.search(r"at (\d+) ms for each", link.client.status.text)
             assert measured
-            assert int(measured[1]) >= 80
+            assert int(measured[1]) >= 1000 * round_trip
+        assert START not in link.peer.commands
+
+    def test_longer_header_is_received_if_allowed(self) -> None:
+        """With header=100 a header of 274 messages arrives at 44 ms for each."""
+        with Link(header=100).play("flight1", round_trip=0.044) as link:
+            link.expect_states(*STARTED)
+            assert link.client.header_seconds
+            assert link.client.header_seconds > 273 * 0.044
+
+    def test_stream_of_a_client_on_another_link_is_left_alone(self, timings: Timings) -> None:
+        """A client without log=take does not end the stream of another client, even after a ground station's STOP.
+
+        PX4 then accepts the START of either client, but sends the data to the client that had the stream before.
+        """
+        timings.log_retry = 1.0  # the client without the stream is the first to send START after STOP
+        take, other = Link("armed", "take"), Link("armed", ids=OTHERS)
+        for each in (take, other):
+            each._socket.settimeout(0.001)  # they take turns
+        with other._socket, take.play("flight1", second_port=other.port) as link:
+            link.expect_states(*STARTED)
+
+            def both_until(condition: Callable[[], object]) -> None:
+                end = time.monotonic() + DEADLINE
+                while not condition():
+                    assert time.monotonic() < end, (take.states, other.states)
+                    take.step()
+                    other.step()
+
+            both_until(lambda: other.states[-1] == ("refused", "taken"))
+            timings.log_retry = DEADLINE  # from now on for the client that had the stream
+            link.peer.trigger("foreign_stop")
+            both_until(lambda: link.peer.streams == 2 and take.states[-1] == ("streaming", None))
+            timings.log_retry = 1.0
+            starts, received = len(other.sent), take.reassembly.bytes
+            both_until(lambda: len(other.sent) > starts + 3 and take.reassembly.bytes > received)
+        assert "stop" not in other.sent
+        assert other.states[-1] == ("refused", "taken")
+        assert other.reassembly.bytes == 0
+        assert set(take.states[4:]) <= {("ended", "stopped_elsewhere"), ("header", None), ("streaming", None)}
+        assert take.sent == ["start"]
+        assert STOP not in link.peer.commands

@@ -11,24 +11,27 @@ from typing import Any, Self
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.sources import Rejection
+from nedbus.sources.mavlink import receive_queue
 from nedbus.sources.mavlink.link import open_link
-from nedbus.sources.mavlink.reader import LinkReader, Received
+from nedbus.sources.mavlink.reader import LinkReader, new_parser, parse
+from nedbus.sources.mavlink.receive_queue import Received
 from nedbus.timings import Timings
 from tests.peers.live_source import Listener
 from tests.waits import DEADLINE, wait_for
 
-WAITING = 16_384  # messages
+WAITING = 1000  # messages
 
 
 class Autopilot:
-    """TCP server of a vehicle: accepts one connection, sends messages, and counts the received STARTs."""
+    """TCP server of a vehicle: accepts one connection, sends messages, answers TIMESYNC, and counts STARTs."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
         self.link = f"tcp:127.0.0.1:{self._server.getsockname()[1]}"
         self._mav, self._parser = dialect.MAVLink(None, 9, 1), dialect.MAVLink(None)
         self._connection: socket.socket | None = None
-        self._starts = 0
+        self._starts = self.answers = 0
 
     def pack(self, *messages: Any) -> list[bytes]:
         """Return the messages as bytes, with consecutive sequence numbers."""
@@ -56,6 +59,9 @@ class Autopilot:
         for each in self._parser.parse_buffer(data) or []:
             is_command = each.get_type() == "COMMAND_LONG"
             self._starts += is_command and each.command == dialect.MAV_CMD_LOGGING_START
+            if each.get_type() == "TIMESYNC":
+                self.send(*self.pack(dialect.MAVLink_timesync_message(1, each.ts1)))
+                self.answers += 1
         return self._starts
 
     def close(self) -> None:
@@ -104,17 +110,43 @@ def test_reads_that_end_within_a_message_lose_nothing(autopilot: Autopilot) -> N
     assert peak < len(data) / 2
 
 
-def test_messages_that_wait_for_the_source_are_limited(autopilot: Autopilot) -> None:
-    """While the source does not read, 16,384 messages wait; later ones are dropped, and counted as lost."""
+def test_source_that_was_blocked_continues_with_the_newest_messages(
+    monkeypatch: pytest.MonkeyPatch, autopilot: Autopilot
+) -> None:
+    """While the source does not read, the oldest messages are dropped beyond a limit, and counted as lost."""
+    monkeypatch.setattr(receive_queue, "_MAX_WAITING", WAITING)
     with Listener(f"mavlink:{autopilot.link}?log=1&topics=vehicle_local_position") as listener:
-        cycle = autopilot.pack(*[position(1000)] * 256)
-        late = autopilot.pack(*[position(1000)] * 99, heartbeat())
-        autopilot.send(*cycle * (WAITING // 256), *late)
+        autopilot.send(*autopilot.pack(*(position(1000 + number) for number in range(WAITING + 99)), heartbeat()))
         wait_for(lambda: autopilot.starts, what="START, the answer to the heartbeat")
-        assert sum(each.lost for each in listener.receive(WAITING)) == 0
-        autopilot.send(*autopilot.pack(position(1000)))
-        assert listener.receive()[0].lost == len(late)
-    assert not listener.rejections
+        dropped = 100 + autopilot.answers  # they wait, too
+        first, *rest = listener.receive(WAITING + 99 - dropped)
+        assert (first.fields["timestamp"], first.lost) == (1000 * (1000 + dropped), dropped)
+        assert rest[-1].fields["timestamp"] == 1000 * (1000 + WAITING + 98)
+        assert sum(each.lost for each in rest) == 0
+
+
+def test_messages_that_are_not_used_are_not_decoded() -> None:
+    """Of a message that no topic needs only the header is read, after the check of its CRC; its sequence counts."""
+    encoder = dialect.MAVLink(None, 9, 1)
+    pressure = dialect.MAVLink_scaled_pressure_message(1, 1.0, 1.0, 1)
+    for version in (pressure.pack(encoder), pressure.pack(encoder, force_mavlink1=True)):
+        [received] = parse(new_parser(), version, "link", None, 1.0)
+        assert isinstance(received, Received)
+        assert (received.system, received.message.get_type()) == (9, "UNKNOWN_29")
+        damaged = bytes([*version[:-3], version[-3] ^ 1, *version[-2:]])
+        [rejection] = parse(new_parser(), damaged, "link", None, 1.0)
+        assert isinstance(rejection, Rejection)
+
+
+def test_vehicles_of_a_link_are_limited(autopilot: Autopilot) -> None:
+    """The first 100 system ids on a link are vehicles; messages of others are rejected with one reason."""
+    with Listener(f"mavlink:{autopilot.link}") as listener:
+        for system in range(1, 104):
+            autopilot.send(position(1000).pack(dialect.MAVLink(None, system, 1)))
+        received = listener.receive(100)
+        listener.step_until(lambda: listener.rejected == 3, what="rejections")
+    assert [int(each.address.vehicle) for each in received] == [*range(1, 101)]
+    assert {each.where.rpartition(" ")[2] for each in listener.rejections} == {"vehicles"}
 
 
 def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopilot) -> None:

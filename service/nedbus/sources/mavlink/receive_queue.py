@@ -1,0 +1,176 @@
+"""Received messages that wait for the source: one queue per vehicle, bounded in time and number, served in turn."""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
+from threading import Condition
+from typing import Any, Final, NamedTuple
+
+from nedbus.sources.source import LinkLoad, Rejection
+
+from .link import Peer
+from .log_reassembly import Chunk
+
+_MAX_WAITING: Final = 16_384  # messages of all vehicles; beyond it the oldest of the longest queue is dropped
+_MAX_WAIT: Final = 2.0  # s; a message that waited longer is dropped, and
+_FRESH: Final = 0.2  # s; so are those behind it that waited longer than this, so that the next ones are fresh
+_LATE: Final = 0.5  # s; a longer wait means that the host is overloaded
+_MEMORY: Final = 5.0  # s without a late or dropped message until the overload has ended
+_MAX_READ: Final = 100  # messages per call of `read`
+_MAX_READ_TIME: Final = 0.1  # s per call of `read`
+_MAX_REJECTIONS: Final = 1000  # different ones that wait
+
+
+class Received(NamedTuple):
+    """A message of an autopilot. `time`: arrival, monotonic [s]; `lost`: messages lost before it; `chunk`: ULog data.
+
+    `sequence`: MAVLink's. A late message, which was counted as lost, has `lost` -1.
+    """
+
+    message: Any
+    system: int
+    sequence: int
+    peer: Peer
+    time: float
+    lost: int = 0
+    chunk: Chunk | None = None
+
+
+@dataclass(slots=True)
+class _VehicleQueue:
+    """Messages of one vehicle. `used`: time spent on them [s]; `lost`, `cut`: as if dropped messages were lost."""
+
+    waiting: deque[Received] = field(default_factory=deque)
+    used: float = 0.0
+    lost: int = 0  # messages dropped, or lost before those, to report with the next one
+    lost_chunks: int = 0
+    is_cut: bool = False  # chunks were dropped, and no record has begun since
+    is_undefined: bool = False  # the beginning of the stream was dropped
+
+    def drop(self, received: Received) -> None:
+        """Count a removed message as lost."""
+        chunk = received.chunk
+        self.lost += received.lost + 1
+        if chunk is not None:
+            self.lost_chunks += chunk.lost + (chunk.verdict in ("delivered", "unsynchronised"))
+            self.is_cut, self.is_undefined = True, self.is_undefined or chunk.begins
+
+    def resume(self, received: Received) -> Received:
+        """Return the next message, with all losses before it; after a dropped chunk, data begins with a record."""
+        chunk = received.chunk
+        lost, self.lost = received.lost + self.lost, 0
+        if chunk is None or not (self.is_cut or chunk.begins):
+            return received._replace(lost=lost)
+        self.is_undefined = self.is_undefined and not chunk.begins
+        is_delivered = chunk.verdict == "delivered" and not self.is_undefined
+        if is_delivered and chunk.offset < len(chunk.data):
+            self.is_cut, chunk = False, chunk._replace(data=chunk.data[chunk.offset :], offset=0)
+        elif is_delivered:
+            chunk = Chunk("unsynchronised", lost=chunk.lost)
+        elif self.is_undefined:
+            chunk = Chunk("no_definitions")
+        if chunk.verdict in ("delivered", "unsynchronised"):
+            chunk, self.lost_chunks = chunk._replace(lost=0 if chunk.begins else chunk.lost + self.lost_chunks), 0
+        return received._replace(lost=lost, chunk=chunk)
+
+
+class ReceiveQueue:
+    """Hand over messages between two threads: `put` and `fail` on that of the link, all else on that of the source.
+
+    Each vehicle gets an equal share of the source's time, so one that needs much of it delays only itself.
+    Acknowledged ULog data, which contains the definitions, may wait longer than other messages.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._changed = Condition()
+        self._vehicles: dict[int, _VehicleQueue] = {}
+        self._rejections: Counter[Rejection] = Counter()
+        self._error: BaseException | None = None
+        self._count = self._dropped = 0
+        self._turn = 0.0  # `used` of the vehicle that is served
+        self._load, self._overload_end, self._longest_wait = LinkLoad(), 0.0, 0.0
+
+    def put(self, item: Received | Rejection) -> None:
+        """Add a message; drop the oldest one of the longest queue if there are too many."""
+        with self._changed:
+            if isinstance(item, Rejection):
+                is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
+                self._rejections[item if is_known else next(iter(self._rejections))] += item.count
+            else:
+                vehicle = self._vehicles.setdefault(item.system, _VehicleQueue())
+                if not vehicle.waiting:  # time in which it had no messages is not owed to it
+                    vehicle.used = max(vehicle.used, self._turn)
+                vehicle.waiting.append(item)
+                self._count += 1
+                if self._count > _MAX_WAITING:
+                    longest = max(self._vehicles.values(), key=lambda each: len(each.waiting))
+                    self._drop(longest, longest.waiting.popleft())
+            self._changed.notify()
+
+    def fail(self, error: BaseException) -> None:
+        """Let `read` raise an error once all messages have been read."""
+        with self._changed:
+            self._error = error
+            self._changed.notify()
+
+    def read(self, timeout: float, *, lost_by_host: int) -> Iterator[Received | Rejection | LinkLoad]:
+        """Yield messages for a short time, and before them changes of the load; wait up to `timeout` for the first.
+
+        `lost_by_host`: datagrams that the operating system has dropped.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._count or self._rejections or self._error, timeout)
+            rejections, self._rejections = self._rejections, Counter()
+        for rejection, count in rejections.items():
+            yield replace(rejection, count=count)
+        start = now = self._now()
+        for _ in range(_MAX_READ):
+            vehicle, received = self._take(now)
+            load = self._measure(0.0 if received is None else now - received.time, lost_by_host, now)
+            if load != self._load:
+                self._load = load
+                yield load
+            if vehicle is None or received is None:
+                if self._error is not None:
+                    raise self._error
+                return
+            yield received
+            before, now = now, self._now()
+            vehicle.used += now - before
+            if now - start > _MAX_READ_TIME:
+                return
+
+    def _take(self, now: float) -> tuple[_VehicleQueue | None, Received | None]:
+        """Remove the next message of the vehicle that has used the least time; drop those that waited too long."""
+        with self._changed:
+            while ready := [each for each in self._vehicles.values() if each.waiting]:
+                vehicle, limit = min(ready, key=attrgetter("used")), _MAX_WAIT
+                self._turn = vehicle.used
+                while vehicle.waiting:
+                    received = vehicle.waiting.popleft()
+                    if now - received.time <= limit or received.message.get_type() == "LOGGING_DATA_ACKED":
+                        self._count -= 1
+                        return vehicle, vehicle.resume(received)
+                    limit = _FRESH
+                    self._drop(vehicle, received)
+        return None, None
+
+    def _drop(self, vehicle: _VehicleQueue, received: Received) -> None:
+        vehicle.drop(received)
+        self._count, self._dropped = self._count - 1, self._dropped + 1
+
+    def _measure(self, wait: float, lost_by_host: int, now: float) -> LinkLoad:
+        """Return the load of the host, given the wait of the next message."""
+        dropped = self._dropped + lost_by_host
+        if wait > _LATE or dropped > self._load.dropped:
+            self._longest_wait, self._overload_end = max(wait, self._longest_wait), now + _MEMORY
+        elif now < self._overload_end:
+            return self._load
+        if now >= self._overload_end:
+            self._longest_wait = 0.0
+            return LinkLoad(dropped)
+        text = f"host overloaded: messages up to {self._longest_wait:.1f} s late, {dropped} dropped"
+        return LinkLoad(dropped, text)

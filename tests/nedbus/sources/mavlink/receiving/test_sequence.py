@@ -1,0 +1,92 @@
+"""Losses between numbered packets: late and repeated ones, restarts of the counter, and random numbers."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from nedbus.sources.mavlink.log_reassembly import Reassembly
+from nedbus.sources.mavlink.sequence import PacketRate, SequenceCounter
+from tests.peers.px4_log_stream import STREAMS, datagrams, stream_message
+
+HEADER = b"ULog\x01\x12\x35\x01" + bytes(20)
+
+
+def test_reordered_and_duplicate_messages_do_not_count_as_lost() -> None:
+    """Datagrams that arrive out of order, or twice, do not count as lost."""
+    counter = SequenceCounter()
+    arrivals = [(10, 0.0), (12, 0.2), (11, 0.2), (13, 0.3), (13, 0.3), (14, 0.4), (100, 3.0), (200, 5.9), (0, 8.0)]
+    found = [counter.add(sequence, 100.0 + seconds) for sequence, seconds in arrivals]
+    assert found == [0, 1, -1, 0, 0, 0, 85, 0, 0]
+
+
+def test_loss_that_the_rate_explains_is_counted() -> None:
+    """A link with 100 messages/s that is cut for 1 s loses 100 messages."""
+    counter = SequenceCounter()
+    assert sum(counter.add(number % 256, number / 100) for number in range(1000)) == 0
+    assert counter.add(1100 % 256, 11.0) == 100
+
+
+def test_jump_that_the_rate_cannot_explain_is_a_restart() -> None:
+    """At 10 messages/s, 100 messages cannot be lost within 0.1 s: the sender's counter restarted."""
+    counter = SequenceCounter()
+    for number in range(200):
+        counter.add(number % 256, number / 10)
+    assert counter.add(44, 20.0) == 0
+    assert counter.add(46, 20.2) == 1
+
+
+def test_random_sequence_numbers_lose_little() -> None:
+    """460 messages with random sequence numbers do not count as more lost messages than were sent."""
+    rng, counter, reassembly = random.Random(1), SequenceCounter(), Reassembly()
+    reassembly.add(0, len(HEADER), 0, HEADER, 0.0)
+    lost = lost_data = 0
+    for number in range(460):
+        lost = max(0, lost + counter.add(rng.randrange(256), number / 20))
+        lost_data += reassembly.add(rng.randrange(2**16), 4, 0, b"data", number / 20).lost
+    assert lost < 460
+    assert lost_data < 2 * 460
+
+
+@pytest.mark.logs
+@pytest.mark.slow
+@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
+@pytest.mark.parametrize(("path", "lost", "lost_data"), [
+    (STREAMS.parent / "link_cut_20s_in_flight.bin.gz", 21, 1475),  # MAVLink's sequence is unknown after the cut
+    (STREAMS.parent / "foreign_stop_in_flight.bin.gz", 0, 0),
+    (STREAMS / "ulog_stream_lossy1.bin.gz", 607, 237),
+    (STREAMS / "ulog_stream_session.bin.gz", 63, 615 + 3433),  # a reader that paused for 5 s
+], ids=lambda each: getattr(each, "name", ""))  # fmt: skip
+def test_losses_of_recorded_links(path: Path, lost: int, lost_data: int) -> None:
+    """Losses of a real PX4 (SITL) at the recorded times are counted in full: no gap is taken for a restart."""
+    counter, reassembly, found, found_data = SequenceCounter(), Reassembly(), 0, 0
+    for seconds, from_vehicle, frame in datagrams(path):
+        if from_vehicle and frame[6] == 1:
+            found += counter.add(frame[4], seconds)
+            if message := stream_message(frame):
+                content = message.sequence, len(message.data), message.offset, message.data
+                found_data += reassembly.add(*content, seconds).lost
+    assert (found, found_data) == (lost, lost_data)
+
+
+def test_gap_of_more_than_65536_messages_is_counted_in_full() -> None:
+    """After a long cut, time and rate show how often the sequence number has wrapped."""
+    reassembly, rate = Reassembly(), 700.0
+    reassembly.add(0, len(HEADER), 0, HEADER, 0.0)
+    for number in range(1, 7001):
+        assert not reassembly.add(number, 4, 0, b"data", number / rate).lost
+    resumed = 7000 + 70_000
+    assert reassembly.add(resumed % 2**16, 4, 0, b"data", resumed / rate).lost == 69_999
+    assert reassembly.add((resumed + 1) % 2**16, 4, 0, b"data", (resumed + 1) / rate).lost == 0
+
+
+def test_rate_forgets_the_past() -> None:
+    """The rate is that of the last seconds."""
+    rate = PacketRate()
+    for number in range(1000):
+        rate.add(float(number))
+    for number in range(4000):
+        rate.add(1000 + number / 100)
+    assert 80 < rate.expected(1041.0 - 0.01) < 110
