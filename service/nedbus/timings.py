@@ -11,6 +11,8 @@ class Timings:
     lease: float = 5.0  # without data until a link is closed, as with a frozen host or a cut cable
     router_lease: float = 8.0  # longer: a router must drop a client before that client joins the next router
     tokens_retry: float = 10.0  # before tokens beyond the limit are listed again
+    slow_list: float = 1.0  # for a router to list all tokens, before a query counts those of each vehicle
+    excluded: float = 600.0  # before a vehicle with too many tokens is listed again
     retransmit_timeout: float = 20.0  # until a sequence gap counts as lost; publishers cache messages for as long
     downsampled_timeout: float = 10.0  # from a liveliness token to the warning that no downsampled message arrives
     definition_timeout: float = 3.0  # for a busy publisher to send the definition of a message

@@ -16,6 +16,7 @@ from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLoc
 
 from .closing import Finalizer
 from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_reports, find_services
+from .fleet_tokens import FleetTokens
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
@@ -40,12 +41,13 @@ class Bus(AbstractContextManager["Bus"]):
         self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
-        self._directory = VehicleDirectory(Selection(), prefix=prefix)
+        reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
+        self._directory = VehicleDirectory(partial(FleetTokens, reopen, prefix=prefix), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         closing = ExitStack()  # runs in reverse order; closing the session ends an open query for layouts
         heartbeats = self._publishers.heartbeats  # not the registry: its publishers reference the bus
-        for close in (self._layouts.close, session.close, heartbeats.close, self._queries.close):
+        for close in (self._layouts.close, self._directory.close, session.close, heartbeats.close, self._queries.close):
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
         self._finalizer = Finalizer(self, closing.close)
@@ -143,7 +145,8 @@ class Bus(AbstractContextManager["Bus"]):
 
     def publishers(self, *, timeout: float = 2.0) -> Publishers:
         """Return the number of publishers of each address: more than one is a conflict. Waits like `vehicles`."""
-        publishers = self._directory.publishers(self._session, timeout=timeout)
+        self._require_open()
+        publishers = self._directory.publishers(timeout=timeout)
         publishers.complete = publishers.complete and self.connected
         return publishers
 

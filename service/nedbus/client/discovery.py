@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -20,11 +20,13 @@ from pydantic_core import PydanticUseDefault, to_json
 from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health import Health
-from nedbus.errors import AddressError
+from nedbus.errors import AddressError, ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
 from nedbus.transport import MAX_REPLY_BYTES, LivelinessTokens, RawSample, Session, query, translate_zenoh_errors
-from nedbus_msgs import ANY, REJECTED, Address, Selection, address_of_alive_key, status_key
+from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
+
+from .fleet_tokens import FleetTokens
 
 _log = logging.getLogger(__name__)
 
@@ -43,35 +45,39 @@ class Publishers(Counter[Address]):
 class Vehicles(dict[str, list[Address]]):
     """The published addresses by vehicle.
 
-    `complete`: False without a router, until the router has listed all addresses, and if there are over 10,000.
+    `complete`: False without a router, until the router has listed all addresses, if there are over 10,000, and while
+    a vehicle is left out because it has over 1,000 publishers' tokens.
     """
 
     complete = True
 
 
 class VehicleDirectory:
-    """Addresses of a selection and their publishers, from liveliness tokens; subscribes on the first call."""
+    """Addresses and their publishers, from the liveliness tokens that `follow` subscribes to on the first call."""
 
-    def __init__(self, selection: Selection, *, prefix: str) -> None:
-        self._prefix, self._key_expr = prefix, selection.alive_key_expr(prefix=prefix)
+    def __init__(self, follow: Callable[[], LivelinessTokens | FleetTokens], *, prefix: str) -> None:
+        self._prefix, self._follow = prefix, follow
         self._lock = threading.Lock()
+        self._closed = threading.Event()
         self._addresses: dict[str, Address] = {}  # by token key
-        self._tokens: LivelinessTokens | None = None
+        self._tokens: LivelinessTokens | FleetTokens | None = None
         self._logged = False
 
     def close(self) -> None:
         """End the subscription."""
+        self._closed.set()  # ends a wait that holds the lock
         with self._lock, suppress(zenoh.ZError):  # the session is already closed
             if self._tokens is not None:
                 self._tokens.undeclare()
 
-    def publishers(self, session: Session, *, timeout: float) -> Publishers:
+    def publishers(self, *, timeout: float) -> Publishers:
         """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete."""
         end = time.monotonic() + timeout
         with self._lock:
-            if self._tokens is None:
-                self._tokens = LivelinessTokens(session, self._key_expr)
-            while True:
+            if self._tokens is None and not self._closed.is_set():
+                with suppress(ConnectError):  # try again on the next call
+                    self._tokens = self._follow()
+            while self._tokens is not None:
                 for key, alive in self._tokens.poll():
                     if not alive:
                         self._addresses.pop(key, None)
@@ -80,15 +86,15 @@ class VehicleDirectory:
                         self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
                     except AddressError:
                         _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
-                if not self._tokens.is_listing or time.monotonic() >= end:
+                if not self._tokens.is_listing or time.monotonic() >= end or self._closed.wait(0.002):
                     break
-                time.sleep(0.002)
             publishers = Publishers(self._addresses.values())
-            publishers.complete = self._tokens.complete
-            if self._tokens.is_listing and timeout and not self._logged:
+            publishers.complete = self._tokens is not None and self._tokens.complete
+            is_listing = self._tokens is None or self._tokens.is_listing
+            if is_listing and timeout and not self._logged:
                 text = "the router listed only %d stream%s within %g s; it may be slow, or forbid listing others"
                 _log.warning(text, len(publishers), "s" * (len(publishers) != 1), timeout, extra=about("incomplete"))
-            self._logged = self._tokens.is_listing and (self._logged or timeout > 0)
+            self._logged = is_listing and (self._logged or timeout > 0)
             return publishers
 
 

@@ -4,7 +4,9 @@ import logging
 import math
 import re
 import time
+from collections.abc import Iterable
 from contextlib import suppress
+from itertools import islice
 from typing import Final
 
 import zenoh
@@ -25,12 +27,14 @@ _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the pr
 
 def token_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
-    replies = wait_for_replies([_query_tokens(session, key_expr, timeout)])
+    replies = wait_for_replies([query_tokens(session, key_expr, timeout=timeout)])
     return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_REPLIES]
 
 
 class LivelinessTokens:
-    """The liveliness tokens that match a key expression. Not thread-safe.
+    """The liveliness tokens that match any of some key expressions. Not thread-safe.
+
+    `known`: the keys listed before by another instance; `poll` then returns the differences from them.
 
     A router sends a new subscriber all tokens at once, then each change. Listing takes time quadratic in the number of
     tokens, about one second for 4,000. The reply to a query on a key without a token (the probe) follows all tokens,
@@ -38,11 +42,11 @@ class LivelinessTokens:
     10,000 tokens are stored; a warning is logged if there are more.
     """
 
-    def __init__(self, session: Session, key_expr: str) -> None:
-        self._session, self._key_expr = session, key_expr
+    def __init__(self, session: Session, *key_exprs: str, known: Iterable[str] = ()) -> None:
+        self._session, self._key_exprs = session, key_exprs
         # Access rules that allow the key expression allow this key.
-        self._probe_key = re.sub(r"\*\*|\$?\*", "-", key_expr)
-        self._keys: set[str] = set()
+        self._probe_key = re.sub(r"\*\*|\$?\*", "-", key_exprs[-1])
+        self._keys = set(known)
         self._unseen: set[str] = set()  # tokens of the previous subscription that the current one has not listed yet
         self._retry = math.inf  # monotonic time of the next attempt to list tokens beyond the limit [s]
         self._probe: Replies | None = None
@@ -60,8 +64,9 @@ class LivelinessTokens:
 
     def undeclare(self) -> None:
         """End the subscription."""
-        self._subscriber.undeclare()
-        for key in (self._key_expr, self._probe_key):  # Zenoh frees neither until something else on it is undeclared
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        for key in (*self._key_exprs, self._probe_key):  # Zenoh frees neither until something else on it is undeclared
             self._session.undeclare(self._session.declare_keyexpr(key))
 
     def poll(self) -> list[tuple[str, bool]]:
@@ -73,11 +78,14 @@ class LivelinessTokens:
             if self._probe.ended:
                 self._probe = self._send_probe() if self._probe.failed else None
         changes: list[tuple[str, bool]] = []
+        is_overflow = False
         with suppress(zenoh.ZError):  # the session is closed
-            while len(changes) < _MAX_CHANGES and (sample := self._subscriber.handler.try_recv()) is not None:
-                changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+            for subscriber in self._subscribers:
+                received = list(islice(iter(subscriber.handler.try_recv, None), self._capacity))
+                is_overflow |= len(received) == self._capacity
+                changes += [(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT) for sample in received]
         is_retry_due = len(self._keys) < MAX_REPLIES and time.monotonic() >= self._retry
-        if len(changes) == _MAX_CHANGES or is_retry_due:  # changes were dropped, or there is room again
+        if is_overflow or is_retry_due:  # changes were dropped, or there is room again
             self.undeclare()
             self._subscribe()
             return []
@@ -87,13 +95,17 @@ class LivelinessTokens:
         return [change for change in changes if self._apply(*change)]
 
     def _subscribe(self) -> None:
+        self._capacity = max(_MAX_CHANGES // len(self._key_exprs), min(_MAX_CHANGES, 256))
         with translate_zenoh_errors():
             declare = self._session.liveliness().declare_subscriber
-            self._subscriber = declare(self._key_expr, zenoh.handlers.RingChannel(_MAX_CHANGES), history=True)
+            self._subscribers = [
+                declare(key_expr, zenoh.handlers.RingChannel(self._capacity), history=True)
+                for key_expr in self._key_exprs
+            ]
         self._probe, self._unseen, self._retry = self._send_probe(), self._keys.copy(), math.inf
 
     def _send_probe(self) -> Replies:
-        return _query_tokens(self._session, self._probe_key, _PROBE_TIMEOUT)
+        return query_tokens(self._session, self._probe_key, timeout=_PROBE_TIMEOUT)
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
@@ -102,14 +114,14 @@ class LivelinessTokens:
         if alive and len(self._keys) >= MAX_REPLIES:
             if self._retry == math.inf:
                 text = "%s: more than %d liveliness tokens, so some streams are missing"
-                _log.warning(text, self._key_expr, MAX_REPLIES, extra=about("incomplete"))
+                _log.warning(text, self._key_exprs[0], MAX_REPLIES, extra=about("incomplete"))
             self._retry = time.monotonic() + TIMINGS.tokens_retry
             return False
         (self._keys.add if alive else self._keys.remove)(key)
         return True
 
 
-def _query_tokens(session: Session, key_expr: str, timeout: float) -> Replies:
+def query_tokens(session: Session, key_expr: str, *, timeout: float) -> Replies:
     """Query matching tokens without waiting; each successful reply is one token."""
     timeout = zenoh_timeout(timeout)
     with translate_zenoh_errors():

@@ -86,6 +86,8 @@ def open_client(
         "connect/timeout_ms": 0,
         "connect/retry": random_backoff(),
         "listen/endpoints": [],
+        # Longer than any wait for tokens: at this timeout, Zenoh reports an unfinished list as complete.
+        "routing/interests/timeout": 120_000,
         # Including key and headers; larger messages from peers are rejected.
         "transport/link/rx/max_message_size": MAX_REPLY_BYTES + 2**12,
     }

@@ -22,6 +22,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
+from nedbus.client import fleet_tokens
 from nedbus.timings import Timings
 from nedbus.transport import Session, liveliness, open_router
 from nedbus.transport.queries import Replies
@@ -141,12 +142,13 @@ def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkey
     """
     queried: list[str] = []
 
-    def record_query(session: Session, key_expr: str, timeout: float) -> Replies:
+    def record_query(session: Session, key_expr: str, *, timeout: float) -> Replies:
         queried.extend([key_expr] if "*" in key_expr else [])
-        return original(session, key_expr, timeout)
+        return original(session, key_expr, timeout=timeout)
 
-    original = liveliness._query_tokens
-    monkeypatch.setattr(liveliness, "_query_tokens", record_query)
+    original = liveliness.query_tokens
+    monkeypatch.setattr(liveliness, "query_tokens", record_query)
+    monkeypatch.setattr(fleet_tokens, "query_tokens", record_query)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
             other.publisher("estimator_local_position", vehicle=vehicle, instance=2)

@@ -53,7 +53,7 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
-        hint = "start a source with 'nedbus serve'"
+        hint = "start a source with 'nedbus serve'" if everything.complete else "not all streams are listed: try again"
         if others := sorted({address.vehicle for address in everything}):
             hint = f"choose one of {to_text(', '.join(others[:20]))}"
         elif bus.services():

@@ -17,7 +17,7 @@ from nedbus.client.discovery import VehicleDirectory
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
-from nedbus.transport import Session, translate_zenoh_errors
+from nedbus.transport import LivelinessTokens, Session, translate_zenoh_errors
 from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
 
 from .downsampler import MatchingListener
@@ -95,7 +95,7 @@ class PublisherRegistry:
     def shared_vehicles(self) -> set[str]:
         """Return the vehicles that another process also publishes; log new ones."""
         with self._lock:  # several threads call this, and `forget` closes directories
-            counts = {name: each.publishers(self._session, timeout=0) for name, each in self._directories.items()}
+            counts = {name: each.publishers(timeout=0) for name, each in self._directories.items()}
             shared = {name for name, numbers in counts.items() if max(numbers.values(), default=0) > 1}
             known, self._shared = self._shared, shared
         for name in shared - known:
@@ -137,7 +137,9 @@ class PublisherRegistry:
     def _add_vehicle(self, vehicle: str) -> None:
         prefix, selection = self.prefix, Selection(vehicle=vehicle)
         schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
-        self._directories[vehicle] = VehicleDirectory(selection, prefix=prefix)
+        self._directories[vehicle] = VehicleDirectory(
+            partial(LivelinessTokens, self._session, selection.alive_key_expr(prefix=prefix)), prefix=prefix
+        )
         self._rate_listeners[vehicle] = MatchingListener(self._session, selection.rate_key_expr(ANY, prefix=prefix))
         self._queries.answer(f"{prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
         # One key per vehicle, for the access rules: a vehicle may answer for its own messages only.

@@ -1,0 +1,132 @@
+"""The liveliness tokens of a fleet, where a vehicle with too many tokens does not hide the others.
+
+A client takes time quadratic in the number of tokens of one vehicle, and its session receives nothing else meanwhile.
+Therefore tokens are listed on a separate session. If that takes long, the session is closed, and a query on another
+one, whose replies arrive one by one, finds the vehicle with too many. As no key expression excludes a name, the others
+are then listed by the first characters in which their names differ from it.
+"""
+
+import logging
+import math
+import string
+import time
+from collections import Counter
+from collections.abc import Callable, Set
+from contextlib import suppress
+from functools import partial
+from typing import Final
+
+from nedbus.errors import NedbusError
+from nedbus.log_event import about
+from nedbus.timings import TIMINGS
+from nedbus.transport import MAX_REPLIES, LivelinessTokens, Replies, Session, query_tokens
+from nedbus_msgs import ANY
+
+_log = logging.getLogger(__name__)
+
+_MAX_TOKENS: Final = 1000  # of one vehicle; two services that publish all topics of a PX4 declare 500
+_MAX_KEY_EXPRS: Final = 5000  # 64 per character of an excluded name; further vehicles are not excluded
+_CHARACTERS: Final = string.ascii_letters + string.digits + "_-"
+_LONGEST_NAME: Final = 64  # characters; peers may use longer ones
+_QUERY_TIMEOUT: Final = 60.0  # s
+
+
+class FleetTokens:
+    """Like LivelinessTokens, for all vehicles, on a separate session; excludes vehicles with over 1,000 tokens.
+
+    An excluded vehicle is logged, and listed again after ten minutes; until then the list is incomplete.
+    `open_session`: raises NedbusError if no router answers.
+    """
+
+    def __init__(self, open_session: Callable[[], Session], *, prefix: str) -> None:
+        self._open_session, self._prefix = open_session, prefix
+        self._keys: set[str] = set()
+        self._numbers: Counter[str] = Counter()  # of keys, by vehicle
+        self._excluded: set[str] = set()
+        self._retry = math.inf  # monotonic time at which excluded vehicles are listed again [s]
+        self._session = open_session()
+        self._subscribe()
+
+    @property
+    def complete(self) -> bool:
+        """True if all tokens are known."""
+        return not self._excluded and not self.is_listing and (self._tokens.is_listing or self._tokens.complete)
+
+    @property
+    def is_listing(self) -> bool:
+        """True until the router has listed all tokens, except those of excluded vehicles."""
+        return bool(self._survey) or (self._tokens.is_listing and not self._is_surveyed)
+
+    def undeclare(self) -> None:
+        """End the subscription, and close its session."""
+        self._session.close()
+
+    def poll(self) -> list[tuple[str, bool]]:
+        """Return the changes since the last call, like LivelinessTokens."""
+        tokens = [reply.ok for each in self._survey for reply in each.poll()]
+        found = [(str(token.key_expr), True) for token in tokens if token is not None]
+        changes = [change for change in (found if self._survey else self._tokens.poll()) if self._apply(*change)]
+        now = time.monotonic()
+        crowded = {name for name, number in self._numbers.items() if number > _MAX_TOKENS} if changes else set()
+        if crowded and len(key_exprs_without(self._excluded | crowded, prefix="")) <= _MAX_KEY_EXPRS:
+            text = "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
+            _log.warning(text, ", ".join(map(repr, sorted(crowded))), _MAX_TOKENS, extra=about("incomplete"))
+            self._excluded |= crowded
+            self._retry = now + TIMINGS.excluded
+            gone = [(key, False) for key in self._keys if self._vehicle_of(key) in crowded]
+            changes += [change for change in gone if self._apply(*change)]
+            self._restart(self._subscribe)
+        elif self._survey and all(each.ended for each in self._survey):
+            is_complete = len(self._keys) < MAX_REPLIES and not any(each.failed for each in self._survey)
+            self._restart(partial(self._subscribe, is_surveyed=is_complete))
+            self._slow = math.inf  # no vehicle has too many
+        elif self._tokens.is_listing and now > self._slow:
+            self._restart(self._query)
+        elif now > self._retry:
+            self._excluded, self._retry = set(), math.inf
+            self._restart(self._subscribe)
+        return changes
+
+    def _restart(self, start: Callable[[], None]) -> None:
+        """List the tokens on a new session, because the old one processes all tokens that the router has sent."""
+        self._slow = math.inf
+        with suppress(NedbusError):  # no router answers: the old session reconnects
+            session = self._open_session()
+            self._session.close()
+            self._session = session
+            start()
+
+    def _subscribe(self, *, is_surveyed: bool = False) -> None:
+        self._survey: list[Replies] = []
+        self._is_surveyed = is_surveyed  # a query has listed all tokens
+        self._tokens = LivelinessTokens(self._session, *self._key_exprs, known=self._keys)
+        self._slow = time.monotonic() + TIMINGS.slow_list
+
+    def _query(self) -> None:
+        self._survey = [query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in self._key_exprs]
+
+    @property
+    def _key_exprs(self) -> list[str]:
+        return key_exprs_without(self._excluded, prefix=self._prefix)
+
+    def _apply(self, key: str, alive: bool) -> bool:
+        """Apply a change; return False if it has no effect."""
+        if (key in self._keys) == alive or (alive and len(self._keys) >= MAX_REPLIES):
+            return False
+        (self._keys.add if alive else self._keys.remove)(key)
+        self._numbers[vehicle := self._vehicle_of(key)] += 1 if alive else -1
+        if not self._numbers[vehicle]:
+            del self._numbers[vehicle]
+        return True
+
+    def _vehicle_of(self, key: str) -> str:
+        return key.removeprefix(f"{self._prefix}/").partition("/")[0][: _LONGEST_NAME + 1]
+
+
+def key_exprs_without(excluded: Set[str], *, prefix: str) -> list[str]:
+    """Return key expressions that match the tokens of all vehicles except the excluded ones."""
+    starts = {name[:length] for name in excluded for length in range(len(name) + 1)}
+    short = [each for each in starts if len(each) <= _LONGEST_NAME]
+    names = {f"{each}{c}$*" for each in short for c in _CHARACTERS if each + c not in starts}
+    names |= starts - excluded - {""}
+    return [f"{prefix}/{name}/@alive/*/**" for name in sorted(names) or [ANY]]
