@@ -6,14 +6,14 @@ uses bounded memory. The readers of the `mcap` package have no limit and stop at
 
 import os
 import struct
+from array import array
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, NamedTuple
 from zlib import crc32
 
 from lz4.frame import LZ4FrameDecompressor
@@ -42,16 +42,30 @@ _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
 }  # fmt: skip
-_MAX_SMALL_CHUNK: Final = 2**26  # bytes uncompressed, at any ratio; ROS 2 writes 768 kB, nedbus 8 MiB plus a message
-_MAX_CHUNK: Final = 2**30  # bytes uncompressed
-_MAX_RATIO: Final = 100  # compression ratio of chunks above _MAX_SMALL_CHUNK
+_MAX_BLOCK: Final = 2**26  # bytes of a chunk, also uncompressed, and of a summary; ROS 2 and nedbus write up to 8 MiB
+_MAX_DESCRIPTION: Final = 2**20  # bytes of a record in _DESCRIPTIONS; statistics of all possible channels have 655 kB
+_MAX_RATIO: Final = 100  # compression ratio of files above _MAX_BLOCK
 _MAX_WARNINGS: Final = 100
+_MAX_WARNING: Final = 1000  # characters
+
+
+class _IndexedChunk(NamedTuple):
+    """Place of a chunk in the file, and its channels."""
+
+    start: int
+    end: int
+    channels: Collection[int]
+
+
+def _place_of(index: ChunkIndex) -> _IndexedChunk:
+    start = index.chunk_start_offset
+    return _IndexedChunk(start, start + index.chunk_length, array("H", index.message_index_offsets))
 
 
 class ChunkFile:
     """An MCAP file open for reading.
 
-    `summary`: schemas, channels, chunk indexes and statistics; empty if the summary is absent or damaged.
+    `summary`: records with schemas, channels and statistics; empty if it is absent or damaged.
     `warnings`: the damage found so far; `damaged`: True if any of it cost messages.
 
     Raises SourceError if the file is not MCAP or cannot be opened.
@@ -68,8 +82,8 @@ class ChunkFile:
         if self._read(0, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.close()
             raise SourceError(str(path), "; ".join(["not a readable MCAP file", *self.warnings]))
-        self._chunks: list[ChunkIndex] = []
-        self.summary: list[McapRecord] = []
+        self._chunks: list[_IndexedChunk] = []
+        self.summary = b""
         try:
             self._read_summary()
         except READ_ERRORS:
@@ -81,12 +95,16 @@ class ChunkFile:
         `only`: channels of interest; chunks without any of them may be skipped.
         """
         chunks = (
-            (Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length)
-            for chunk in self._chunks
+            (Opcode.CHUNK, start, end)
+            for start, end, channels in self._chunks
             # A chunk that lists no channels may contain any.
-            if only is None or not (own := chunk.message_index_offsets.keys()) or not own.isdisjoint(only)
+            if only is None or not channels or not set(channels).isdisjoint(only)
         )
         for opcode, offset, end in chunks if self._chunks else self._scan():
+            if end - offset > _MAX_BLOCK:
+                text = f"skipped {end - offset} bytes from byte {offset}, above the limit of {_MAX_BLOCK} for a chunk"
+                self.warn(text, lost=True)
+                continue
             record = self._read(offset, end - offset)
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
@@ -96,6 +114,7 @@ class ChunkFile:
     def warn(self, warning: str, *, lost: bool = False) -> None:
         """Add a warning unless it is a duplicate; `lost`: the damage cost messages."""
         self.damaged |= lost
+        warning = warning[:_MAX_WARNING]
         if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
             self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed")
 
@@ -104,7 +123,7 @@ class ChunkFile:
         packed.seek(0)
         with packed, ExitStack() as on_error:
             unpacked = on_error.enter_context(TemporaryFile())
-            limit = max(_MAX_SMALL_CHUNK, _MAX_RATIO * os.fstat(packed.fileno()).st_size)
+            limit = max(_MAX_BLOCK, _MAX_RATIO * os.fstat(packed.fileno()).st_size)
             try:
                 for part in ZstdDecompressor().read_to_iter(packed):
                     unpacked.write(part)
@@ -129,17 +148,19 @@ class ChunkFile:
             return
         if not len(MCAP0_MAGIC) <= start <= end:
             raise ValueError(start)
-        crc_offset = self._size - len(MCAP0_MAGIC) - 4
-        if checksum and crc32(self._read(start, crc_offset - start)) != checksum:
+        if end - start > _MAX_BLOCK:
+            self.warn(f"the index is larger than {_MAX_BLOCK} bytes; reading without it")
+            return
+        summary = self._read(start, end - start)
+        if checksum and crc32(self._read(end, _FOOTER.size - len(MCAP0_MAGIC) - 4), crc32(summary)) != checksum:
             raise ValueError(checksum)
-        records = list(records_of(self._read(start, end - start)))
-        chunks = [record for record in records if isinstance(record, ChunkIndex)]
-        chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
-        places = [(chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length) for chunk in chunks]
-        edges = [(0, len(MCAP0_MAGIC)), *places, (start, start)]
-        if any(end > begin for (_, end), (begin, _) in pairwise(edges)):
-            raise ValueError(places)
-        self._chunks, self.summary = chunks, records
+        chunks = sorted(_place_of(each) for each in records_of(summary) if isinstance(each, ChunkIndex))
+        previous = len(MCAP0_MAGIC)
+        for begin, stop, _ in (*chunks, (start, start, ())):
+            if begin < previous:
+                raise ValueError(begin)
+            previous = stop
+        self._chunks, self.summary = chunks, summary
 
     def _scan(self) -> Iterator[tuple[int, int, int]]:
         """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages between them."""
@@ -176,8 +197,8 @@ def _expected_length(opcode: int, body: bytes, length: int) -> int:
     return _LENGTHS.get(opcode, length)
 
 
-def records_of(block: bytes) -> Iterator[McapRecord]:
-    """Yield the schemas, channels, messages, chunk indexes and statistics in a block of records.
+def records_of(block: bytes, *opcodes: int) -> Iterator[McapRecord]:
+    """Yield the schemas, channels, messages, chunk indexes and statistics in a block, or only these kinds of record.
 
     Raises one of READ_ERRORS if the block is damaged.
     """
@@ -188,10 +209,14 @@ def records_of(block: bytes) -> Iterator[McapRecord]:
         offset = start + length
         if opcode == 0 or offset > len(block):  # no record has opcode 0
             raise ValueError(opcode)
+        if opcodes and opcode not in opcodes:
+            continue
         if opcode == Opcode.MESSAGE:
             channel, sequence, logged, published = _MESSAGE_HEAD.unpack_from(block, start)
             yield Message(channel, logged, block[start + _MESSAGE_HEAD.size : offset], published, sequence)
         elif opcode in _DESCRIPTIONS:
+            if length > _MAX_DESCRIPTION:
+                raise ValueError(length)
             yield _DESCRIPTIONS[opcode].read(ReadDataStream(BytesIO(block[start:offset])))
 
 
@@ -203,7 +228,7 @@ def _unpack_chunk(record: bytes) -> bytes:
     if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:  # zeros would parse as an empty chunk
         raise ValueError(len(record))
     size, packed = chunk.uncompressed_size, chunk.data
-    if size > max(_MAX_SMALL_CHUNK, min(_MAX_CHUNK, _MAX_RATIO * len(packed))):
+    if size > _MAX_BLOCK:
         raise ValueError(size)
     records: bytes = packed
     if chunk.compression == "zstd":

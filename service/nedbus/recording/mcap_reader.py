@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
@@ -17,6 +18,7 @@ from .flight_files import recording_files
 from .mcap_chunks import READ_ERRORS, ZSTD_MAGIC, ChunkFile, records_of
 
 _MAX_PAYLOAD: Final = 2**16  # decompressed size of a message compressed by rosbag2
+_SCHEMA_BUDGET: Final = 2**25  # bytes of the schemas of a file
 _DEFINITION_BUDGET: Final = 16_000  # for all definitions of a file: 32 per message, 1 per field, 1 per 256 characters
 
 
@@ -110,16 +112,17 @@ class _RecordedFile:
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
-        self._definition_budget = _DEFINITION_BUDGET
+        self._schema_budget, self._definition_budget = _SCHEMA_BUDGET, _DEFINITION_BUDGET
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
         self.counts: Mapping[RecordedStream, int]
-        for record in sorted(self.chunks.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
-            # A summary may repeat channels but not schemas, which are then in the chunks.
-            if not isinstance(record, Channel) or record.schema_id in {0, *self._schemas}:
-                self._register(record)
-            if isinstance(record, Statistics):
-                totals = record.channel_message_counts
+        for kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+            for record in records_of(self.chunks.summary, kind):
+                # A summary may repeat channels but not schemas, which are then in the chunks.
+                if not isinstance(record, Channel) or record.schema_id in self._schemas or not record.schema_id:
+                    self._register(record)
+                if isinstance(record, Statistics):
+                    totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
         if self._all_known:
             self.counts = {stream: total for number, total in totals.items() if (stream := self._streams[number])}
@@ -157,8 +160,12 @@ class _RecordedFile:
 
     def _register(self, record: McapRecord) -> None:
         """Register a schema or channel; ignore later records with the same id."""
-        if isinstance(record, Schema):
-            self._schemas.setdefault(record.id, record)
+        if isinstance(record, Schema) and record.id not in self._schemas:
+            self._schema_budget -= len(record.name) + len(record.data)
+            if self._schema_budget < 0:
+                self.chunks.warn(f"skipped channels: the schemas in this file exceed {_SCHEMA_BUDGET} bytes")
+            else:
+                self._schemas[record.id] = record
         elif isinstance(record, Channel) and record.id not in self._streams:
             self._streams[record.id] = self._describe(self._schemas.get(record.schema_id), record)
 
@@ -184,9 +191,9 @@ class _RecordedFile:
         except (AddressError, ValueError) as exc:
             self.chunks.warn(f"skipped {channel.topic} ({exc})")
             return None
-        if (boot := metadata.get("boot_time_utc_us", "")).isdecimal():
+        if (boot := metadata.get("boot_time_utc_us", "")[:20]).isdecimal() and len(self.boot_times) < 2:
             self.boot_times.add(boot)
-        missing = frozenset(metadata.get("missing", "").split())
+        missing = frozenset(metadata.get("missing", "").split()).intersection(definition.names)
         return RecordedStream(channel.topic, address, definition, layout, missing)
 
     def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:

@@ -346,7 +346,7 @@ def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
         nedbus.read(path)
-    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_SMALL_CHUNK", 2**20)
+    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_BLOCK", 2**20)
     path.write_bytes(zstandard.compress(bytes(2**21)))
     with pytest.raises(SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"):
         nedbus.read(path)

@@ -310,7 +310,7 @@ def test_oversized_chunk_is_skipped(
 
     A smaller one is decompressed: zeros are not a record, so the rest of that chunk is skipped.
     """
-    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_SMALL_CHUNK", 2**20)
+    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_BLOCK", 2**20)
     path = write_recording(tmp_path / "a.mcap", finish=False)
     original = payloads_of(path)[0]
     add_chunk(path, bytes(size), size=declared, compression=compression, in_index=in_index)

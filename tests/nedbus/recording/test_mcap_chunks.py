@@ -1,0 +1,126 @@
+"""MCAP files just beyond the limits of a chunk, a record and an index: reading them takes bounded memory."""
+
+import random
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+from zlib import crc32
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, McapRecord, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+
+import nedbus
+from nedbus.recording.mcap_reader import RecordingReader
+from tests.peers.processes import Start
+
+_SECONDS: Final = 5  # they need 0.7 s
+LIMIT: Final = 2**22  # bytes of a chunk or index, here; 64 MiB in fact
+SHARE: Final = 8  # of 512 MiB: growth of a process per byte of the limit
+
+# The first use of the libraries is not counted.
+_READ: Final = """
+import sys
+from pathlib import Path
+import nedbus
+from nedbus.recording import mcap_chunks, mcap_reader
+mcap_chunks._MAX_BLOCK = mcap_reader._SCHEMA_BUDGET = LIMIT
+peak = lambda: int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])  # [KiB]
+before = peak()
+try:
+    mcap_reader.RecordingReader(sys.argv[1], vehicle="1")
+except nedbus.SourceError as exc:
+    print(exc)
+print(1024 * (peak() - before))
+""".replace("LIMIT", str(LIMIT))
+
+
+def encode(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
+
+
+def chunk(content: bytes, compression: str = "") -> bytes:
+    """Return a chunk of records."""
+    pack = {"": bytes, "zstd": zstandard.compress, "lz4": lz4.frame.compress}[compression]
+    return encode(Chunk(compression, pack(content), 0, 0, crc32(content), len(content)))
+
+
+def message(size: int) -> bytes:
+    """Return a message record of incompressible data."""
+    return encode(Message(1, 0, random.Random(1).randbytes(size - 31), 0, 0))
+
+
+def channels(number: int) -> bytes:
+    """Return channels of nearly the maximum size, with as many metadata as fit."""
+    metadata = {f"{each:x}": "" for each in range(75_000)}
+    return encode(*(Channel(each, f"/{each}", "cdr", metadata, 0) for each in range(number)))
+
+
+def index(*records: McapRecord) -> bytes:
+    """Return an index with these records, and the end of the data before it."""
+    data_end, place = encode(DataEnd(0)), len(MCAP0_MAGIC)
+    return data_end + encode(*records) + encode(Footer(place + len(data_end), 0, 0))
+
+
+def metadata(size: int) -> Metadata:
+    return Metadata(metadata={"a": "b" * size}, name="c")
+
+
+FILES: Final[dict[str, tuple[Callable[[], bytes], str]]] = {
+    "chunk": (lambda: chunk(message(LIMIT + 1)), "above the limit"),
+    "expanding chunk": (lambda: chunk(bytes(LIMIT + 1), "zstd"), "is damaged"),
+    "message": (lambda: message(LIMIT + 1), "above the limit"),
+    "accepted chunk": (lambda: chunk(message(LIMIT - 100)), "channel record is lost"),
+    "accepted lz4 chunk": (lambda: chunk(message(LIMIT - 2**16), "lz4"), "channel record is lost"),
+    "accepted zstd chunk": (lambda: chunk(message(LIMIT - 2**16), "zstd"), "channel record is lost"),
+    "accepted channels": (lambda: chunk(channels(4)), "no messages"),
+    "large channel": (lambda: chunk(encode(Channel(1, "/a" * 2**19, "cdr", {}, 0))), "invalid record"),
+    "index": (lambda: index(metadata(LIMIT)), "the index is larger than"),
+    "index of chunks": (
+        lambda: index(*(ChunkIndex(0, 8, "", 0, 0, 0, dict.fromkeys(range(60_000), 0), 0, 0) for _ in range(6))),
+        "is damaged",
+    ),
+    "schemas": (
+        lambda: b"".join(
+            chunk(encode(Schema(id=number, data=b"a" * 2**19, encoding="ros2msg", name="px4_msgs/msg/A")))
+            for number in range(1, 10)
+        ),
+        "the schemas in this file exceed",
+    ),
+}  # fmt: skip
+"""Contents of a file at or just beyond a limit, and what is reported."""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("kind", FILES)
+def test_file_at_a_limit_is_read_in_bounded_memory(start: Start, tmp_path: Path, kind: str) -> None:
+    """Memory of at most eight times the limit of a chunk, 512 MiB, is used; what is skipped is reported."""
+    make, reason = FILES[kind]
+    path = tmp_path / "a.mcap"
+    data = make()
+    end = b"" if kind.startswith("index") else encode(DataEnd(0), Footer(0, 0, 0))
+    path.write_bytes(MCAP0_MAGIC + data + end + MCAP0_MAGIC)
+    process = start("-c", _READ, str(path), coverage=False)
+    assert process.wait() == 0, process.err
+    assert reason in process.out
+    assert int(process.out.splitlines()[-1]) < SHARE * LIMIT, process.out
+
+
+def test_index_with_many_schemas_is_read_in_linear_time(tmp_path: Path) -> None:
+    """An index with 40,000 schemas and channels is read in seconds of CPU time, on any machine."""
+    path = tmp_path / "a.mcap"
+    schemas = [Schema(id=number, data=b"", encoding="", name="other") for number in range(1, 40_001)]
+    path.write_bytes(MCAP0_MAGIC + index(*schemas, *(Channel(each.id, "/a", "", {}, each.id) for each in schemas)))
+    with path.open("ab") as file:
+        file.write(MCAP0_MAGIC)
+    begin = time.process_time()
+    with pytest.raises(nedbus.SourceError, match="no messages"):
+        RecordingReader(path, vehicle="1")
+    assert time.process_time() - begin < _SECONDS
