@@ -180,14 +180,17 @@ def _fill(template: str, values: Sequence[Any]) -> str:
 
 
 class RateLimit:
-    """Limit of 100 messages per second; `omitted`: number of messages above it."""
+    """Limit of 100 messages per second; `omitted`: number of messages above it.
+
+    Earlier messages count in the newest second: a log with alternating times would otherwise have no limit.
+    """
 
     def __init__(self) -> None:
         self.omitted = self._begin = self._count = 0
 
     def admits(self, time: int) -> bool:
         """Return whether a message at this time [us] is below the limit."""
-        if abs(time - self._begin) >= 1_000_000:
+        if time - self._begin >= 1_000_000:
             self._begin, self._count = time, 0
         self._count += 1
         self.omitted += self._count > _MAX_PER_SECOND

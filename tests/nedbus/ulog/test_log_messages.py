@@ -264,6 +264,18 @@ def test_log_messages_are_sanitised_and_rate_limited() -> None:
     assert texts.limit.omitted == 9_900
 
 
+def test_texts_that_jump_in_time_are_rate_limited() -> None:
+    """Texts that are earlier than previous ones count in the newest second, so jumps in time do not evade the limit."""
+    log, texts = Log(), LogMessageBuilder()
+    for number in range(1000):
+        log.text(50_000_000 if number % 2 else 90_000_000, b"%d" % number)
+    log.text(91_000_000, b"later")
+    *_, last = log_messages = log.log_messages(texts)
+    assert last == (91_000_000, 6, "later")
+    assert len(log_messages) == 101
+    assert texts.limit.omitted == 900
+
+
 def test_topics_with_unexpected_fields_are_ignored(tmp_path: Path) -> None:
     """A topic `event` with other fields is ignored, and a logged log_message does not duplicate the strings."""
     log = UlogWriter()
