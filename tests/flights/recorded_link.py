@@ -28,12 +28,19 @@ class _Receiver(LogReceiver):
     """The receiver of a link without its thread."""
 
     def __init__(self, options: MavlinkOptions) -> None:
-        self._reader, self._options, self._send = cast("Any", SimpleNamespace(name="udp")), options, lambda *_: None
+        self._reader, self._options, self._send = cast("Any", SimpleNamespace(name="udp")), options, self._answer
+        self._sent: list[int] = []  # times in TIMESYNC requests, which the vehicle answers at once
         self.vehicles = {}
+
+    def _answer(self, message: Any, _: object) -> None:
+        if message.get_type() == "TIMESYNC":
+            self._sent.append(message.ts1)
 
     def tick(self, now: float) -> None:
         for vehicle in self.vehicles.values():
             self._execute(vehicle, vehicle.client.tick(now))
+            while self._sent:
+                self._execute(vehicle, vehicle.client.on_timesync(self._sent.pop(), now))
 
     def process(self, received: Received) -> Received | Rejection:
         self.tick(received.time)
@@ -73,7 +80,7 @@ class Service:
         registry = SimpleNamespace(publisher=self._open, reject=lambda *_: None)
         self.output = SourceOutput("udp", "mavlink:udp", cast("PublisherRegistry", registry), self._now, self.event_log)
         monkeypatch.setattr(clock, "steady", self._now)
-        self._items = play(path, MavlinkOptions.model_validate({"log": "armed"} | options))
+        self._items = play(path, MavlinkOptions.model_validate({"log": "armed", "state": "0"} | options))
 
     def run(self, until: float = 1e9) -> Service:
         """Play the recording up to this time [s since its start]."""

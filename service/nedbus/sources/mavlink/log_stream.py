@@ -110,7 +110,10 @@ class LogStream:
             return
         self._undecodable += self._parser.undecodable - undecodable
         sizes = [len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)]
+        is_first = not self._records
         self._records, self._record_bytes = self._records + len(sizes), self._record_bytes + sum(sizes)
+        if is_first and self._gaps:  # a stream that continues that of an earlier process begins with a gap
+            self._estimate_lost()
         yield from self._check_definitions(is_first=not undecodable)
         self._save_definitions(records, now)
         for record in self._texts.merge(records):

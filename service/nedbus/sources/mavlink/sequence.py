@@ -29,8 +29,11 @@ class PacketRate:
         return self._count / seconds * max(0.0, now - self._last) if seconds > 0 else 0.0
 
     def explains(self, lost: int, now: float, *, margin: int = _MARGIN) -> bool:
-        """Return whether so many packets can be lost since the last one; if not, the sender's counter restarted."""
-        return lost <= margin + _FACTOR * self.expected(now)
+        """Return whether so many packets can be lost since the last one; if not, the sender's counter restarted.
+
+        Before the first packet nothing is known, as in a stream that continues that of an earlier process.
+        """
+        return not self._count or lost <= margin + _FACTOR * self.expected(now)
 
 
 class SequenceCounter:
