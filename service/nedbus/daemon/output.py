@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Container
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, Final, cast
 
 from nedbus import clock
@@ -20,6 +21,7 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 _log = logging.getLogger(__name__)
 
 _MAX_ADDRESSES: Final = 1000  # published and stale addresses of one live source
+_MAX_REPLAYED: Final = 10_000  # addresses of one replay, as many as a reader tracks
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one per origin (`where`)
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
@@ -102,7 +104,7 @@ class SourceOutput:
         for address in run.addresses.keys() - set(self.addresses):
             if address in self._registry.publishers:
                 raise AddressInUseError(address)
-        for address, definition in run.addresses.items():
+        for address, definition in islice(run.addresses.items(), _MAX_REPLAYED):
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
@@ -154,6 +156,9 @@ class SourceOutput:
 
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
+        if message.address not in self._streams and len(self._streams) >= _MAX_REPLAYED:
+            self._reject_excess(message.address, _MAX_REPLAYED)
+            return
         try:
             self.claim(message.address, message.definition, lossless=lossless)
         except AddressInUseError as exc:
@@ -171,8 +176,7 @@ class SourceOutput:
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
             resumed = stream is not None and stream.last_received is not None
             if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._evict_stale():
-                reason = f"the limit is {_MAX_ADDRESSES}, and {address} is the first one ignored"
-                self.reject(Rejection("further addresses", reason), rule=TOO_MANY)
+                self._reject_excess(address, _MAX_ADDRESSES)
                 return
             try:
                 self.claim(address, message.definition)
@@ -238,6 +242,10 @@ class SourceOutput:
         if rejection.address is not None:
             self._event_log.reject(rejection.address, reason, clock.steady())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
+
+    def _reject_excess(self, address: Address, limit: int) -> None:
+        reason = f"the limit is {limit}, and {address} is the first one ignored"
+        self.reject(Rejection("further addresses", reason), rule=TOO_MANY)
 
     def note(self, unavailable: UnavailableTopics) -> None:
         """Store the unavailable topics of a live source; log each silent address once, up to the address limit."""

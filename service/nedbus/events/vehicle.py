@@ -144,7 +144,7 @@ class Vehicle:
                 self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
         if self._on_ground and time - self._armed_at >= PAUSE:
             self.conditions |= self._on_ground
-            self.initial += dict.fromkeys(self._on_ground.values())
+            self.initial += [*dict.fromkeys(self._on_ground.values())][: _MAX_RECENT - len(self.initial)]
             self._on_ground.clear()
         for key, events in list(self._changes.items()):
             last = events[-1]
@@ -271,7 +271,8 @@ class Vehicle:
 
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream; None if it has no events, or a preferred stream is in use."""
-        self.topics.add(address.topic)
+        if len(self.topics) < _MAX_STREAMS:  # streams without events may be opened again
+            self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
         if topic == detectors.EKF_SELECTOR:
             unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]

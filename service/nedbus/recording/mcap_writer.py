@@ -5,8 +5,10 @@ it. A power cut costs only the messages since the last flush, never the file.
 """
 
 import errno
+import logging
 import os
 import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import repeat
@@ -19,12 +21,17 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from nedbus.atomic_write import sync_folder
 from nedbus.errors import OutputError
+from nedbus.log_event import about
 from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.messages import LogMessage
 
+_log = logging.getLogger(__name__)
+
 _CHUNK: Final = 2**23  # bytes; flushing every second makes smaller chunks
 _MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
+_MAX_CHANNELS: Final = 1000  # per vehicle, so none uses up those of a file; a PX4 has 300 topics
+_MAX_ALL_CHANNELS: Final = 60_000  # of at most 65,535 in an MCAP file, which also has a log channel per vehicle
 _MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have larger timestamps
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
@@ -60,11 +67,14 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
     vehicle's boot [us], for `utc_of` if the messages do not provide it.
 
+    `omitted`: messages left out beyond 1,000 channels of their vehicle, or beyond those of a file.
+
     Raises OutputError if the file exists, is deleted while open, or cannot be written; flushed messages stay readable.
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0) -> None:
-        self.path, self._boot_utc, self.messages = Path(path), boot_utc, 0
+        self.path, self._boot_utc = Path(path), boot_utc
+        self.messages = self.omitted = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
         # Large chunks: the writer keeps an index per chunk and channel in memory.
@@ -80,6 +90,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
             raise
         self._schemas: dict[tuple[str, str], int] = {}  # by type and text
         self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
+        self._numbers: Counter[str] = Counter()  # of channels, by vehicle
         self._log_channels = dict[str, int]()  # by vehicle; RecordingReader ignores these
 
     def write(
@@ -117,7 +128,11 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
         channels = self._channels.setdefault(definition, {})
         for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
-            channel, layout = channels.get(stream) or self._new_channel(definition, *stream)
+            found = channels.get(stream) or self._new_channel(definition, *stream)
+            if found is None:
+                self.omitted += 1
+                continue
+            channel, layout = found
             if layout not in encoded:
                 payloads = arrays_of(definition).encode_cdr(messages, layout)
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
@@ -155,7 +170,16 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         else:
             self.close()
 
-    def _new_channel(self, definition: Definition[Any], address: Address, provenance: Provenance) -> tuple[int, Layout]:
+    def _new_channel(
+        self, definition: Definition[Any], address: Address, provenance: Provenance
+    ) -> tuple[int, Layout] | None:
+        """Return the id and layout of a new channel, None beyond the limit of a vehicle or of the file."""
+        if self._numbers[address.vehicle] >= _MAX_CHANNELS or self._numbers.total() >= _MAX_ALL_CHANNELS:
+            if not self.omitted:
+                text = "%s: not recording some messages of vehicle %s, which has more than %d topics and provenances"
+                _log.warning(text, self.path, address.vehicle, _MAX_CHANNELS, extra=about("incomplete", address))
+            return None
+        self._numbers[address.vehicle] += 1
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
         known = {
             "vehicle": address.vehicle, "topic": address.topic,

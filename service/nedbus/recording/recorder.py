@@ -38,6 +38,8 @@ class Recorder:
         """The counts so far as text, such as "120 messages, 2 lost"."""
         names = ("lost", "dropped", "invalid", "discarded", "forgotten")
         counts = [f"{count} {name}" for name in names if (count := getattr(self._subscription.counts, name))]
+        if self._writer is not None and self._writer.omitted:
+            counts.append(f"{self._writer.omitted} not recorded")
         return ", ".join([f"{self.messages} message{'s' * (self.messages != 1)}", *counts])
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:

@@ -11,8 +11,8 @@ import nedbus
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
-from nedbus.sources import Rejection, SourceMessage, UnavailableTopics
-from nedbus_msgs import BY_TOPIC, Address
+from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
+from nedbus_msgs import BY_TOPIC, Address, Definition
 from tests.flights.messages import VLP
 
 HOME, POSITION, OTHER = Address("1", "home_position"), Address("1", VLP), Address("2", VLP)
@@ -27,7 +27,9 @@ class FakeOutput:
         self.failure: nedbus.InvalidMessageError | None = None
         self.reports = list[dict[str, object]]()
         self.event_log = EventLog()
-        registry = SimpleNamespace(publisher=self._open, reject=lambda _, report: self.reports.append(report))
+        registry = SimpleNamespace(
+            publisher=self._open, publishers={}, reject=lambda _, report: self.reports.append(report)
+        )
         self.output = SourceOutput(
             "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.event_log
         )
@@ -119,6 +121,21 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses
     assert present[0] not in fake.output.stale
+
+
+def test_addresses_of_a_replay_are_limited() -> None:
+    """Messages of a replay beyond 10,000 addresses are rejected, counted, and logged once."""
+    fake = FakeOutput()
+    addresses: dict[Address, Definition[Any] | None] = dict.fromkeys(
+        Address(f"v{number}", VLP) for number in range(10_001)
+    )
+    fake.output.claim_all(ReplayRun(iter(()), addresses, None, "", position=0), lossless=True)
+    assert len(fake.output.addresses) == 10_000
+    last = [*addresses][-1]
+    for address in (last, last, POSITION):
+        fake.output.publish_replay(SourceMessage(0.0, address, {"timestamp": 1}), lossless=True)
+    assert fake.output.rejections == {"too many addresses": 3}
+    assert fake.output.warnings == (f"further addresses: the limit is 10000, and {last} is the first one ignored",)
 
 
 def test_text_of_a_rejection_is_limited(caplog: pytest.LogCaptureFixture) -> None:

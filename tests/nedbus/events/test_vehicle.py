@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 
 from nedbus.events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
+from nedbus.events.rules import PAUSE
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP
+from tests.nedbus.events.flight import ARMED, Flight
 
 MAIN = Address("1", VLP)
 GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0}
@@ -297,3 +299,25 @@ def test_end_of_fake_position_fusion_is_evidence(vehicle: SimpleVehicle, gnss: b
     assert [each.text for each in invalid.evidence] == ["no horizontal aiding: EKF stopped fusing fake position"][
         : not gnss
     ]
+
+
+def test_number_of_topics_of_a_vehicle_is_limited(vehicle: SimpleVehicle) -> None:
+    """At most 1,000 topics are stored, although a better position stream opens the other streams again."""
+    for instance in (3, 2, 1, 0):
+        vehicle.send(0.0, "estimator_local_position", instance)
+        for number in range(800):
+            vehicle.send(0.0, f"topic_{instance}_{number}")
+    assert len(vehicle.event_log.vehicles["1"].topics) == 1000
+
+
+def test_number_of_initial_conditions_is_limited() -> None:
+    """A vehicle that is rebooted and armed again and again without a fix has at most 100 initial conditions."""
+    flight = Flight()
+    for _ in range(100):
+        flight.booted = flight.now
+        flight.wait(1.0).send(xy_global=False)
+        flight.gps(fix_type=0, satellites_used=0)
+        flight.status(ARMED)
+        flight.fly(PAUSE + 1.0)
+        flight.update()
+    assert len(flight.event_log.vehicles["1"].initial) == 100

@@ -22,7 +22,7 @@ import nedbus
 from nedbus.cli.follow import write_notice
 from nedbus.client import Batch, Subscription
 from nedbus.errors import NoDataError, SourceError
-from nedbus.recording import Recorder, RecordingReader, RecordingWriter
+from nedbus.recording import Recorder, RecordingReader, RecordingWriter, mcap_writer
 from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.timings import Timings
 from nedbus.transport import Session
@@ -82,6 +82,25 @@ def test_sequence_numbers_of_publishers_are_recorded(tmp_path: Path) -> None:
         writer.write(rows, DEFAULT, repeat((ADDRESS, Provenance())), logged=times, published=times, sequence=numbers)
     with path.open("rb") as file:
         assert [each.sequence for _, _, each in make_reader(file).iter_messages()] == [0, 0, 7, 2**32 - 1]
+
+
+def test_channels_of_a_vehicle_are_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A vehicle with too many topics and provenances does not use up the channels of a file for the others.
+
+    Its further messages are left out, counted, and logged once; those of its known channels are recorded.
+    """
+    monkeypatch.setattr(mcap_writer, "_MAX_CHANNELS", 2)
+    monkeypatch.setattr(mcap_writer, "_MAX_ALL_CHANNELS", 3)
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for vehicle, source in (("7", "a"), ("7", "b"), ("7", "c"), ("7", "d"), ("8", "a"), ("9", "a"), ("7", "a")):
+            streams = [(Address(vehicle, VLP), Provenance(source))]
+            writer.write(to_array([message(1)]), DEFAULT, streams, logged=[1], published=[1])
+    assert (writer.messages, writer.omitted) == (4, 3)
+    assert [topic for topic, *_ in read_independently(path)] == [f"/{each}/{VLP}" for each in "7787"]
+    assert caplog.text.count("not recording some messages of vehicle 7, which has more than 2") == 1
 
 
 def test_replay_of_a_recording_is_bit_exact(

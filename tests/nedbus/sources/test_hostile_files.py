@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import struct
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
@@ -11,11 +14,14 @@ from mcap.writer import Writer
 
 import nedbus
 from tests.flights.replays import open_replay
+from tests.flights.ulogs import UlogWriter
 from tests.nedbus.ulog import test_parser as log_limits
 from tests.peers.processes import Start
+from tests.waits import wait_for
 
 _SECONDS: Final = 30  # CPU time limit for all readers, on any machine; they need 1 to 2 s
 _MEMORY: Final = 100_000  # KiB
+_STOP: Final = 3.0  # s; it needs less than 1 s
 
 # All readers of files in one process; only nedbus's own errors are allowed, which the command line shows as one line.
 _READ: Final = """
@@ -133,3 +139,23 @@ def _check(start: Start, path: Path) -> None:
     assert process.wait(100.0) == 0, process.err
     *_, growth = process.out.split()
     assert int(growth) < _MEMORY, process.out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", ["", "&speed=max&loop=1"])
+def test_service_with_many_topics_stops(run_nedbus: Start, endpoint: str, tmp_path: Path, options: str) -> None:
+    """Ctrl-C stops a service whose log rotates through 450 topics within three seconds."""
+    log = UlogWriter()
+    fields = "".join(f"float value_{number};" for number in range(15))
+    for number in range(450):
+        log.put("F", f"other{number}:uint64_t timestamp;{fields}".encode())
+        log.put("A", struct.pack("<BH", 0, number) + f"other{number}".encode())
+    for number in range(10_000):
+        log.put("D", struct.pack("<HQ60x", number % 450, 1_000_000 + 100 * number))
+    path = log.write(tmp_path / "many.ulg")
+    service = run_nedbus("serve", "-s", f"ulog:{path}?topics=*{options}", "-c", endpoint, coverage=False)
+    wait_for(lambda: "MB" in service.err, what="the start of the replay")
+    begin = time.monotonic()
+    service.signal(signal.SIGINT)
+    assert service.wait() == 130
+    assert time.monotonic() - begin < _STOP

@@ -50,9 +50,11 @@ def hz(
             if not (json_output or csv_output):
                 show_table([_to_row(*each) for each in streams])
                 return
+            former = written.copy()
+            written.clear()  # of streams that are no longer shown
             for address, health, state in streams:
-                before, written[address] = written.get(address), (health.messages, state.name)
-                if before != written[address]:
+                written[address] = health.messages, state.name
+                if former.get(address) != written[address]:
                     fields: dict[str, Any] = {"time": clock.utc(), **asdict(address), "state": state.name}
                     fields |= {"reason": state.reason, **asdict(health)}
                     cells = {**fields, **(health.flags or {}), "time": f"{fields['time']:.3f}"}

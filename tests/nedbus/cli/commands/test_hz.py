@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -10,10 +11,13 @@ from typing import cast
 import pytest
 
 from nedbus import Bus
+from nedbus.cli.commands import hz
 from nedbus.cli.commands.hz import _states
+from nedbus.client import StreamState
 from nedbus.health import Monitor, StreamHealth
 from nedbus_msgs import Address
 from tests.flights.messages import VLP
+from tests.peers.command_line import run_command
 
 
 @pytest.mark.parametrize(("age", "is_shown"), [(59.0, True), (61.0, False)])
@@ -25,3 +29,17 @@ def test_gone_stream_is_hidden_after_a_minute(age: float, is_shown: bool) -> Non
     bus = SimpleNamespace(publishers=lambda **_: Counter[Address](), connected=True)
     shown = [state.name for _, _, state in _states(cast("Bus", bus), cast("Monitor", monitor))]
     assert (shown, forgotten) == ((["gone"], []) if is_shown else ([], [address]))
+
+
+def test_stream_that_was_hidden_is_written_when_it_returns(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
+    """What was written of a stream is forgotten with the stream, so --json shows a stream that returns."""
+    address, health = Address("1", VLP), StreamHealth(VLP).snapshot(0)
+    rows = iter([[(address, health, StreamState("ok"))], [(address, health, StreamState("ok"))], []] * 2)
+
+    def show_each(*_: object, each_second: Callable[[], None], **__: object) -> None:
+        for _second in range(6):
+            each_second()
+
+    monkeypatch.setattr(hz, "_states", lambda *_: next(rows))
+    monkeypatch.setattr(hz, "follow", show_each)
+    assert run_command("hz", "-c", endpoint, "--json").out.count(VLP) == 2
