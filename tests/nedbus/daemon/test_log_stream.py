@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,14 @@ class Flight1:
             self._start, slow, "serve", "--connect", self._endpoint, "--source", self._source
         )  # fmt: skip
 
+    def kill_service_in_flight(self, positions: Iterable[nedbus.Sample[Any]]) -> None:
+        """Start a service, and kill it once the stream has begun and the vehicle is armed."""
+        service = self.serve()
+        next(each for each in positions if each.source == "mavlink-ulog")
+        wait_for(lambda: self.peer.is_armed, what="arming")
+        service.signal(signal.SIGKILL)
+        service.wait()
+
     def positions(self) -> dict[int, tuple[float, ...]]:
         """Return the positions that the vehicle has sent, by timestamp."""
         parser, found = UlogParser(verify=False), {}
@@ -195,11 +204,7 @@ class TestRestartInFlight:
         """Without the state file, the stream of a killed process is rejected with the remedy, and left alone."""
         flight = Flight1(start, endpoint, "log=1&state=0")
         with bus.subscribe(vehicle="1", mode="every") as positions, flight.peer:
-            service = flight.serve()
-            next(each for each in positions if each.source == "mavlink-ulog")
-            wait_for(lambda: flight.peer.is_armed, what="arming")
-            service.signal(signal.SIGKILL)
-            service.wait()
+            flight.kill_service_in_flight(positions)
             service = flight.serve()
             reason = "of an earlier process cannot be continued, because state=0 is set; it restarts after disarming"
             wait_for(lambda: reason in service.err, what="the reason")
@@ -214,11 +219,7 @@ class TestRestartInFlight:
         """A stream that is addressed to other ids is not continued, although its definitions are known."""
         flight = Flight1(start, endpoint, f"log=armed&state={tmp_path}")
         with bus.subscribe(vehicle="1", mode="every") as positions, flight.peer:
-            service = flight.serve()
-            next(each for each in positions if each.source == "mavlink-ulog")
-            wait_for(lambda: flight.peer.is_armed, what="arming")
-            service.signal(signal.SIGKILL)
-            service.wait()
+            flight.kill_service_in_flight(positions)
             flight.peer.change_owner((255, 190))
             service = flight.serve()
             wait_for(lambda: "system 255 component 190 already receives it" in service.err, what="the owner")

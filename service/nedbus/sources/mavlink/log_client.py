@@ -355,7 +355,7 @@ class LogStreamClient:
             self._awaited = "pong"
             return self._ping(now) if is_repeated else self._start(now)
         elif awaited == "data" and not is_lost:
-            # The data may go to another client, so no STOP: if nobody acknowledges it, PX4 gives up.
+            # The data may go to another client, so no STOP; without acknowledgements PX4 gives up.
             self._restarts += 1
             if self._restarts <= _RESTARTS:
                 self._enter("starting", None, now)

@@ -29,7 +29,7 @@ class PacketRate:
         return self._count / seconds * max(0.0, now - self._last) if seconds > 0 else 0.0
 
     def explains(self, lost: int, now: float, *, margin: int = _MARGIN) -> bool:
-        """Return whether so many packets can be lost since the last one; if not, the sender's counter restarted.
+        """Return whether this number of packets can be lost since the last one; if not, the sender restarted.
 
         Before the first packet nothing is known, as in a stream that continues that of an earlier process.
         """

@@ -116,7 +116,7 @@ def test_failed_declaration_leaves_nothing_behind(
 def test_interrupted_open_closes_the_publisher(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C while `bus.publisher` waits for the router closes the publisher, which nobody could close otherwise."""
+    """Ctrl-C while `bus.publisher` waits for the router closes the publisher, which the script has no reference to."""
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt

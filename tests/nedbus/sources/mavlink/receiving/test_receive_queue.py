@@ -33,7 +33,7 @@ class Host:
         self.queue.put(Received(message, system, sequence, None, self.time, chunk=chunk))
 
     def read(self, count: int | None = None, *, lost_by_host: int = 0) -> list[Received]:
-        """Return what one call of `read` yields; `count`: stop after so many messages."""
+        """Return what one call of `read` yields; `count`: stop after this number of messages."""
         found = []
         for each in self.queue.read(0.0, lost_by_host=lost_by_host):
             if isinstance(each, LinkLoad):
