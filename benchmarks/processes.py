@@ -27,14 +27,15 @@ class Checkout(NamedTuple):
 
     folder: Path
 
-    def start(self, *arguments: str) -> Process:
-        """Start a Python process that imports this checkout."""
+    def start(self, *arguments: str, errors: int | None = subprocess.DEVNULL) -> Process:
+        """Start a Python process that imports this checkout; `errors`: target of its stderr."""
         python, packages = (
             self.folder / ".venv/bin/python",
             [str(self.folder / each) for each in ("service", "schemas")],
         )
         environment = {"PYTHONPATH": os.pathsep.join(packages)}
-        return start(*arguments, python=str(python) if python.exists() else sys.executable, environment=environment)
+        known = str(python) if python.exists() else sys.executable
+        return start(*arguments, python=known, environment=environment, errors=errors)
 
 
 HERE: Final = Checkout(ROOT)

@@ -1,1 +1,1 @@
-"""Reading ULog files, and receiving the ULog stream."""
+"""Reading and serving ULog files, and receiving the ULog stream."""

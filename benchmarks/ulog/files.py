@@ -10,12 +10,14 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
+import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 from pyulog import ULog
@@ -23,6 +25,7 @@ from tests.flights.ulogs import LOGS
 
 from nedbus.recording import Flight
 
+_TIMESTAMP = 5  # offset in a record with a message
 REPLAY = """
 import resource, sys, time
 from nedbus.sources import parse_source
@@ -77,16 +80,37 @@ def measure_replay(path: Path) -> list[float]:
 
 
 def repeat_log(path: Path, target: Path, size: int) -> Path:
-    """Write a log with the data section of another one repeated up to `size` bytes."""
+    """Write a log with the data section of another one repeated up to `size` bytes, with continuing timestamps."""
     data = path.read_bytes()
     at = 16
     while data[at + 2] != ord("A"):  # the first subscription ends the definitions
         at += 3 + int.from_bytes(data[at : at + 2], "little")
+    records, head = [*records_of(data, at)], data[:at]
+    times = [time for record in records if (time := timestamp_of(record))]
+    span = max(times) - min(times) + 1000
     with target.open("wb") as file:
-        file.write(data[:at])
-        while file.tell() < size:
-            file.write(data[at:])
-    return target
+        file.write(head)
+        for repetition in count():
+            for record in records:
+                time = timestamp_of(record)
+                shifted = struct.pack("<Q", time + repetition * span)
+                file.write(record[:_TIMESTAMP] + shifted + record[_TIMESTAMP + 8 :] if time else record)
+            if file.tell() >= size:
+                return target
+    raise AssertionError
+
+
+def records_of(data: bytes, at: int) -> Iterator[bytes]:
+    """Yield the complete records of a log from a position on."""
+    while at + 3 <= len(data) and (stop := at + 3 + int.from_bytes(data[at : at + 2], "little")) <= len(data):
+        yield data[at:stop]
+        at = stop
+
+
+def timestamp_of(record: bytes) -> int:
+    """Return the timestamp of a message [us], with which PX4 begins each one; 0 for another record."""
+    is_message = record[2] == ord("D") and len(record) >= _TIMESTAMP + 8
+    return int.from_bytes(record[_TIMESTAMP : _TIMESTAMP + 8], "little") if is_message else 0
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
+from .codecs.records import Encoded, encode_upgraded, record_encoder
 from .definitions import DEFAULT, define, definition_of
 from .errors import (
     AddressError,
@@ -15,7 +16,7 @@ from .errors import (
 )
 from .messages.vehicle_local_position import DOUBT_FLAGS, VehicleLocalPosition, describe_flags, message_doubts
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
-from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
+from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, FieldReader, Row, upgrade_fields, upgrade_with
 from .model.message import Message
 from .model.px4_types import BASES, YEAR_2000, FieldType, decode_text, field_type, is_unix_time
 from .model.rules import UnitQuaternion
@@ -47,13 +48,13 @@ from .topics import (
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "MESSAGES",
     "PAYLOAD_LIMIT", "RATE", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address", "AddressError",
-    "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
-    "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError", "NedbusError", "Provenance", "Quantity",
-    "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion", "UnknownLayoutError", "VehicleLocalPosition",
-    "ack_key", "address_of_alive_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of", "dds_type",
-    "decode_text", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
-    "describe_flags", "encode_with", "encoding_of", "field_type", "get_topic", "hash_of", "hash_of_msg",
-    "identity_of", "is_unix_time", "is_vehicle_input", "message_doubts", "message_of_type_hash", "provenance_of",
-    "read_msg", "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "short_hash", "split_ros2_topic",
-    "status_key", "topic_of", "upgrade_fields", "upgrade_with", "vehicle_name",
+    "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "Encoded", "FieldReader",
+    "FieldType", "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError", "NedbusError", "Provenance",
+    "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion", "UnknownLayoutError",
+    "VehicleLocalPosition", "ack_key", "address_of_alive_key", "bases_of_msg", "check_prefix", "check_vehicle",
+    "codec_of", "dds_type", "decode_text", "decode_with", "define", "define_msg", "definition_of", "definition_text",
+    "describe", "describe_flags", "encode_upgraded", "encode_with", "encoding_of", "field_type", "get_topic", "hash_of",
+    "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input", "message_doubts", "message_of_type_hash",
+    "provenance_of", "read_msg", "record_encoder", "ros2_topic_of", "ros2_type", "ros2_types", "schema_key",
+    "short_hash", "split_ros2_topic", "status_key", "topic_of", "upgrade_fields", "upgrade_with", "vehicle_name",
 ]  # fmt: skip

@@ -20,8 +20,8 @@ from .model.declaration import Layout, cached_on_owner
 from .model.definition import MESSAGES, Definition
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, encode_text
-from .model.rules import column_checks, compile_rules
-from .model.validation import Values
+from .model.rules import column_checks, compile_lambda, expression_of
+from .model.validation import Values, accessors_of
 
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
@@ -55,16 +55,12 @@ class Arrays(Generic[M]):
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
         self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
-        self._has_text = any(kind.is_text for kind in types.values())
         checked = {name for rule in definition.rules for name in rule.fields}
         # A struct that unpacks only the fields with rules from an element, and an expression for each unpacked field.
-        form, accessors, index = "=", dict[str, str](), 0
-        for name, kind in types.items():
-            form += kind.form if name in checked else f"{self.dtype[name].itemsize}x"
-            if name in checked:
-                accessors[name] = f"values[{index}:{index + kind.values}]" if kind.is_array else f"values[{index}]"
-                index += kind.values
-        self._checked, self._passes_rules = struct.Struct(form), compile_rules(definition.rules, accessors)
+        forms = (kind.form if name in checked else f"{self.dtype[name].itemsize}x" for name, kind in types.items())
+        accessors = accessors_of({name: kind for name, kind in types.items() if name in checked})
+        self._checked = struct.Struct("=" + "".join(forms))
+        self._passes_rules = compile_lambda(f"lambda values: {expression_of(definition.rules, accessors)}")
         self._column_checks = column_checks(
             definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
         )
@@ -123,7 +119,7 @@ class Arrays(Generic[M]):
 
     def to_element(self, row: Values) -> Values:
         """Convert a row for assignment to an array: text becomes UTF-8, because NumPy rejects non-ASCII strings."""
-        if not self._has_text:
+        if not self.definition.has_text:
             return row
         return tuple(encode_text(value) if isinstance(value, str) else value for value in row)
 

@@ -30,8 +30,15 @@ _OUT, _IN = ("fmu", "out"), ("fmu", "in")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
+class _Hashed:
+    """Slot for a hash that is computed once, because each message looks up its address several times."""
+
+    __slots__ = ("_hash",)
+    _hash: int
+
+
 @dataclass(frozen=True, slots=True)
-class Address:
+class Address(_Hashed):
     """The address of a stream: vehicle, topic and, where the topic has instances, the uORB instance.
 
     Addresses sort by these fields; an address without an instance sorts before instance 0.
@@ -47,6 +54,13 @@ class Address:
     def __post_init__(self) -> None:
         check_vehicle(self.vehicle)
         _check_instance(self.topic, self.instance, required=get_topic(self.topic).instances is True)
+        object.__setattr__(self, "_hash", hash((self.vehicle, self.topic, self.instance)))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Address, (self.vehicle, self.topic, self.instance)  # hashes differ between processes
 
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:

@@ -18,7 +18,7 @@ from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.reader import LogReceiver, Received, new_parser, parse
 from nedbus.sources.mavlink.source import _LinkSession
 from nedbus.sources.options import MavlinkOptions
-from nedbus_msgs import BY_TOPIC, Address, codec_of
+from nedbus_msgs import BY_TOPIC, Address
 from tests.peers.px4_log_stream import datagrams
 
 _TICK: Final = 0.25  # s of the recording between two checks of the streams
@@ -120,7 +120,7 @@ class Service:
         return self.now
 
     def _open(self, address: Address, definition: Any, **_: object) -> SimpleNamespace:
-        known = definition or BY_TOPIC[address.topic]
         return SimpleNamespace(
-            definition=known, publish=codec_of(known).encode_fields, close=lambda: None, relabel=lambda _: None
-        )
+            definition=definition or BY_TOPIC[address.topic], source="mavlink",
+            publish_encoded=lambda *_: None, close=lambda: None, relabel=lambda _: None,
+        )  # fmt: skip

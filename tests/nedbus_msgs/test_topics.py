@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 
 import pytest
@@ -175,6 +176,15 @@ def test_errors_can_be_pickled() -> None:
         Address("a b", "vehicle_local_position")
     again = pickle.loads(pickle.dumps(info.value))
     assert (type(again), str(again), again.given) == (AddressError, str(info.value), "a b")
+
+
+def test_address_of_another_process_is_found() -> None:
+    """A pickled address has no hash, which differs between processes; it is hashed anew where it is loaded."""
+    address = Address("7", "battery_status", 1)
+    data = pickle.dumps(address)
+    loaded = pickle.loads(data)
+    assert b"hash" not in data
+    assert {address: "found"}[loaded] == {loaded: "found"}[copy.deepcopy(address)] == "found"
 
 
 def test_address_without_instance_sorts_first() -> None:

@@ -51,6 +51,8 @@ class Codec(Generic[M]):
     `size`: payload size [bytes].
     `tags`: the payload with all values zero, as an integer; `tag_mask`: a mask of the bits that are not values.
     `offsets`: field, array index and payload offset of every value.
+    `encode_flat(values)`: return the payload of valid values, flattened by the validation; raise OverflowError for one
+    beyond the range of its float32 field.
 
     `encode(message)`: return the payload of a message; float32 fields are rounded.
     Raises EncodeError for a value that does not fit its field, in a message whose validation was bypassed.
@@ -69,6 +71,7 @@ class Codec(Generic[M]):
     tags: int
     tag_mask: int
     offsets: tuple[tuple[str, int, int], ...]
+    encode_flat: Callable[[Values], bytes]
     encode: Callable[[M], bytes]
     encode_fields: Callable[[Mapping[str, object]], bytes]
     encode_row: Callable[[Sequence[object]], bytes]
@@ -86,13 +89,15 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
     tags, tag_mask, packed, offsets = _payload_parts(types, head)
     size, pack_flat, unpack_flat = packed.size, packed.pack, packed.unpack
-    unflatten, has_text = validation.unflatten, any(kind.is_text for kind in types.values())
     new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
 
     def pack(row: Values) -> bytes:
         """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
+        return encode_flat(flatten(row))
+
+    def encode_flat(values: Values) -> bytes:
         # The packed struct has zeros for the tags, and `tags` has zeros for the values.
-        return (from_bytes(pack_flat(*flatten(row)), "big") | tags).to_bytes(size, "big")
+        return (from_bytes(pack_flat(*values), "big") | tags).to_bytes(size, "big")
 
     def encode(message: M) -> bytes:
         try:
@@ -129,12 +134,12 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
             return None
         # The tags prove type and range of every value; only the rules are left to check.
-        row: Values = decode_values(payload) if has_text else unpack(payload, use_list=False)[1:]
+        row: Values = decode_values(payload) if definition.has_text else unpack(payload, use_list=False)[1:]
         return row if passes_rules(row) else None
 
     def decode_values(payload: bytes) -> Values:
         """Decode a payload with text, which ends at the first NUL and may contain invalid UTF-8."""
-        return unflatten(unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big")))
+        return validation.unflatten(unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big")))
 
     def decode_any(payload: bytes, newer: NewerLayouts | None) -> M:
         """Decode any msgpack encoding of any known layout."""
@@ -158,7 +163,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
 
     return Codec(
         definition, size, tags, tag_mask, offsets,
-        encode, encode_fields, encode_row, decode, decode_row,
+        encode_flat, encode, encode_fields, encode_row, decode, decode_row,
     )  # fmt: skip
 
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Typ
 
 from .declaration import ALL, RELEASES, Layout, Topic, cached_on_owner
 from .px4_types import NAN, FieldType, field_type
-from .validation import Validation, Values
+from .validation import Validation, Values, positions_of
 
 if TYPE_CHECKING:
     from .message import Message
 
+_MAX_READERS: Final = 64  # types of messages for which a FieldReader keeps a function
 M = TypeVar("M", bound="Message")
 M_co = TypeVar("M_co", bound="Message", covariant=True)
 
@@ -45,15 +46,55 @@ class Row(tuple[Any, ...]):
         return _row, (self.DEFINITION, tuple(self))
 
 
+class FlatRow(tuple[Any, ...]):
+    """The values of a message in order, each element of an array as one value; read them with a FieldReader."""
+
+    __slots__ = ()
+    _positions: ClassVar[Mapping[str, int | slice]] = {}
+
+
+class FieldReader:
+    """Fast access to some fields of models, rows and dicts; a missing field has the value `absent`."""
+
+    def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
+        self.names, self._absent = tuple(names), absent
+        self._readers: dict[type, Callable[[Any], tuple[Any, ...]]] = {}  # by type of message
+
+    def __call__(self, message: object) -> tuple[Any, ...]:
+        """Return the values in the order of `names`."""
+        read = self._readers.get(type(message))
+        if read is None:
+            if len(self._readers) >= _MAX_READERS:
+                self._readers.clear()
+            read = self._readers[type(message)] = self._reader_of(message)
+        return read(message)
+
+    def _reader_of(self, message: object) -> Callable[[Any], tuple[Any, ...]]:
+        """Return a function that reads the fields of messages of this type."""
+        names, absent, positions = self.names, self._absent, getattr(message, "_positions", None)
+        if isinstance(message, Mapping):
+            return lambda fields: tuple([fields.get(name, absent) for name in names])
+        if positions is None and all(hasattr(message, name) for name in names):
+            return attrgetter(*names) if len(names) > 1 else lambda model: (getattr(model, names[0]),)
+        if positions is None:
+            return lambda model: tuple([getattr(model, name, absent) for name in names])
+        known = [positions[name] for name in names if name in positions]
+        if len(known) < len(names):  # the publisher defines the fields of a topic that is not built in
+            return lambda row: tuple([row[positions[name]] if name in positions else absent for name in names])
+        return itemgetter(*known) if len(known) > 1 else itemgetter(slice(known[0], known[0] + 1))
+
+
 class UpgradePlan(NamedTuple):
     """Mapping from the fields of a layout to those of the model.
 
-    `provided`: the model's fields that receive a value, which are the keys of `names` and `converted`.
+    `provided`: the model's fields that receive a value, which are the keys of `names` and `converted`; `missing`: all
+    others.
     `names`: the source field, for each field whose value is copied.
     `converted`: for each other field, the source fields (None for a missing array element) and the conversion.
     """
 
     provided: frozenset[str]
+    missing: frozenset[str]
     names: Mapping[str, str]
     converted: Mapping[str, tuple[Sequence[str | None], Callable[..., Any]]]
 
@@ -62,7 +103,7 @@ class Definition(Generic[M_co]):
     """Metadata of one message, derived from its class.
 
     `name`: its name in PX4, such as VehicleAttitude. `model`: its Pydantic model.
-    `types`: the PX4 type of every field of the model, in order.
+    `types`: the PX4 type of every field of the model, in order; `has_text`: some are char arrays.
     `topics`, `older`: topics and older fields by name. `rules`: the rules for its fields.
     `flags`: for each flag, the fields that are valid while it is true.
     `always`: the fields present in every log, even the oldest. `caches`: see `cached_on_owner`.
@@ -77,6 +118,7 @@ class Definition(Generic[M_co]):
         }
         self.names = tuple(self.types)
         self.all_fields = frozenset(self.names)
+        self.has_text = any(kind.is_text for kind in self.types.values())
         self.topics = {topic.name: topic for topic in model.TOPICS}
         self.older = {old.name: old for old in model.OLDER}
         self.rules = model.RULES
@@ -110,7 +152,13 @@ class Definition(Generic[M_co]):
         """The named tuple class of this message."""
         members: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
         members |= {name: each for name, each in vars(self.model).items() if isinstance(each, property)}
-        return type(f"{self.name}Row", (Row,), {**members, "__slots__": (), "_fields": self.names, "DEFINITION": self})
+        members |= {"_positions": {name: index for index, name in enumerate(self.names)}, "_fields": self.names}
+        return type(f"{self.name}Row", (Row,), {**members, "__slots__": (), "DEFINITION": self})
+
+    @cached_property
+    def flat_row(self) -> type[FlatRow]:
+        """The class of flattened values of this message."""
+        return type(f"{self.name}FlatRow", (FlatRow,), {"__slots__": (), "_positions": positions_of(self.types)})
 
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout with this name or of this PX4 release; None if there is none."""
@@ -155,7 +203,8 @@ class Definition(Generic[M_co]):
                 elif base not in converted:
                     direct.setdefault(base, old.name)
         in_order = {name: direct[name] for name in self.types if name in direct}
-        return UpgradePlan(frozenset({*direct, *converted}), in_order, converted)
+        provided = frozenset({*direct, *converted})
+        return UpgradePlan(provided, self.all_fields - provided, in_order, converted)
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
         """Convert the model's values to a layout, in its order; fields without a fitting value are "not provided"."""

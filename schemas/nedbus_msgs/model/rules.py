@@ -110,8 +110,8 @@ class UnitQuaternion(Rule):
         super().__init__([Check(field, reason, f"(({value}[0] == {value}[0]) and {bad})")])
 
 
-def compile_rules(rules: Sequence[Rule], accessors: Mapping[str, str]) -> Callable[[Any], bool]:
-    """Compile all rules to one predicate on `values`; `accessors`: the expression for each field.
+def expression_of(rules: Sequence[Rule], accessors: Mapping[str, str]) -> str:
+    """Return one expression that is true if `values` pass all rules; `accessors`: the expression for each field.
 
     A single expression avoids a function call per rule.
     """
@@ -121,7 +121,7 @@ def compile_rules(rules: Sequence[Rule], accessors: Mapping[str, str]) -> Callab
         # Fast path: the sum of all guarded fields is almost always finite.
         finite = " + ".join(f"{{{name}}}" for fields in rule.flags.values() for name in fields)
         passed.append(f"(isfinite({finite}) or {right})" if finite else right)
-    return compile_lambda(f"lambda values: {' and '.join(passed) or True}".format_map(accessors))
+    return (" and ".join(passed) or "True").format_map(accessors)
 
 
 def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -145,11 +145,11 @@ def column_checks(rules: Sequence[Rule], **functions: Callable[..., Any]) -> lis
 
 
 @lru_cache(1024)
-def compile_lambda(expression: str, **functions: Callable[..., Any]) -> Callable[[Any], Any]:
+def compile_lambda(expression: str, **functions: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a lambda generated from numbers and field positions, never from data of a peer."""
-    names = {"isfinite": math.isfinite, "squared_norm": _squared_norm, "inf": math.inf, **functions}
+    names = {"isfinite": math.isfinite, "squared_norm": _rounded_norm, "inf": math.inf, "nan": math.nan, **functions}
     code = compile(expression, "<rules>", "eval")  # eval() of a str makes CPython lose a pending Ctrl-C
-    return cast("Callable[[Any], Any]", eval(code, names))  # noqa: S307 - see above
+    return cast("Callable[..., Any]", eval(code, names))  # noqa: S307 - see above
 
 
 def float32(value: float) -> float:
@@ -160,10 +160,15 @@ def float32(value: float) -> float:
         return math.copysign(math.inf, value)
 
 
-def _squared_norm(quaternion: tuple[float, float, float, float]) -> float:
+def squared_norm(quaternion: tuple[float, ...]) -> float:
+    """Return the squared norm of a quaternion."""
+    w, x, y, z = quaternion
+    return w * w + x * x + y * y + z * z
+
+
+def _rounded_norm(quaternion: tuple[float, ...]) -> float:
     """Return the squared norm of a quaternion after rounding to float32."""
     try:
-        w, x, y, z = _QUATERNION.unpack(_QUATERNION.pack(*quaternion))
+        return squared_norm(_QUATERNION.unpack(_QUATERNION.pack(*quaternion)))
     except OverflowError:
         return math.inf
-    return cast("float", w * w + x * x + y * y + z * z)

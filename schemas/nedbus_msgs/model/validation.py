@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
 from .px4_types import FieldType, decode_text, encode_text
-from .rules import Rule, compile_lambda, compile_rules
+from .rules import Rule, compile_lambda, expression_of
 
 _FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
@@ -33,7 +33,8 @@ class Validation:
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
         names, kinds = tuple(types), types.values()
-        self.passes_rules = compile_rules(rules, {name: f"values[{index}]" for index, name in enumerate(names)})
+        accessors = {name: f"values[{index}]" for index, name in enumerate(names)}
+        self.passes_rules = compile_lambda(f"lambda values: {expression_of(rules, accessors)}")
         self.values_of: Callable[[Any], Values] = (
             itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         )
@@ -89,6 +90,21 @@ class Validation:
             for number in (values[name] if kind.is_array else (values[name],)) if kind.base == "float32" else ():
                 if math.isfinite(number) and abs(number) > _FLOAT32_MAX:
                     yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
+
+
+def positions_of(types: Mapping[str, FieldType]) -> dict[str, int | slice]:
+    """Return the position of each field in flattened values, of which each element of an array is one."""
+    positions, count = dict[str, int | slice](), 0
+    for name, kind in types.items():
+        positions[name] = slice(count, count + kind.values) if kind.is_array else count
+        count += kind.values
+    return positions
+
+
+def accessors_of(types: Mapping[str, FieldType]) -> dict[str, str]:
+    """Return an expression for each field of flattened values."""
+    found = positions_of(types).items()
+    return {name: f"values[{at}]" if isinstance(at, int) else f"values[{at.start}:{at.stop}]" for name, at in found}
 
 
 def _flatten_functions(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:

@@ -1,5 +1,6 @@
 """Run the body of a command in a thread until it ends or a signal arrives; also works as PID 1 of a container."""
 
+import gc
 import logging
 import os
 import queue
@@ -69,6 +70,7 @@ def run_until_stopped(
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, on_signal)
     on_terminal = _has_terminal()
+    gc.freeze()  # modules live as long as the process, so collections need not examine them
     thread = threading.Thread(target=run, name="nedbus-run", daemon=True)
     thread.start()
     while thread.is_alive() and not signals:

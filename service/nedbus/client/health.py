@@ -8,17 +8,27 @@ import math
 import time
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from statistics import median
-from typing import Final, Literal, cast, get_args
+from typing import Final, Literal, get_args
 
 from nedbus import clock
 from nedbus.events import format_duration
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus_msgs import DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, describe_flags, get_topic
+from nedbus_msgs import (
+    DEFAULT,
+    DOUBT_FLAGS,
+    RESET_COUNTERS,
+    Address,
+    FieldReader,
+    Message,
+    Quantity,
+    describe_flags,
+    get_topic,
+)
 
 from .sample import Sample
 
@@ -41,6 +51,7 @@ _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
 _ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token counts as gone
 _QUEUED: Final = "log_message"  # PX4's queue may hold old ones, so their timestamps reveal no reboot
 _FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
+_COUNTERS: Final = 1 + len(DOUBT_FLAGS)  # index of the first counter in _FIELDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +96,15 @@ class Health:
         return max(TIMINGS.stale, _FACTOR * (self.usual_interval or 0.0))
 
 
-_FlagCounts = Counter[tuple[str, bool]]  # messages by flag and value; unknown values are not counted
+_FlagCounts = Counter[tuple[bool | None, ...]]  # messages by the values of all flags, None for unknown ones
 
 
 def _flag_shares(counts: _FlagCounts) -> dict[str, float]:
-    known = {flag: counts[flag, True] + counts[flag, False] for flag in DOUBT_FLAGS}
-    return {flag: counts[flag, True] / total for flag, total in known.items() if total}
+    shares, known = {}, [*counts.items()]  # copied: another thread may add to them
+    for index, flag in enumerate(DOUBT_FLAGS):
+        if total := sum(count for flags, count in known if flags[index] is not None):
+            shares[flag] = sum(count for flags, count in known if flags[index]) / total
+    return shares
 
 
 @dataclass(slots=True, eq=False)
@@ -152,6 +166,7 @@ class StreamHealth:
     def __init__(self, topic: str) -> None:
         self._topic = get_topic(topic)
         self._is_position = topic in DEFAULT.topics  # the message that has flags and reset counters
+        self._read = FieldReader(_FIELDS if self._is_position else _FIELDS[:1])
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
@@ -161,7 +176,7 @@ class StreamHealth:
         self._intervals = deque[float](maxlen=_USUAL)  # s between arrivals
         self._usual_rate: float | None = None
         self._flags: _FlagCounts = Counter()
-        self._seen: tuple[Sequence[int], Collection[str]] = (), ()  # counters of the last message, and missing fields
+        self._seen: tuple[tuple[int | None, ...], Collection[str]] = (), ()  # counters of the last, and missing fields
         self._counters: dict[Quantity, int] = {}  # the last known ones
         self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
         self.latencies = Histogram(_LATENCY_BUCKETS)
@@ -169,21 +184,15 @@ class StreamHealth:
 
     def add(
         self,
-        message: Message | Mapping[str, object],
+        message: object,
         *,
         received: int,
         latency: float | None = None,
         lost: int = 0,
         missing: Collection[str] = (),
     ) -> None:
-        """Add a valid message or a mapping of its fields, received at `received` [ns]; `missing` fields are unknown."""
-        names = _FIELDS if self._is_position else _FIELDS[:1]
-        if isinstance(message, Mapping):
-            timestamp, *seen = (cast("int", message.get(name, 0)) for name in names)
-            missing = set(names) - message.keys() if self._is_position else ()
-        else:
-            timestamp, *seen = (getattr(message, name) for name in names)
-        window = self._window
+        """Add a valid message, its row or a mapping of its fields; `missing` fields are unknown; `received` in ns."""
+        values, window = self._read(message), self._window
         if received - window.start >= _WINDOW:
             if window.messages:
                 self._last_window = window
@@ -199,21 +208,18 @@ class StreamHealth:
             window.add_interval(interval)
             self._intervals.append(interval)
         self._received = received
-        rebooted, counters = self._add_time(int(timestamp)), seen[len(DOUBT_FLAGS) :]
-        if rebooted or (counters, missing) != self._seen:
-            self._seen, known = (counters, missing), {} if rebooted else self._counters  # a reboot restarts them
-            for (quantity, name), count in zip(RESET_COUNTERS.items(), counters, strict=False):
-                if name not in missing:
-                    self._resets[quantity] += (count - known.get(quantity, count)) % 256
-                    known[quantity] = count
-            self._counters = known
+        rebooted = self._add_time(int(values[0]))
         if latency is not None:
             window.add_latency(latency)
             self.latencies.add(latency)
-        for flag, is_set in zip(DOUBT_FLAGS, seen, strict=False):
-            if flag not in missing:
-                window.flags[flag, bool(is_set)] += 1
-                self._flags[flag, bool(is_set)] += 1
+        if self._is_position:
+            flags, counters = values[1:_COUNTERS], values[_COUNTERS:]
+            if rebooted or counters != self._seen[0] or missing != self._seen[1]:
+                self._add_counters(counters, missing, rebooted=rebooted)
+            if missing:
+                flags = tuple(None if name in missing else flag for name, flag in zip(DOUBT_FLAGS, flags, strict=True))
+            window.flags[flags] += 1
+            self._flags[flags] += 1
 
     @property
     def usual_interval(self) -> float | None:
@@ -246,6 +252,14 @@ class StreamHealth:
             on_change=self._topic.on_change,
             usual_interval=self.usual_interval,
         )
+
+    def _add_counters(self, counters: tuple[int | None, ...], missing: Collection[str], *, rebooted: bool) -> None:
+        self._seen, known = (counters, missing), {} if rebooted else self._counters  # a reboot restarts them
+        for (quantity, name), count in zip(RESET_COUNTERS.items(), counters, strict=True):
+            if name not in missing and count is not None:
+                self._resets[quantity] += (count - known.get(quantity, count)) % 256
+                known[quantity] = count
+        self._counters = known
 
     def _add_time(self, timestamp: int) -> bool:
         """Track PX4's time; return True for the first timestamp, and for one so far back that it means a reboot."""

@@ -1,13 +1,12 @@
 """Output of a source: validate, publish or reject its messages, and track the health of each stream."""
 
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable, Container
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from nedbus import clock
 from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
@@ -16,7 +15,7 @@ from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import LinkLoad, Rejection, ReplayRun, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
-from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
+from nedbus_msgs import Address, Definition, get_topic
 
 _log = logging.getLogger(__name__)
 
@@ -107,17 +106,18 @@ class SourceOutput:
         for address, definition in islice(run.addresses.items(), _MAX_REPLAYED):
             self.claim(address, definition, lossless=lossless)
 
-    def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
+    def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> _Stream:
         """Open a publisher, or keep one with this definition; raise AddressInUseError if another source has one."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
             if not _differs(definition, stream.publisher.definition):
-                return
+                return stream
             stream.publisher.close()  # another layout, for example of new firmware
             stream.publisher = None
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
+        return stream
 
     def release(self, *, keep: Container[Address] = ()) -> None:
         """Close the publishers of all addresses except `keep`."""
@@ -126,45 +126,47 @@ class SourceOutput:
                 stream.publisher.close()
                 stream.publisher = None
 
-    def publish(self, message: SourceMessage, received: float | None = None) -> None:
+    def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
+        """Publish a message of a replay; claim its address first if it was unknown at the start."""
+        stream, definition = self._streams.get(message.address), message.definition
+        if stream is None and len(self._streams) >= _MAX_REPLAYED:
+            self._reject_excess(message.address, _MAX_REPLAYED)
+            return
+        if stream is None or stream.publisher is None or definition is not stream.publisher.definition:
+            try:
+                stream = self.claim(message.address, definition, lossless=lossless)
+            except AddressInUseError as exc:
+                self.reject(Rejection(str(message.address), str(exc)))
+                return
+        self._publish(message, stream)
+
+    def _publish(self, message: SourceMessage, stream: _Stream, received: float | None = None) -> None:
         """Validate a message of a claimed address, and publish or reject it; `received`: time, by default now."""
-        stream = self._streams[message.address]
-        if stream.publisher is None:
-            raise KeyError(message.address)
+        address, publisher, lost = message.address, stream.publisher, message.lost
+        if publisher is None:
+            raise KeyError(address)
         if message.error is not None:
             self._reject_invalid(message, _NO_MESSAGE, message.error)
             return
-        stream.publisher.relabel(message.source or self._kind)
-        start = time.perf_counter()
+        if (source := message.source or self._kind) != publisher.source:
+            publisher.relabel(source)
+        start = self._now()
         try:
-            fields = upgrade_fields(stream.publisher.definition, message.fields)
-            fields.setdefault("timestamp", None)  # invalid if missing, because this host's time is no substitute
-            stream.publisher.publish(fields)
+            row, payload, provided, missing = message.encode()
+            publisher.publish_encoded(payload, provided)
         except InvalidMessageError as exc:
             field, violation = exc.violations[0]
             self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)  # without values
             return
-        self.durations.add(time.perf_counter() - start)
-        self.published += 1
         now = self._now()
+        self.durations.add(now - start)
+        self.published += 1
         received = now if received is None else received
         latency = now - received if now - received > TIMINGS.lateness else None  # it waited in this service
-        stream.health.add(fields, received=round(received * 1e9), latency=latency, lost=message.lost)
+        stream.health.add(row, received=round(received * 1e9), latency=latency, lost=lost, missing=missing)
         if message.dropout:
-            self._event_log.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
-        self._event_log.add(message.address, fields, clock.steady(), lost=message.lost)
-
-    def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
-        """Publish a message of a replay; claim its address first if it was unknown at the start."""
-        if message.address not in self._streams and len(self._streams) >= _MAX_REPLAYED:
-            self._reject_excess(message.address, _MAX_REPLAYED)
-            return
-        try:
-            self.claim(message.address, message.definition, lossless=lossless)
-        except AddressInUseError as exc:
-            self.reject(Rejection(str(message.address), str(exc)))
-        else:
-            self.publish(message)
+            self._event_log.add_dropout(address.vehicle, message.dropout, clock.steady() - message.dropout)
+        self._event_log.add(address, row, clock.steady(), missing=missing, lost=lost)
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source; claim its address first if necessary."""
@@ -179,18 +181,17 @@ class SourceOutput:
                 self._reject_excess(address, _MAX_ADDRESSES)
                 return
             try:
-                self.claim(address, message.definition)
+                stream = self.claim(address, message.definition)
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
-            stream = self._streams[address]
             if not stream.flaps:
                 text = f"{address} is published{' again' if resumed else ''}"
                 event = "stream_resumed" if resumed else "published"
                 _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
             self._republish_retained(message)
         stream.last_received, stream.last = message.due or self._now(), message
-        self.publish(message, stream.last_received)
+        self._publish(message, stream, stream.last_received)
 
     def expire_stale(self) -> bool:
         """Stop publishing stale live addresses; return True if any address is still published.
@@ -268,7 +269,8 @@ class SourceOutput:
         vehicle = message.address.vehicle
         streams = [(address, stream) for address, stream in self._streams.items() if address.vehicle == vehicle]
         known = [(address, stream, stream.last) for address, stream in streams if stream.last is not None]
-        rebooted = message.rebooted or _timestamp(message) < max((_timestamp(last) for *_, last in known), default=0)
+        newest = max((last.timestamp or 0 for *_, last in known), default=0)
+        rebooted = message.rebooted or (message.timestamp or 0) < newest
         for address, stream, last in known:
             if stream.publisher is not None or get_topic(address.topic).rate:
                 continue
@@ -276,10 +278,10 @@ class SourceOutput:
                 stream.last = None
                 continue
             with suppress(AddressInUseError):
-                self.claim(address, last.definition)
+                claimed = self.claim(address, last.definition)
                 extra = about("stream_resumed", address, source=self._name)
                 _log.info("%s: %s is published again", self._name, address, extra=extra)
-                self.publish(replace(last, lost=0))
+                self._publish(replace(last, lost=0), claimed)
 
     def _count_rejected(self, rule: str, count: int = 1) -> None:
         self.rejected += count
@@ -301,7 +303,3 @@ class SourceOutput:
 def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
     """Return True if a definition has different fields, or the same fields in another order."""
     return new is not None and new is not known and [*new.types.items()] != [*known.types.items()]
-
-
-def _timestamp(message: SourceMessage) -> int:
-    return cast("int", message.fields.get("timestamp", 0))

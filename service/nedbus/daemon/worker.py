@@ -8,11 +8,21 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
 
-from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
+from nedbus.client import Histogram, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.events import EventLog
 from nedbus.log_event import about
-from nedbus.sources import LinkLoad, LiveItem, LiveSource, Rejection, ReplayRun, ReplaySource, Source, UnavailableTopics
+from nedbus.sources import (
+    LinkLoad,
+    LiveItem,
+    LiveSource,
+    Rejection,
+    ReplayRun,
+    ReplaySource,
+    Source,
+    SourceMessage,
+    UnavailableTopics,
+)
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
@@ -241,17 +251,18 @@ class Worker:
                 now = self._message_start = self._clock.now()
                 if self._clock.is_set():
                     return
-                if isinstance(item, Rejection):
+                if isinstance(item, SourceMessage):
+                    self._output.publish_live(item)
+                    if self._state != "running":
+                        self._set_state("running")
+                elif isinstance(item, Rejection):
                     self._output.reject(item)
                 elif isinstance(item, UnavailableTopics):
                     self._output.note(item)
                 elif isinstance(item, LinkLoad):
                     self._output.note_load(item)
-                elif isinstance(item, LogStreamStatus):
-                    self._output.log_streams[item.vehicle] = item
                 elif item is not None:
-                    self._output.publish_live(item)
-                    self._set_state("running")
+                    self._output.log_streams[item.vehicle] = item
                 if now >= next_poll:
                     next_poll = now + _STALE_POLL
                     if not self._output.expire_stale():

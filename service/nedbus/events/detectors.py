@@ -4,9 +4,9 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from operator import attrgetter, itemgetter
 from typing import Any, Final, Literal, cast
 
+from nedbus_msgs import FieldReader
 from nedbus_msgs.messages import LogMessage, VehicleStatus
 
 from . import rules
@@ -53,24 +53,6 @@ Detect = Callable[[Fields, Fields], Iterator[Finding]]
 """Yield findings from the fields of the previous message ({} for the first one) and of the current message."""
 Detection = tuple[Sequence[str], Sequence[str], Detect]
 """Fields whose changes trigger the function, other fields that it needs, and the function."""
-
-
-class FieldReader:
-    """Fast access to fields of a model, a row or a dict; missing fields have the value `absent`."""
-
-    def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
-        self.names, self._absent = tuple(names), absent
-        self._of_message: Callable[[object], tuple[Any, ...]] = attrgetter(*names)
-        self._of_fields: Callable[[Mapping[str, object]], tuple[Any, ...]] = itemgetter(*names)
-
-    def __call__(self, message: object) -> tuple[Any, ...]:
-        """Return the values in the order of `names`."""
-        try:
-            return self._of_fields(message) if type(message) is dict else self._of_message(message)
-        except KeyError:
-            return tuple(cast("Fields", message).get(name, self._absent) for name in self.names)
-        except AttributeError:  # the publisher defines the fields of a topic that is not built in
-            return tuple(getattr(message, name, self._absent) for name in self.names)
 
 
 read_fields: Final = cache(FieldReader)

@@ -76,19 +76,19 @@ class EventLog:
         `missing`: names of fields that were not provided. `lost`: messages lost before this one.
         """
         with self._lock:
-            if vehicle := self._vehicle(address.vehicle, time):
-                vehicle.add(address, message, time, missing=missing, lost=lost)
+            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
+                vehicle.add(address, message, time, missing, lost)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
         """Record a logging dropout of a vehicle that starts at `time`."""
         with self._lock:
-            if known := self._vehicle(vehicle, time):
+            if known := self.vehicles.get(vehicle) or self._new_vehicle(vehicle, time):
                 known.add_dropout(seconds, time)
 
     def reject(self, address: Address, reason: str, time: float) -> None:
         """Record a rejected message."""
         with self._lock:
-            if vehicle := self._vehicle(address.vehicle, time):
+            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
                 vehicle.reject(address.stream, reason, time)
 
     def update(
@@ -165,22 +165,19 @@ class EventLog:
             if event.boot is None and known is not None and known.boot is not None:
                 self._events[number] = replace(event, boot=known.boot + event.time - known.time)
 
-    def _vehicle(self, name: str, time: float) -> Vehicle | None:
-        """Return the vehicle of this name, created if necessary; None if the event log is full."""
-        known = self.vehicles.get(name)
-        if known is None:
-            if self.is_full and time >= self._full_until:
-                self._full_until = time + 1.0
-                self._forget(self._gone(time)[:1])
-            if self.is_full:
-                if not self.refused:
-                    text = "more than %d vehicles: the others have no events; select vehicles with --vehicle"
-                    _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
-                self.refused += 1
-                return None
-            known = self.vehicles[name] = Vehicle(name, self._record, self._common)
-        known.last_seen = time
-        return known
+    def _new_vehicle(self, name: str, time: float) -> Vehicle | None:
+        """Return a new vehicle; None if the event log is full."""
+        if self.is_full and time >= self._full_until:
+            self._full_until = time + 1.0
+            self._forget(self._gone(time)[:1])
+        if self.is_full:
+            if not self.refused:
+                text = "more than %d vehicles: the others have no events; select vehicles with --vehicle"
+                _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
+            self.refused += 1
+            return None
+        vehicle = self.vehicles[name] = Vehicle(name, self._record, self._common)
+        return vehicle
 
     def _gone(self, time: float) -> list[tuple[float, str]]:
         """Return the time last seen and the name of each vehicle not seen for a minute, longest gone first."""

@@ -10,7 +10,7 @@ from functools import partial
 from statistics import median
 from typing import Final
 
-from nedbus_msgs import BY_TOPIC, Address
+from nedbus_msgs import BY_TOPIC, Address, FieldReader
 
 from . import detectors
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
@@ -34,7 +34,7 @@ _MAX_TOPICS: Final = 20  # named in one event
 _GROUPS: Final = (POSITIONS, EVIDENCE["GPS"])
 _EVIDENCE_OF: Final = {topic: name for name, topics in EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
-_read_sample: Final = detectors.FieldReader(_SAMPLE)
+_read_sample: Final = FieldReader(_SAMPLE)
 
 
 class Vehicle:
@@ -77,8 +77,9 @@ class Vehicle:
         self._checked = self._resumed = 0  # time of the last position then, and after its last pause [us since boot]
         self._equal: dict[int, bool] = {}  # by EKF: whether its estimate equals the vehicle's
 
-    def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
+    def add(self, address: Address, message: object, time: float, missing: frozenset[str], lost: int) -> None:
         """Add a message; `lost`: number of messages lost before it."""
+        self.last_seen = time
         if lost:
             self._count("lost", time, lost, address.stream)
         try:
@@ -116,11 +117,13 @@ class Vehicle:
 
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
+        self.last_seen = time
         self._count("dropout", time, round(1e3 * seconds))
         self._main_time = max(self._main_time, time + seconds)
 
     def reject(self, topic: str, reason: str, time: float) -> None:
         """Record a rejected message."""
+        self.last_seen = time
         if "rejected" not in self._bursts:
             self.emit(Finding("rejected", "begin", f"{topic} rejected: {reason}", names=(topic, reason)), topic, time)
         self._count("rejected", time, 1, topic)
@@ -311,7 +314,9 @@ class Vehicle:
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
         """Without EKF_SELECTOR: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
-        vehicle = _read_sample(None if self._position is None else self._position.last)
+        last, absent = (None, ()) if self._position is None else (self._position.last, self._position.missing)
+        values = zip(_SAMPLE, _read_sample(last), strict=True)
+        vehicle = tuple(None if name in absent else value for name, value in values)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
         if self._equal.get(instance) and not self._equal.get(self._ekf, True):

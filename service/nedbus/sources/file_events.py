@@ -15,7 +15,7 @@ from typing import Final, cast
 from nedbus import recording
 from nedbus.errors import InvalidMessageError, SourceError
 from nedbus.events import AIR_DATA, EKF_SELECTOR, EventLog, Times
-from nedbus_msgs import BY_TOPIC, TOPICS, codec_of, upgrade_fields
+from nedbus_msgs import TOPICS
 
 from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
@@ -92,7 +92,7 @@ class Flights:
         """Return the Unix time of the start of a file [s]."""
         ahead = list(islice(run.messages, _LOOKAHEAD))
         run.messages = chain(ahead, run.messages)
-        known = ((each, cast("int", each.fields["timestamp"]) / 1e6) for each in ahead if not each.error)
+        known = ((each, each.timestamp / 1e6) for each in ahead if not each.error)
         times = ((self.times.utc_of_boot(names[each.address.vehicle], boot), each.due) for each, boot in known)
         found = [utc - due for utc, due in times if utc is not None]
         if not found:
@@ -138,11 +138,9 @@ def follow(
             checked += _CHECK_INTERVAL
             update(checked)
         if reason is None:
-            definition = message.definition or BY_TOPIC[message.address.topic]
             try:
-                fields = upgrade_fields(definition, message.fields)
-                payload = codec_of(definition).encode_fields(fields)
-                event_log.add(message.address, fields, due)
+                row, payload, _, missing = message.encode()
+                event_log.add(message.address, row, due, missing=missing)
             except InvalidMessageError as exc:
                 reason = exc.reason
         if reason is not None:

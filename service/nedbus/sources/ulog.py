@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Final, cast
+from typing import Final
 
 from nedbus.recording import UlogReader
 from nedbus.ulog import LOG_MESSAGE, LoggedStream
@@ -38,11 +38,15 @@ def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> Repl
 
 def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptions) -> Iterator[SourceMessage]:
     """Yield the messages of a log, and update its run."""
-    clock = _Clock()
-    for due, stream, fields in clock.pace(reader):
-        run.addresses[stream.address], run.position = stream.definition, reader.position
+    clock, begun = _Clock(), set[LoggedStream]()
+    for due, stream, payload in clock.pace(reader):
+        run.position, address, definition = reader.position, stream.address, stream.definition
+        if stream not in begun:
+            begun.add(stream)
+            run.addresses[address] = definition
         dropout, reader.dropout = reader.dropout, 0.0
-        yield SourceMessage(due, stream.address, fields, definition=stream.definition, dropout=dropout)
+        given = stream.decode(payload) if stream.converted else None  # warns at once if fields are left out
+        yield SourceMessage(due, address, given, 0, False, None, definition, None, dropout, stream, payload)
     warnings = _warnings_of(reader)
     for address, count in clock.unordered.items():
         warnings.append(f"timestamps of {address} are out of order ({count}); the order of the log is kept")
@@ -63,13 +67,13 @@ class _Clock:
         self._now = self._due = self._behind = 0  # us; messages
         self._is_running = False
 
-    def pace(self, reader: UlogReader) -> Iterator[tuple[float, LoggedStream, dict[str, object]]]:
-        """Yield due time [s since the start], stream and fields of each message; due times never decrease."""
+    def pace(self, reader: UlogReader) -> Iterator[tuple[float, LoggedStream, bytes]]:
+        """Yield due time [s since the start], stream and payload of each message; due times never decrease."""
         newest: dict[LoggedStream, int] = {}
-        held: tuple[int, LoggedStream, dict[str, object]] | None = None
+        held: tuple[int, LoggedStream, bytes] | None = None
         for stream, payload in reader.messages():
-            fields = stream.decode(payload)
-            time = cast("int", fields["timestamp"])
+            (timestamp,) = stream.timestamp(payload)
+            time = timestamp or 0
             self._now = self._now or reader.start
             if time < newest.get(stream, 0) and stream.subscription is not LOG_MESSAGE:  # PX4 queues log messages
                 self.unordered[stream.address] += 1
@@ -79,11 +83,15 @@ class _Clock:
                     self._follow(held[0])
                 yield self._due / 1e6, *held[1:]
                 held = None
-            if time > self._now + _MAX_STEP:
-                held = time, stream, fields
+            step = time - self._now
+            if step > _MAX_STEP:
+                held = time, stream, payload
+                continue
+            if step >= 0 and self._is_running:
+                self._due, self._now, self._behind = self._due + step, time, 0
             else:
                 self._follow(time)
-                yield self._due / 1e6, stream, fields
+            yield self._due / 1e6, stream, payload
         if held is not None:
             if held[0] <= self._now + _MAX_GAP:
                 self._follow(held[0])

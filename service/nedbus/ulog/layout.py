@@ -36,36 +36,42 @@ class PayloadField(NamedTuple):
 
 
 class PayloadLayout:
-    """The fields of a logged message; `size`: bytes without trailing padding, which PX4 does not log."""
+    """The fields of a logged message; `size`: bytes without trailing padding, which PX4 does not log.
+
+    `unpack`: return the values in a payload of at least `size` bytes; each element of an array is a value.
+    `bool_mask`: the bits that are 0 because bools are 0 or 1, with the payload read as a little-endian integer.
+    """
 
     def __init__(self, fields: tuple[PayloadField, ...], size: int, padding: int) -> None:
         self.fields, self.size, self.padding = fields, size, padding
-        self._bools = [name for name, kind, _ in fields if kind.base == "bool"]
-        self._texts = [name for name, kind, _ in fields if kind.is_text]
         self._indices: list[tuple[str, int | slice]] = []  # index of each field among the unpacked values
-        code, end, count = "<", 0, 0
+        code, end, count, self.bool_mask = "<", 0, 0, 0
         for name, kind, offset in fields:
             self._indices.append((name, slice(count, count + kind.values) if kind.is_array else count))
-            code += f"{offset - end}x{_struct_format(kind)}"
+            code += f"{offset - end}x{kind.form}"
             end, count = offset + kind.values * kind.size, count + kind.values
-        self._unpack = struct.Struct(code).unpack_from
+            if kind.base == "bool":
+                self.bool_mask |= int.from_bytes(b"\xfe" * kind.values) << 8 * offset
+        self.unpack = struct.Struct(code).unpack_from
 
     def decode(self, payload: bytes) -> dict[str, Any]:
         """Decode a payload of at least `size` bytes; values are int, float, bool, str, or tuples of numbers."""
-        values = self._unpack(payload)
+        values = self.unpack(payload)
         fields: dict[str, Any] = {name: values[index] for name, index in self._indices}
-        for name in self._bools:
-            value = fields[name]
-            fields[name] = _BOOLS[value] if isinstance(value, int) else tuple(map(_BOOLS.__getitem__, value))
-        for name in self._texts:
-            fields[name] = decode_text(fields[name])
+        has_wrong_bool = int.from_bytes(payload, "little") & self.bool_mask
+        for name, kind, offset in self.fields:
+            if kind.is_text:
+                fields[name] = decode_text(fields[name])
+            elif has_wrong_bool and kind.base == "bool":
+                bools = tuple(map(_BOOLS.__getitem__, payload[offset : offset + kind.values]))
+                fields[name] = bools if kind.is_array else bools[0]
         return fields
 
     @property
     def dtype(self) -> Any:
         """Argument for `numpy.dtype` that describes a payload; a bool is a uint8."""
         types = [
-            f"S{kind.size}" if kind.is_text else (f"<{_struct_format(kind)}"[-1], kind.length or ())
+            f"S{kind.size}" if kind.is_text else (f"<{kind.form.replace('?', 'B')}"[-1], kind.length or ())
             for _, kind, _ in self.fields
         ]
         names, _, offsets = zip(*self.fields, strict=True)
@@ -134,8 +140,3 @@ class Formats:
                 continue
             for index in range(length or 1):
                 yield from self._expand(kind, f"{field}." if length is None else f"{field}[{index}].", level + 1)
-
-
-def _struct_format(kind: FieldType) -> str:
-    """Return the struct format of a field; a bool is read as a uint8, which may have any value."""
-    return kind.form.replace("?", "B")

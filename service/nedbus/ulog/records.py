@@ -4,10 +4,10 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, FieldType, define
+from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, Encoded, FieldType, define, record_encoder
 
 from .layout import BASIC_TYPES, FIELD, PayloadLayout
 
@@ -210,8 +210,20 @@ class LoggedStream:
             known = self.definition.known_types.get(name, {kind})
             if kind not in known:
                 self.converted[name] = self.definition.types.get(name) or next(iter(known))
+        at = next((each.offset for each in layout.fields if each.name == "timestamp" not in self.converted), None)
+        self.timestamp: Callable[[bytes], tuple[int | None]] = lambda payload: (self.decode(payload).get("timestamp"),)
+        """Return the timestamp of a message [us], or None if it has none, in a tuple."""
+        if at is not None:
+            self.timestamp = struct.Struct(f"<{at}xQ").unpack_from
         self.omitted: dict[str, str] = {}
         """Warnings for fields left out because a value does not fit the target type, by field name."""
+
+    @cached_property
+    def encode_valid(self) -> Callable[[bytes], Encoded | None]:
+        """A function that validates and encodes a message; it returns None for an invalid one."""
+        layout = self.subscription.layout
+        types = {name: kind for name, kind, _ in layout.fields}
+        return record_encoder(self.definition, types, layout.unpack, layout.bool_mask)
 
     def decode(self, payload: bytes) -> dict[str, Any]:
         """Decode a message; leave out fields whose value does not fit their target type."""

@@ -7,7 +7,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
@@ -62,7 +62,7 @@ class Recording:
         try:
             self.timeline.times = flights.times
             for message, reason, payload in follow(flights.messages(), event_log, ended=flights.ended):
-                address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
+                address, stamp = message.address, message.timestamp or 0
                 entry: bytes | str | int = stamp if reason is None else reason
                 if payload is not None and (is_position(address) or address.topic in _STATUS_TOPICS):
                     entry = payload

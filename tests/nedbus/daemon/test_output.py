@@ -12,7 +12,7 @@ from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
 from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
-from nedbus_msgs import BY_TOPIC, Address, Definition
+from nedbus_msgs import BY_TOPIC, Address, Definition, codec_of
 from tests.flights.messages import VLP
 
 HOME, POSITION, OTHER = Address("1", "home_position"), Address("1", VLP), Address("2", VLP)
@@ -43,16 +43,15 @@ class FakeOutput:
         self.output.expire_stale()
 
     def _open(self, address: Address, definition: Any, **_: object) -> SimpleNamespace:
-        def publish(fields: dict[str, int]) -> None:
+        definition = definition or BY_TOPIC[address.topic]
+
+        def publish(payload: bytes, _: object) -> None:
             if self.failure is not None:
                 raise self.failure
-            self.published.append((address, fields["timestamp"]))
+            self.published.append((address, codec_of(definition).decode(payload).timestamp))
 
         return SimpleNamespace(
-            definition=definition or BY_TOPIC[address.topic],
-            publish=publish,
-            close=lambda: None,
-            relabel=lambda _: None,
+            definition=definition, publish_encoded=publish, close=lambda: None, relabel=lambda _: None, source=""
         )
 
 

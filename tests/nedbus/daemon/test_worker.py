@@ -19,7 +19,7 @@ from nedbus.sources import Rejection, ReplayRun, ReplaySource, Source, SourceMes
 from nedbus.sources.options import RecordedOptions
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition
-from tests.flights.local_position import decode, encode_fields
+from tests.flights.local_position import decode
 from tests.flights.messages import VLP
 
 ONE, TWO = Address("1", VLP), Address("2", VLP)
@@ -63,8 +63,8 @@ class FakeRegistry:
         if address in self.publishers:
             raise AddressInUseError(address)
 
-        def publish(fields: Mapping[str, object]) -> None:
-            self.published.setdefault(address, []).append((self.clock.seconds, decode(encode_fields(fields))))
+        def publish(payload: bytes, _: object) -> None:
+            self.published.setdefault(address, []).append((self.clock.seconds, decode(payload)))
 
         def close() -> None:
             del self.publishers[address]
@@ -72,7 +72,11 @@ class FakeRegistry:
 
         self.log.append(f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}")
         self.publishers[address] = SimpleNamespace(
-            publish=publish, close=close, relabel=lambda _: None, definition=definition or DEFAULT
+            publish_encoded=publish,
+            close=close,
+            relabel=lambda _: None,
+            definition=definition or DEFAULT,
+            source=source,
         )
         return self.publishers[address]
 

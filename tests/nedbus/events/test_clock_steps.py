@@ -42,7 +42,7 @@ class World:
         patch.setattr("nedbus.clock.utc_ns", lambda: round((START + self.now + self.offset) * 1e9))
         patch.setattr("time.monotonic_ns", lambda: round(self.now * 1e9))
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
-        publisher = SimpleNamespace(publish=lambda _: None, close=lambda: None, relabel=lambda _: None)
+        publisher = SimpleNamespace(publish_encoded=lambda *_: None, close=lambda: None, source="px4-zenoh")
         registry = SimpleNamespace(
             reject=lambda *_: None,
             publisher=lambda address, *_, **__: SimpleNamespace(definition=BY_TOPIC[address.topic], **vars(publisher)),

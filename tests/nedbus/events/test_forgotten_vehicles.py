@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from types import SimpleNamespace
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import pytest
 
@@ -50,8 +50,12 @@ class World:
 
     def _publisher(self, address: Address, *_: object, **__: object) -> SimpleNamespace:
         self.open.add(address)
-        known: Any = {"publish": lambda _: None, "relabel": lambda _: None, "close": lambda: self.open.discard(address)}
-        return SimpleNamespace(definition=BY_TOPIC[address.topic], **known)
+        return SimpleNamespace(
+            definition=BY_TOPIC[address.topic],
+            publish_encoded=lambda *_: None,
+            close=lambda: self.open.discard(address),
+            source="px4-zenoh",
+        )
 
     def receive(self, address: Address) -> None:
         sent = message(round(self.now * 1e6) + 1, **VALID)

@@ -8,6 +8,7 @@ import threading
 import time
 from contextlib import suppress
 from functools import partial
+from time import monotonic
 from typing import Final
 
 import zenoh
@@ -18,11 +19,15 @@ from nedbus_msgs import ANY, Address, Topic, get_topic
 
 from .writer import Heartbeats, Writer
 
+_CHECK: Final = 0.005  # s between checks whether any downsampled stream of a vehicle has subscribers
 _LINGER: Final = 60_000_000_000  # ns for which an unmatched writer is kept, so returning readers can recover messages
 
 
 class MatchingListener:
-    """Matching status of a key expression, from a publisher that never publishes. Thread-safe."""
+    """Matching status of a key expression, from a publisher that never publishes. Thread-safe.
+
+    `matched`: the status at the last call of `is_matched`.
+    """
 
     def __init__(self, session: Session, key_expr: str) -> None:
         with translate_zenoh_errors():
@@ -32,7 +37,7 @@ class MatchingListener:
             except BaseException:
                 self._probe.undeclare()
                 raise
-        self._matched = False
+        self.matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
         self._try_recv = self._listener.handler.try_recv
 
@@ -41,10 +46,10 @@ class MatchingListener:
         with self._lock:
             try:
                 if (status := self._try_recv()) is not None:
-                    self._matched = status.matching
+                    self.matched = status.matching
             except zenoh.ZError:  # closed
-                self._matched = False
-            return self._matched
+                self.matched = False
+            return self.matched
 
     def close(self) -> None:
         """Undeclare the listener and its publisher."""
@@ -57,6 +62,7 @@ class Downsampler:
     """Publisher of the downsampled copies of one address; not thread-safe.
 
     `listener`: matched by subscribers of any downsampled stream of the vehicle.
+    `due`: monotonic time before which `put` has nothing to do unless `listener` is known to be matched [s].
     """
 
     def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, listener: MatchingListener) -> None:
@@ -65,12 +71,15 @@ class Downsampler:
         self._topic = get_topic(address.topic)
         self._address_listener: MatchingListener | None = None
         self._streams: list[_Stream] = []
+        self.due = 0.0
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
         if self._address_listener is None:
             if not self.vehicle_listener.is_matched():
+                self.due = monotonic() + _CHECK
                 return
+            self.due = 0.0
             self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
         now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
         is_matched = self._address_listener.is_matched()

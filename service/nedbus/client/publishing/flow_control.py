@@ -16,6 +16,7 @@ from nedbus.timings import TIMINGS
 from nedbus.transport import Replies, send_query
 from nedbus_msgs import ack_key
 
+from .downsampler import MatchingListener
 from .writer import Writer
 
 _log = logging.getLogger(__name__)
@@ -59,6 +60,11 @@ class ReaderProxies:
         self.away: dict[str, float] = {}  # deadline of each reader that the publisher waits for
         self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown reader froze
 
+    @property
+    def is_empty(self) -> bool:
+        """True if no reader is known."""
+        return not (self._matched or self.away)
+
     def update(self, replies: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Update from all replies to a request. `replies`: whether each reader is closed. `now` in seconds.
 
@@ -79,7 +85,7 @@ class ReaderProxies:
 
     def wait_for_link(self, now: float) -> None:
         """Extend all deadlines while the publisher has no router, or after its routers change. `now` in seconds."""
-        if not self._matched and not self.away:
+        if self.is_empty:
             self.away[_UNKNOWN] = now
         self.away = {reader: max(until, now + TIMINGS.return_wait) for reader, until in self.away.items()}
 
@@ -110,11 +116,15 @@ class _Request:
 class FlowControl:
     """The credit of one writer, renewed by acknowledgement requests on `<key>/@ack`, one at a time.
 
+    `check_at`: number of the next message that may have to wait, or after which replies are received.
+    `listener`: matched by the subscribers of a router in this process; without any, no request is necessary.
     `needs_router`: readers are reached through a router; without one, missing replies do not mean that readers left.
     """
 
-    def __init__(self, writer: Writer, window: SharedWindow, *, needs_router: bool) -> None:
-        self._writer, self._shared, self._needs_router = writer, window, needs_router
+    def __init__(
+        self, writer: Writer, window: SharedWindow, *, needs_router: bool, listener: MatchingListener | None = None
+    ) -> None:
+        self._writer, self._shared, self._needs_router, self._listener = writer, window, needs_router, listener
         self.cancelled = threading.Event()  # set to end a wait with ClosedError
         self._lock = threading.Lock()
         self._readers = ReaderProxies()
@@ -123,16 +133,20 @@ class FlowControl:
         self._acknowledged = {False: 0, True: 0}  # number of messages received (False) and read by scripts (True)
         self._window, self._due = WINDOW, WINDOW // _REQUESTS_PER_WINDOW  # messages; number at which a request is due
         self._logged = False
+        self.check_at = 0
 
     def wait_for_credit(self, published: int) -> None:
         """Wait while readers have more than a window of unread messages; raise ClosedError once closed.
 
-        Call it after each message. Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
+        Call it after each message from number `check_at` on.
+        Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
         """
-        has_credit = published < self._due and published - self._acknowledged[True] < self._window
-        if has_credit and published % _POLL_EVERY:
+        if self._listener and not self._listener.is_matched() and self._readers.is_empty and self._request is None:
+            self._acknowledged[True], self._due, self.check_at = published, published, published + _POLL_EVERY
             return
         if self._wait(published, self._window, read=True, timeout=_TRICKLE_PERIOD):
+            next_poll = self._due if self._request is None else published + _POLL_EVERY
+            self.check_at = min(next_poll, self._due, self._acknowledged[True] + self._window)
             return
         if not self._logged:
             _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow_reader"))
@@ -193,4 +207,4 @@ class FlowControl:
             self._acknowledged[request.read] = request.number
 
     def _routers(self) -> list[str]:
-        return sorted(map(str, self._writer.session.info.routers_zid()))
+        return sorted(map(str, self._writer.session.info.routers_zid())) if self._needs_router else []

@@ -60,7 +60,12 @@ class Publisher(AbstractContextManager["Publisher"]):
         topic = get_topic(address.topic)
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
-        self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
+        self._listener = None
+        if lossless and not registry.is_client:
+            self._listener = MatchingListener(heartbeats.session, self.key)
+        self._flow_control = FlowControl(
+            self._writer, registry.window, needs_router=registry.is_client, listener=self._listener
+        )
         self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
         try:
             with translate_zenoh_errors():  # last: readers may use all of the above once they see the token
@@ -97,11 +102,11 @@ class Publisher(AbstractContextManager["Publisher"]):
         that bypassed validation, ClosedError once the publisher or its bus is closed.
         """
         if isinstance(message, self.definition.model):
-            self._put(self._codec.encode(message), message.__pydantic_fields_set__)
+            self.publish_encoded(self._codec.encode(message), message.__pydantic_fields_set__)
         elif isinstance(message, (dict, Mapping)):  # dict first, which is faster
             if "timestamp" not in message:
                 message = {"timestamp": time.monotonic_ns() // 1000, **message}
-            self._put(self._codec.encode_fields(message), message.keys())
+            self.publish_encoded(self._codec.encode_fields(message), message.keys())
         else:
             name, given = self.definition.name, type(message).__name__
             raise TypeError(f"{self.address} carries {name}: publish a {name} or a dict of its fields, not {given}")
@@ -111,7 +116,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
         Equivalent to `publish` with these fields, but faster: no message object is created. Raises the same errors.
         """
-        self._put(self._codec.encode_row(cast("Sequence[object]", values)), self._all)
+        self.publish_encoded(self._codec.encode_row(cast("Sequence[object]", values)), self._all)
 
     def publish_many(self, messages: MessageArray) -> None:
         """Validate a structured array of shape (n,) and dtype DTYPE, then publish its messages in order.
@@ -130,7 +135,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
         for start in range(0, len(payloads), size):
-            self._put(payloads[start : start + size], self._all)
+            self.publish_encoded(payloads[start : start + size], self._all)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers in mode "every" have received all messages; return False on timeout.
@@ -158,25 +163,32 @@ class Publisher(AbstractContextManager["Publisher"]):
             self._writer.close()
             self._registry.forget(self.address)
             self._downsampler.close()
+            if self._listener is not None:
+                self._listener.close()
             with suppress(zenoh.ZError):  # the session is already closed
                 self._token.undeclare()
 
     def __exit__(self, exc: object, *_: object) -> None:
         self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
-    def _put(self, payload: bytes, provided: Set[str]) -> None:
+    def publish_encoded(self, payload: bytes, provided: Set[str]) -> None:
+        """Publish a payload that a codec has validated and encoded; `provided`: the fields that its source provides."""
         require_unforked()
-        encoding, is_whole = self._encoding, len(provided) == len(self._all)
-        if not is_whole:
-            if provided != self._partial[0]:  # rare: usually the same fields are missing
+        encoding = self._encoding
+        if len(provided) != len(self._all):
+            if (
+                provided is not self._partial[0] and provided != self._partial[0]
+            ):  # rare: usually the same fields are missing
                 self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
+        writer, downsampler = self._writer, self._downsampler
         try:
             stamp = self._new_timestamp()
-            self._writer.put(payload, stamp, None if encoding is self._declared else encoding)
+            writer.put(payload, stamp, None if encoding is self._declared else encoding)
             self.last = payload, stamp, encoding
-            self._downsampler.put(payload, stamp, encoding)
+            if writer.last_put >= downsampler.due or downsampler.vehicle_listener.matched:
+                downsampler.put(payload, stamp, encoding)
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc
-        if self.lossless:
-            self._flow_control.wait_for_credit(self.published)
+        if self.lossless and writer.published >= self._flow_control.check_at:
+            self._flow_control.wait_for_credit(writer.published)

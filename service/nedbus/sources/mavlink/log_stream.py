@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import BinaryIO, Final
 
 from nedbus import clock, ulog
 from nedbus.client import LogStreamStatus
@@ -123,10 +123,10 @@ class LogStream:
                 stream = self._streams[record.subscription]
                 if stream is not None:
                     reported = len(stream.omitted)
-                    fields = stream.decode(record.payload)
+                    message = self._message(stream, record.payload, now)
                     for name, reason in [*stream.omitted.items()][reported:]:
                         yield Rejection(f"{self._name} {name}", reason, count=0)
-                    yield self._message(stream, fields, now)
+                    yield message
             elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
             elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
@@ -239,11 +239,13 @@ class LogStream:
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
         self._streams[subscription] = stream
 
-    def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
+    def _message(self, stream: ulog.LoggedStream, payload: bytes, now: float) -> SourceMessage:
         self._streamed.add(stream.address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
-        definition = stream.definition
-        return SourceMessage(now, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
+        given, definition = stream.decode(payload) if stream.converted else None, stream.definition
+        return SourceMessage(
+            now, stream.address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload
+        )
 
     def _count_gap(self, lost: int) -> None:
         self._gaps += 1

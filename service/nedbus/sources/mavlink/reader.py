@@ -1,8 +1,9 @@
 """Readers of a link: LinkReader yields the messages of autopilots, LogReceiver queues them for the source."""
 
+import struct
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -27,6 +28,11 @@ COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _MAX_VEHICLES: Final = 100  # per link
 _SIGNATURE: Final = 13  # bytes
 _DECODED: Final = {number for number, each in dialect.mavlink_map.items() if each.msgname in DECODED}
+_HEADER: Final = 10  # bytes
+_LOG_HEADER: Final = struct.Struct("<H4B")  # the fields before the data
+_LOG_DATA: Final[Mapping[int, str]] = {
+    number: each.msgname for number, each in dialect.mavlink_map.items() if each.msgname.startswith("LOGGING_DATA")
+}
 _TICK: Final = 0.05  # s, the longest wait of the thread
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
@@ -66,19 +72,56 @@ def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterat
             yield Rejection(f"{name} system {system} component {component}", reason)
 
 
+class _LogData:
+    """LOGGING_DATA or LOGGING_DATA_ACKED in a MAVLink 2 frame."""
+
+    def __init__(self, number: int, frame: bytes, end: int) -> None:
+        self._number, self._frame = number, frame
+        fields = _LOG_HEADER.unpack_from(frame[_HEADER:end].ljust(_LOG_HEADER.size, b"\0"))  # zeros are not sent
+        self.sequence, self.target_system, self.target_component, self.length, self.first_message_offset = fields
+        self.data = frame[_HEADER + _LOG_HEADER.size : end]
+
+    def get_type(self) -> str:
+        """Return the name of the message, as pymavlink does."""
+        return _LOG_DATA[self._number]
+
+    def get_msgId(self) -> int:  # noqa: N802 - pymavlink's name
+        """Return the number of the message, as pymavlink does."""
+        return self._number
+
+    def get_msgbuf(self) -> bytes:
+        """Return the frame, as pymavlink does."""
+        return self._frame
+
+
 class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
-    """Decode only the messages that nedbus uses; of others, only the header, as if the dialect lacked them."""
+    """Decode only the messages that nedbus uses; of others, only the header, as if the dialect lacked them.
+
+    Pymavlink takes 20 us for ULog data, and reads each datagram twice; here that takes a fifth of the time.
+    """
+
+    def parse_buffer(self, data: bytes) -> Any:
+        """Return the messages that these bytes complete, None without any."""
+        size = len(data) - _HEADER - 2
+        if size < 0 or data[:3] != bytes([dialect.PROTOCOL_MARKER_V2, size % 256, 0]) or size > 255 or self.buf_len():
+            return super().parse_buffer(data)
+        try:
+            return [self.decode(bytearray(data))]
+        except dialect.MAVError as exc:
+            return [dialect.MAVLink_bad_data(data, exc.message)]
 
     def decode(self, msgbuf: bytearray) -> Any:
         """Return a message; raise MAVError if it is damaged."""
         is_v2 = msgbuf[0] == dialect.PROTOCOL_MARKER_V2
         number = int.from_bytes(msgbuf[7:10], "little") if is_v2 else msgbuf[5]
-        if number in _DECODED or number not in dialect.mavlink_map:
+        if number not in dialect.mavlink_map or (number in _DECODED and number not in _LOG_DATA):
             return super().decode(msgbuf)
         end = len(msgbuf) - 2 - _SIGNATURE * (is_v2 and bool(msgbuf[2] & dialect.MAVLINK_IFLAG_SIGNED))
         checked = msgbuf[1:end] + bytes([dialect.mavlink_map[number].crc_extra])
         if dialect.x25crc(checked).crc != int.from_bytes(msgbuf[end : end + 2], "little"):
             raise dialect.MAVError("invalid CRC")
+        if number in _LOG_DATA:
+            return _LogData(number, bytes(msgbuf), end)
         return dialect.MAVLink_unknown(number, msgbuf)
 
 
@@ -156,7 +199,8 @@ class LogReceiver:
             ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
             client = LogStreamClient(options.log, **ids, header=options.header)
             vehicle = self.vehicles[system] = _Vehicle(system, client, received.peer)
-        received = received._replace(lost=vehicle.sequence.add(received.sequence, now))
+        if lost := vehicle.sequence.add(received.sequence, now):
+            received = received._replace(lost=lost)
         return self._follow_stream(vehicle, received) if self._options.log else received
 
     def _follow_stream(self, vehicle: _Vehicle, received: Received) -> Received | Rejection:

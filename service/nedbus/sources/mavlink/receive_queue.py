@@ -62,7 +62,7 @@ class _VehicleQueue:
         chunk = received.chunk
         lost, self.lost = received.lost + self.lost, 0
         if chunk is None or not (self.is_cut or chunk.begins):
-            return received._replace(lost=lost)
+            return received._replace(lost=lost) if lost != received.lost else received
         self.is_undefined = self.is_undefined and not chunk.begins
         is_delivered = chunk.verdict == "delivered" and not self.is_undefined
         if is_delivered and chunk.offset < len(chunk.data):
@@ -167,7 +167,7 @@ class ReceiveQueue:
         dropped = self._dropped + lost_by_host
         if wait > _LATE or dropped > self._load.dropped:
             self._longest_wait, self._overload_end = max(wait, self._longest_wait), now + _MEMORY
-        elif now < self._overload_end:
+        elif now < self._overload_end or not (self._load.overload or dropped != self._load.dropped):
             return self._load
         if now >= self._overload_end:
             self._longest_wait = 0.0

@@ -122,13 +122,16 @@ class _LinkSession:
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
             log.add_timesync(message.tc1, message.ts1, now)
-        converted = vehicle.handle(message, now, log)
+        converted = vehicle.handle(message, now, log) if chunk is None else None
         streamed = log.add(chunk, now) if log and chunk else ()
         for each in chain([converted] if converted else [], streamed):
-            item = vehicle.report(each, log) if isinstance(each, SourceMessage) else each
-            if log is not None and isinstance(item, SourceMessage) and item.source:
-                log.add_delay(item.fields.get("timestamp"), time.monotonic())
-            if isinstance(item, SourceMessage) and item.rebooted:
+            if not isinstance(each, SourceMessage):
+                yield each
+                continue
+            item = vehicle.report(each, log)
+            if log is not None and item.source:
+                log.add_delay(item.timestamp, time.monotonic())
+            if item.rebooted:
                 address = Address(item.address.vehicle, DEFAULT_TOPIC)
                 extra = about("rebooted", address, source=self._name)
                 _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)

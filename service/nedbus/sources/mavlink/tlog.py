@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
@@ -68,7 +68,7 @@ class TlogReader:
                     found = SourceMessage(item.time, found.address, {}, error=found.reason)
                 elif found.rebooted or found.address.vehicle not in {each.vehicle for each in self.definitions}:
                     # The message may have the time of an old sample.
-                    self._boots.add(stamp - (vehicle.clock.newest or cast("int", found.fields["timestamp"])))
+                    self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
                 self.definitions.setdefault(found.address, BY_TOPIC[found.address.topic])
                 yield replace(found, due=item.time)
         if not self.definitions:

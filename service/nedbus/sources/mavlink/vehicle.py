@@ -91,7 +91,7 @@ class Vehicle:
         self._last_message = 0.0
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self._rebooted = False
-        self._text_limit = RateLimit()
+        self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
 
@@ -119,7 +119,9 @@ class Vehicle:
 
     def report(self, message: SourceMessage, log: LogStream | None = None) -> SourceMessage:
         """Add the losses and the reboot that were not reported yet; during a ULog stream only losses of others."""
-        lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
+        lost = self.lost
+        if lost and log is not None and log.is_streaming:
+            lost = min(lost, self._certain)
         if not (lost or self._rebooted):
             return message
         rebooted, self._rebooted, self.lost, self._certain = self._rebooted, False, self.lost - lost, 0
@@ -158,7 +160,7 @@ class Vehicle:
             self._arrivals[number] = now
         is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
         self._store_fields(kind, message, timestamp, now)
-        address = Address(self._name, LOG_MESSAGE.name)
+        address = self._text_address
         if kind == "STATUSTEXT" and address.topic in self._topics and not (log and log.delivers(address)):
             if not self._text_limit.admits(round(now * 1e6)):
                 return Rejection(str(address), "more than 100 log messages per second", address)

@@ -16,6 +16,7 @@ import zenoh
 
 from nedbus.client.protocol import CLOSED
 from nedbus.client.publishing import flow_control as module
+from nedbus.client.publishing.downsampler import MatchingListener
 from nedbus.client.publishing.flow_control import FlowControl, SharedWindow
 from nedbus.client.publishing.writer import Writer
 from nedbus.timings import TIMINGS, Timings
@@ -84,13 +85,19 @@ class FakeSession:
     dropping: bool = False  # a full queue drops all requests
 
     def flow_control(
-        self, monkeypatch: pytest.MonkeyPatch, timings: Timings, *, needs_router: bool = True
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        timings: Timings,
+        *,
+        needs_router: bool = True,
+        is_matched: Callable[[], bool] | None = None,
     ) -> FlowControl:
-        """Return a FlowControl on this session and clock."""
+        """Return a FlowControl on this session and clock; `is_matched`: whether the router has subscribers."""
         timings.credit_polls = 0.0005, _TICK
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
-        return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)
+        listener = cast("MatchingListener", SimpleNamespace(is_matched=is_matched)) if is_matched else None
+        return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router, listener=listener)
 
     def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
         """Publish `count` messages, at `rate` [Hz] while there is credit."""
@@ -98,7 +105,8 @@ class FakeSession:
             self.advance(1 / rate)
             self.published += 1
             self.sent.append(self.now)
-            control.wait_for_credit(self.published)
+            if self.published >= control.check_at:
+                control.wait_for_credit(self.published)
 
     def schedule(self, seconds: float, action: Callable[[], object]) -> None:
         """Schedule an action after `seconds`."""

@@ -49,6 +49,37 @@ def test_publisher_without_readers_never_waits(
     assert session.now == pytest.approx(1.0)
 
 
+def test_publisher_asks_nobody_until_its_key_has_a_subscriber(
+    session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
+    """With the router in its process, a publisher requests nothing without a subscriber, and the first one at once."""
+    control = session.flow_control(monkeypatch, timings, needs_router=False, is_matched=lambda: bool(session.readers))
+    session.publish(control, 10_000)
+    assert not session.requests
+    session.readers.append(Reader("stuck", rate=0.0, read=10_000))
+    session.publish(control, WINDOW)
+    assert int(session.requests[0]["number"]) in range(10_000, 10_016)
+    with pytest.raises(Stuck):
+        session.publish(control, 10_000)
+    assert session.published - 10_000 == pytest.approx(LIMIT, abs=16)
+
+
+def test_flow_control_of_a_known_reader_does_not_depend_on_its_subscription(
+    session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
+    """A reader that loses its link also loses its subscription; the publisher waits for its return as ever."""
+    reader = Reader("cut")
+    control = session.flow_control(
+        monkeypatch, timings, needs_router=False, is_matched=lambda: reader.is_linked(session.now)
+    )
+    session.readers.append(reader)
+    session.publish(control, 5000)
+    reader.alive = False
+    session.schedule(TIMINGS.return_wait / 2, lambda: setattr(reader, "alive", True))
+    session.publish(control, 10_000)
+    assert session.now > TIMINGS.return_wait / 2
+
+
 def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
     """The publisher requests an acknowledgement every 250 messages, and never waits for a fast reader."""
     session.readers.append(Reader("fast"))

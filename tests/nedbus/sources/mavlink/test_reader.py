@@ -165,3 +165,45 @@ def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopil
         wait_for(lambda: autopilot.starts == 1, what="the first START")
         autopilot.send(*autopilot.pack(*messages(3900), heartbeat()))
         wait_for(lambda: autopilot.starts == 2, what="START after the reboot")
+
+
+def data_frames() -> Iterator[bytes]:
+    """Yield frames of ULog data: full, short, and with zeros at the end, which MAVLink 2 does not transmit."""
+    mav = dialect.MAVLink(None, 9, 1)
+    for data in (bytes(range(249)), b"abc" + bytes(246), bytes(249)):
+        for kind in (dialect.MAVLink_logging_data_message, dialect.MAVLink_logging_data_acked_message):
+            for target, sequence, length, offset in ((245, 65_535, 249, 255), (0, 0, 3, 0)):
+                yield bytes(kind(target, target, sequence, length, offset, data).pack(mav))
+
+
+def test_data_of_the_ulog_stream_is_decoded_as_by_pymavlink() -> None:
+    """Frames of ULog data have the same fields as pymavlink decodes, in a datagram of one frame and of several."""
+    names = ("target_system", "target_component", "sequence", "length", "first_message_offset")
+    frames = list(data_frames())
+    reference = dialect.MAVLink(None)
+    for datagrams in (frames, [b"".join(frames)]):
+        found = [each for data in datagrams for each in parse(new_parser(), data, "link", None, 0.0)]
+        assert len(found) == len(frames)
+        for received, frame in zip(found, frames, strict=True):
+            assert isinstance(received, Received)
+            expected: Any = reference.parse_char(frame)
+            assert [getattr(received.message, name) for name in names] == [getattr(expected, name) for name in names]
+            data = received.message.data.ljust(249, b"\0")
+            assert (received.message.get_type(), received.message.get_msgId()) == (
+                expected.get_type(),
+                expected.get_msgId(),
+            )
+            assert (list(data), received.system) == (list(expected.data), 9)
+
+
+def test_damaged_data_of_the_ulog_stream_is_rejected() -> None:
+    """A frame of ULog data with a flipped bit in data or checksum is rejected, and the next frame is read."""
+    frames = list(data_frames())
+    for index in range(10, len(frames[0])):
+        damaged = bytearray(frames[0])
+        damaged[index] ^= 1
+        found = list(parse(new_parser(), bytes(damaged), "link", None, 0.0))
+        assert not any(isinstance(each, Received) for each in found), index
+    parser = new_parser()
+    mixed = [*parse(parser, bytes(damaged), "link", None, 0.0), *parse(parser, frames[1], "link", None, 0.0)]
+    assert [isinstance(each, Received) for each in mixed] == [False, True]
