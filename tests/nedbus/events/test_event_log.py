@@ -529,8 +529,8 @@ def test_single_wild_position_is_no_jump(flight: Flight) -> None:
         (
             0.1,
             {"z": -12.0, "vz": -20.0, "z_reset_counter": 1, "delta_z": -10.2},
-            "height by 10.2 m",
-        ),  # delta plus motion
+            "height by 11.0 m",
+        ),  # minus the motion at the mean velocity
         (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
         (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
