@@ -105,8 +105,8 @@ class Vehicle:
         # PX4's log messages are queued, and a log may begin with old ones, so their timestamps reveal no reboot.
         is_dated = type(detector) is not detectors.TextDetector
         if is_dated and (stamp < before - _REBOOT or self._suspect is not None):
-            found = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
-            found = detector.add(message, missing) if found is None else found
+            known = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
+            found = detector.add(message, missing) if known is None else iter(known)
         self._emit_all(found or (), address, time)
 
     def add_dropout(self, seconds: float, time: float) -> None:
@@ -346,8 +346,10 @@ class Vehicle:
 
     def _check_reboot(self, new: _Suspect, stamp: int, earlier: int, time: float) -> list[Finding] | None:
         """Return the findings to report now; None after a reboot, which a second message must confirm."""
-        # If the message before the previous one is close in time, only the previous one was damaged.
-        is_earlier = stamp < new.before - _REBOOT and not 0 < earlier <= stamp + _REBOOT
+        # Only the previous message was damaged unless another one before it, or of another stream, is later as well.
+        others = (each for at, each in self._detectors.items() if each is not None and at != new.address)
+        support = earlier or max((max(each.stamp, each.earlier) for each in others), default=0)
+        is_earlier = min(new.before, support) > stamp + _REBOOT
         if (old := self._suspect) is None:
             self._suspect = new if is_earlier else None
             return [] if is_earlier else new.found

@@ -152,8 +152,8 @@ def _stable_parts(times: Any, offsets: Any) -> list[Any] | None:
     medians = np.median([times[:-2], times[1:-1], times[2:]], axis=0)  # without single wild values
     if (np.diff(medians) < -_TOLERANCE).any():
         return None  # several boots
-    parts = list[Any]()
-    while len(offsets):
+    parts, few = list[Any](), (1 - _AGREEING) * len(offsets)
+    while len(offsets) > few:
         tail = offsets[-max(1, int(_TAIL * len(offsets))) :]
         is_late = _is_near(offsets, tail)
         begin = int(np.argmax(np.append(0, np.cumsum(np.where(is_late, -1, 1)))))

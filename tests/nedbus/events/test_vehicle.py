@@ -118,6 +118,14 @@ def test_single_low_timestamp_is_not_a_reboot(vehicle: SimpleVehicle, stamp: int
     assert vehicle.state(7.0) == "bad"
 
 
+def test_wild_first_timestamp_is_not_a_reboot(vehicle: SimpleVehicle) -> None:
+    """If only the first message of the only stream was later, that time was wrong, and the vehicle did not reboot."""
+    vehicle.send(0.0, timestamp=10**11)
+    for second in range(1, 5):
+        vehicle.send(float(second))
+    assert vehicle.reported == []
+
+
 def test_second_stream_confirms_a_reboot(vehicle: SimpleVehicle) -> None:
     """Two streams whose time went back show a reboot, and the first one keeps what it reported."""
     status = {"arming_state": 2, "nav_state": 4, "failsafe": False}
@@ -184,6 +192,7 @@ def test_worse_warning_ends_the_previous_one(vehicle: SimpleVehicle) -> None:
 def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
     """Two faults within a minute have one story each; an end event belongs to the story of its begin event."""
     vehicle.send(0.0)
+    vehicle.send(0.1)
     vehicle.send(1.0, timestamp=1_000_000, xy_reset_counter=0)
     vehicle.send(1.05, timestamp=1_050_000, xy_reset_counter=0)
     vehicle.send(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)

@@ -268,6 +268,16 @@ def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
         nedbus.utc_of(tmp_path / "two.mcap")
 
 
+@pytest.mark.parametrize("wild", [10**11, 9 * 10**18])
+@pytest.mark.parametrize("index", [0, 20, 40])
+def test_single_wild_timestamp_does_not_extend_a_table(wild: int, index: int) -> None:
+    """At a rate, the rows span the messages without a few wild timestamps."""
+    positions = np.repeat(POSITIONS, 10)[:41]
+    positions["timestamp"] = 1_000_000 + 100_000 * np.arange(41)
+    positions["timestamp"][index] = wild
+    assert 40 <= len(nedbus.align({VLP: positions}, on=10.0)) <= 41
+
+
 def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     """Values before the first message are null, arrays have a column per element, and `utc` has a time zone."""
     pytest.importorskip("pandas")
@@ -346,6 +356,7 @@ _OFF = 2_000_000
         ([-18_000_000] * 30 + [_OFF] * 10 + [0] * 30, -_OFF),
         ([_OFF] * 20 + [0] * 20 + [10**13] + [0] * 19, -_OFF),  # one wild value
         ([0] * 8 + [_OFF] * 3 + [0], None),
+        ([-(10**11)] + [_OFF] * 20 + [0] * 20, -_OFF),  # a wild first value
         ([_OFF, 0] * 10, None),  # two receivers in one stream
         ([300_000 * number for number in range(40)], None),  # a drift
         ([30_000_000] * 20 + [0] * 20, None),  # another boot
