@@ -44,6 +44,16 @@ def test_nested_messages_are_flattened_and_hashed() -> None:
     assert list(many.types) == ["timestamp", "parts_0_of", "parts_0_is", "parts_1_of", "parts_1_is"]
 
 
+def test_byte_and_char_are_hashed_as_in_ros_2() -> None:
+    """A byte has a type id of its own in ROS 2, but its values are those of a uint8, like those of a char."""
+    text = "uint64 timestamp\n{0} flags\n{0}[2] more\n"
+    hashes = {kind: hash_of_msg("Probe", text.format(kind)) for kind in ("uint8", "byte")}
+    assert hashes["uint8"] != hashes["byte"]
+    single = "uint64 timestamp\n{} flags\n"
+    assert hash_of_msg("Probe", single.format("char")) == hash_of_msg("Probe", single.format("uint8"))
+    assert define_msg("Probe", text.format("byte")).types == define_msg("Probe", text.format("uint8")).types
+
+
 def test_annotations_become_rules() -> None:
     """@range bounds a value or each array element, @invalid names the value for "unknown", and units are kept."""
     text = """

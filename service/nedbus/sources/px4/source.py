@@ -20,7 +20,17 @@ from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Rejection, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session, Tls, TopicKey
-from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
+from nedbus_msgs import (
+    LITERAL_CHAR,
+    Address,
+    Definition,
+    bases_of_msg,
+    dds_type,
+    decode_with,
+    define_msg,
+    hash_of_msg,
+    ros2_type,
+)
 
 from .streams import Definitions, NotAcceptedError, StreamRegistry
 
@@ -143,7 +153,13 @@ class Px4ZenohNode:
                 if form.unknown:
                     names, extra = ", ".join(form.unknown), about("newer_layout", stream.address, source="px4-zenoh")
                     _log.warning("%s: left out unknown fields %s; update nedbus", stream.key, names, extra=extra)
-            definition, layout, unknown = form
+                if form.is_literal:
+                    extra = about("notice", stream.address, source="px4-zenoh")
+                    text = (
+                        "%s: this publisher's type hash takes char literally, unlike ROS 2, whose nodes do not match it"
+                    )
+                    _log.warning(text, stream.key, extra=extra)
+            definition, layout, unknown, _ = form
             address = stream.address
             attachment = None if sample.attachment is None else transport.Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
@@ -212,7 +228,7 @@ def _read_definitions(paths: str) -> Definitions:
 
     Raises ConfigError for an unreadable file, or with line and column for an invalid one.
     """
-    found: dict[str, dict[str, Definition[Any]]] = {}
+    found: dict[str, dict[tuple[str, str], Definition[Any]]] = {}
     skipped: list[str] = []
     for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
         files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
@@ -222,7 +238,8 @@ def _read_definitions(paths: str) -> Definitions:
         for file in files or [path]:
             try:
                 text = _with_nested_messages(file)
-                definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
+                definition = define_msg(file.stem, text)
+                hashes = hash_of_msg(file.stem, text), hash_of_msg(file.stem, text, char=LITERAL_CHAR)
             except OSError as exc:
                 raise ConfigError(str(file), (exc.strerror or str(exc)).lower(), key="msg") from None
             except ValueError as exc:  # such as MsgError
@@ -230,7 +247,7 @@ def _read_definitions(paths: str) -> Definitions:
                     raise ConfigError(str(file), str(exc), key="msg") from None
                 skipped.append(f"{file.stem} ({exc})")
                 continue
-            found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
+            found.setdefault(dds_type(ros2_type(definition)), {})[hashes] = definition
     if skipped:
         extra = about("damaged", source="px4-zenoh")
         _log.info("px4-zenoh: skipped unsupported definitions in %s: %.2000s", paths, ", ".join(skipped), extra=extra)

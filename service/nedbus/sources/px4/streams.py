@@ -16,6 +16,7 @@ from nedbus_msgs import (
     Layout,
     dds_type,
     get_topic,
+    has_literal_char,
     is_vehicle_input,
     message_of_type_hash,
     ros2_types,
@@ -32,7 +33,8 @@ _SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after whic
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each vehicle its own namespace or domain"
 
-Definitions = Mapping[str, Mapping[str, Definition[Any]]]  # supplied by the user, by DDS type and ROS 2 type hash
+# Supplied by the user, by DDS type and ROS 2 type hash, the latter also with LITERAL_CHAR.
+Definitions = Mapping[str, Mapping[tuple[str, str], Definition[Any]]]
 
 
 class NotAcceptedError(Exception):
@@ -40,11 +42,15 @@ class NotAcceptedError(Exception):
 
 
 class WireFormat(NamedTuple):
-    """Definition and layout of a stream's messages; `unknown`: fields of a newer layout, by name or type."""
+    """Definition and layout of a stream's messages.
+
+    `unknown`: fields of a newer layout, by name or type. `is_literal`: the type hash takes `char` literally.
+    """
 
     definition: Definition[Any]
     layout: Layout
     unknown: tuple[str, ...]
+    is_literal: bool
 
 
 @dataclass(slots=True, eq=False)
@@ -138,7 +144,9 @@ class StreamRegistry:
         """Return the format of a stream's messages; raise NotAcceptedError if it is unknown."""
         definition, layout = self._layout_of(stream.key, stream.address.topic)
         unknown = tuple(name for name, kind in layout.types.items() if kind not in definition.known_types.get(name, ()))
-        stream.wire_format = WireFormat(definition, layout, unknown)
+        digest, supplied = stream.key.type_hash, self._supplied.get(stream.key.dds_type, {})
+        is_literal = has_literal_char(digest) or any(literal == digest != own for own, literal in supplied)
+        stream.wire_format = WireFormat(definition, layout, unknown, is_literal)
         stream.reboots = self._reboots.get(stream.address.vehicle, 0)
         return stream.wire_format
 
@@ -247,14 +255,14 @@ class StreamRegistry:
         found = message_of_type_hash(key.type_hash)
         if found is not None and found[0] is known:
             return found
-        own = supplied.get(key.type_hash)
+        own = next((each for hashes, each in supplied.items() if key.type_hash in hashes), None)
         if own is None and key.type_hash == NO_HASH and len(supplied) == 1:
             [own] = supplied.values()
         if own is not None:
             return known or own, own.layouts["PX4"]
         hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
         if supplied:
-            hashes = " or ".join(supplied)
+            hashes = " or ".join(own for own, _ in supplied)
             reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}; use the file of this PX4"
         elif known is None:
             reason = f"{name} with the type hash {key.type_hash} is unknown; {hint}"

@@ -22,6 +22,7 @@ from nedbus.sources import SourceMessage, parse_source
 from nedbus.transport import NO_HASH, Attachment, Session, TopicKey
 from nedbus_msgs import (
     ANY,
+    LITERAL_CHAR,
     VehicleLocalPosition,
     dds_type,
     define_msg,
@@ -276,6 +277,31 @@ def test_user_definition_has_timestamp_at_any_place(listen: Listen, zenoh_sessio
     wait_for_matching(zenoh_session, key)
     zenoh_session.put(key, struct.pack("<4sf4xQ", b"\0\1\0\0", 2.5, 7))
     assert listener.receive()[0].fields == {"speed": 2.5, "timestamp": 7}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("LogMessage", "uint64 timestamp\nuint8 severity\nchar[127] text\n"),
+        ("Letter", "uint64 timestamp\nchar letter\nbyte flags\n"),
+    ],
+)
+def test_hash_with_literal_char_is_accepted(
+    listen: Listen, zenoh_session: Session, tmp_path: Path, name: str, text: str
+) -> None:
+    """Messages of a library that hashes char as IDL's char are carried, although ROS 2 does not match them."""
+    (tmp_path / f"{name}.msg").write_text(text)
+    own, literal = hash_of_msg(name, text), hash_of_msg(name, text, char=LITERAL_CHAR)
+    assert own != literal
+    definition = define_msg(name, text)
+    listener = listen(f"?msg={tmp_path}") if name == "Letter" else listen()
+    topic = "letter" if name == "Letter" else "log_message"
+    key = f"0/fmu/out/{topic}/{dds_type(ros2_type(definition))}/{literal}"
+    wait_for_matching(zenoh_session, key)
+    fields = {field: kind.absent for field, kind in definition.current.types.items()} | {"timestamp": 7}
+    for _ in range(2):
+        zenoh_session.put(key, encode_with(definition, fields, definition.current))
+    assert [each.fields["timestamp"] for each in listener.receive(2)] == [7, 7]
 
 
 def test_user_definition_decodes_newer_layout(

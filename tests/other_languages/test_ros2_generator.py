@@ -1,0 +1,124 @@
+"""Type hashes compared with those of ROS 2's own generator, and of libraries that take `char` literally."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from nedbus_msgs import (
+    LITERAL_CHAR,
+    MESSAGES,
+    definition_text,
+    has_literal_char,
+    hash_of,
+    hash_of_msg,
+    message_of_type_hash,
+    ros2_type,
+)
+from tests.nedbus_msgs.strategies import DATA
+
+GENERATOR: Final = (
+    "ros-rosidl-generator-type-description==4.9.5", "ros-rosidl-adapter==4.9.5", "ros-rosidl-cli==4.9.5", "pyyaml",
+    "catkin_pkg", "lark",
+)  # fmt: skip
+BASIC: Final = """uint64 timestamp
+bool a
+bool[2] aa
+byte b
+byte[2] bb
+char c
+char[2] cc
+int8 d
+int8[2] dd
+uint8 e
+uint8[2] ee
+int16 f
+uint16 g
+int32 h
+uint32 i
+int64 j
+int64[2] jj
+uint64 k
+float32 l
+float32[3] ll
+float64 m
+float64[3] mm
+"""
+NESTED: Final = "\n" + "=" * 80 + "\nMSG: px4_msgs/"
+ROSBAGS: Final = """
+import sys
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+store = get_typestore(Stores.EMPTY)
+store.register(get_types_from_msg(sys.stdin.read(), "px4_msgs/msg/LogMessage"))
+print(store.hash_rihs01("px4_msgs/msg/LogMessage"))
+"""
+
+
+def install(folder: Path, *packages: str) -> Path:
+    """Install packages in a new environment; return its folder of programs. Skips without a package index."""
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, timeout=60)
+    command = [str(folder / "bin" / "pip"), "install", "--quiet", "--disable-pip-version-check", *packages]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    except subprocess.TimeoutExpired:
+        pytest.skip("the packages cannot be installed here in 200 s")
+    if done.returncode:
+        pytest.skip(f"the packages cannot be installed here: {done.stderr[-200:]}")
+    return folder / "bin"
+
+
+def definitions() -> dict[str, str]:
+    """Return .msg files by name: each layout of each built-in message, other messages of PX4, and all basic types."""
+    files = {"Basic": BASIC} | {path.stem: path.read_text() for path in (DATA / "msg").glob("*.msg")}
+    for name, definition in MESSAGES.items():
+        layouts = definition.layouts.values()
+        files |= {f"{name}L{number}": definition_text(definition, each) for number, each in enumerate(layouts)}
+    return files
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(420)
+def test_hash_equals_that_of_ros_2(tmp_path: Path) -> None:
+    """Each definition has the hash that ROS 2's generator computes, also with nested messages and all basic types."""
+    programs, files = install(tmp_path / "venv", *GENERATOR), definitions()
+    (tmp_path / "msg").mkdir()
+    for name, text in files.items():
+        (tmp_path / "msg" / f"{name}.msg").write_text(text)
+    command = [str(programs / "rosidl"), "hash", "-o", "out", "-I", f"px4_msgs:{tmp_path}", "px4_msgs"]
+    command += [f"msg/{name}.msg" for name in files]
+    environment = os.environ | {"AMENT_PREFIX_PATH": str(programs.parent)}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    for name, text in files.items():
+        hashes = json.loads((tmp_path / "out" / "msg" / f"{name}.json").read_text())["type_hashes"]
+        expected = {each["type_name"]: each["hash_string"] for each in hashes}[f"px4_msgs/msg/{name}"]
+        nested = "".join(f"{NESTED}{each}\n{files[each]}" for each in files if f"\n{each} " in text)
+        assert hash_of_msg(name, text + nested) == expected, name
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(420)
+def test_literal_hash_equals_that_of_rosbags(tmp_path: Path) -> None:
+    """Rosbags takes char literally; nedbus recognizes the hash, and knows that it is not the one of ROS 2."""
+    definition = MESSAGES["LogMessage"]
+    (layout,) = definition.layouts.values()
+    text = definition_text(definition, layout)
+    programs = install(tmp_path / "venv", "rosbags==0.11.9")
+    done = subprocess.run(
+        [str(programs / "python"), "-c", ROSBAGS], input=text, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = done.stdout.strip()
+    assert found == hash_of_msg("LogMessage", text, char=LITERAL_CHAR) != hash_of(layout, ros2_type(definition))
+    assert has_literal_char(found)
+    assert message_of_type_hash(found) == (definition, layout)
