@@ -9,7 +9,7 @@ Source: the resets of 15 real logs, measured by `python -m benchmarks.resets`.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import add, sub
+from operator import add, attrgetter, sub
 from statistics import fmean
 from typing import Any, Final, Literal
 
@@ -33,17 +33,11 @@ RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" f
 """The field that counts the resets of each quantity, modulo 256."""
 
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-JUMP_FIELDS: Final = tuple(
-    dict.fromkeys(
-        (
-            *(value for values in _VALUES.values() for value in values),
-            *(rate for rates in _RATES.values() for rate in rates),
-            *(f"delta_{name}" for name in _VALUES),
-            *_ORIGIN,
-            "unaided_heading",
-        )
-    )
-)
+_read_origin: Final = attrgetter(*_ORIGIN)
+JUMP_FIELDS: Final = (
+    *sorted({each for names in (*_VALUES.values(), *_RATES.values()) for each in names}),
+    *(f"delta_{name}" for name in _VALUES), *_ORIGIN, "unaided_heading",
+)  # fmt: skip
 """The fields that `jump_of` needs besides `timestamp`, `xy_global` and the reset counter."""
 
 _REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
@@ -100,7 +94,7 @@ class ResetTracker:
         last, self._last = self._last, message
         reset, discontinued = set[Quantity](), set[Quantity]()
         rebooted = last is not None and message.timestamp < last.timestamp - _REBOOT
-        origin_changed = last is not None and _origin(last) != _origin(message)
+        origin_changed = last is not None and _is_moved(_read_origin(last), _read_origin(message))
         values: dict[str, float] = {}
         for name, fields in _VALUES.items():
             zero: Point = (0.0,) * len(fields)
@@ -147,7 +141,7 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
     delta = after[f"delta_{name}"]
     announced = [delta if isinstance(delta, tuple) else (delta,)] * ((after[counter] - before[counter]) % 256 == 1)
-    if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str([after[each] for each in _ORIGIN]):
+    if name in ("xy", "z") and _is_moved(*(tuple(fields[each] for each in _ORIGIN) for fields in (before, after))):
         announced += [(0.0,) * len(values), _shift_of_origin(name, before, after)]
     announced = [jump for jump in announced if all(map(math.isfinite, jump))]
     motion = [_motion(value, before, after, seconds) for value in values]
@@ -170,6 +164,10 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     return step if is_measured else None
 
 
+def _is_moved(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
+    return before != after and str(before) != str(after)  # NaN equals NaN only as text
+
+
 def _motion(value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float) -> float:
     """Return how far a value moved between two messages by its rate of change at both; NaN if it is unknown."""
     if value == "heading":  # the gyroscopes' heading has no resets
@@ -188,9 +186,3 @@ def _shift_of_origin(name: Quantity, before: Mapping[str, Any], after: Mapping[s
     if not (before["xy_global"] and after["xy_global"]):
         return (math.nan, math.nan)
     return MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])
-
-
-def _origin(message: Message) -> tuple[float | None, ...]:
-    """Return the origin with None for NaN, so that missing origins compare equal."""
-    values = (message.ref_lat, message.ref_lon, message.ref_alt)
-    return tuple(value if math.isfinite(value) else None for value in values)

@@ -12,10 +12,9 @@ from typing import Final
 import pytest
 
 from nedbus_msgs import (
-    LITERAL_CHAR,
     MESSAGES,
     definition_text,
-    has_literal_char,
+    has_char_hash,
     hash_of,
     hash_of_msg,
     message_of_type_hash,
@@ -119,6 +118,6 @@ def test_literal_hash_equals_that_of_rosbags(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     found = done.stdout.strip()
-    assert found == hash_of_msg("LogMessage", text, char=LITERAL_CHAR) != hash_of(layout, ros2_type(definition))
-    assert has_literal_char(found)
+    assert found == hash_of_msg("LogMessage", text, literal_char=True) != hash_of(layout, ros2_type(definition))
+    assert has_char_hash(found)
     assert message_of_type_hash(found) == (definition, layout)

@@ -13,7 +13,7 @@ from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
 from nedbus_msgs.model.rules import InRange
 
-from .types import BYTE, NESTED, PACKAGE, describe_field, type_hash
+from .types import NESTED, PACKAGE, TYPE_IDS, describe_field, type_hash
 
 # Possessive quantifiers: a comment may have 200,000 spaces or digits.
 _NUMBER: Final = r"[-+]?(?:(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?|inf)"
@@ -83,13 +83,10 @@ def define_msg(name: str, text: str) -> Definition[Message]:
         raise MsgError(1, 1, str(exc)) from None
 
 
-def hash_of_msg(name: str, text: str, *, char: int = BASES["char"].ros2) -> str:
-    """Return the RIHS01 hash of the type in a .msg file, with nested messages; raise MsgError if it is malformed.
-
-    `char`: id of the type `char`, such as LITERAL_CHAR.
-    """
+def hash_of_msg(name: str, text: str, *, literal_char: bool = False) -> str:
+    """Return the RIHS01 hash of the type in a .msg file, with nested messages; raise MsgError if it is malformed."""
     parts = _parts(text)
-    types = {part: [_describe(line, parts, char) for line in lines.values()] for part, lines in parts.items()}
+    types = {part: [_describe(line, parts, literal_char) for line in lines.values()] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
     return type_hash(*((f"{PACKAGE}/{each or name}", types[each]) for each in ["", *used]))
 
@@ -149,13 +146,12 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
         yield MsgField(prefix + line.name, _type_of(line), line.comment, line.number, line.column)
 
 
-def _describe(line: _Line, parts: Mapping[str, object], char: int) -> Mapping[str, object]:
+def _describe(line: _Line, parts: Mapping[str, object], literal_char: bool) -> Mapping[str, object]:
     count = _LENGTH.fullmatch(line.length)
     if line.base in parts and (count or not line.length):
         return describe_field(line.name, NESTED, int(count[1]) if count else 0, f"{PACKAGE}/{line.base}")
-    kind = _type_of(line)
-    type_id = {"byte": BYTE, "char": char}.get(line.base, BASES[kind.base].ros2)
-    return describe_field(line.name, type_id, kind.length or 0)
+    length = _type_of(line).length or 0
+    return describe_field(line.name, TYPE_IDS[literal_char][line.base], length)
 
 
 def _type_of(line: _Line) -> FieldType:

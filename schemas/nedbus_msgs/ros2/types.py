@@ -12,8 +12,10 @@ from nedbus_msgs.model.px4_types import BASES
 
 PACKAGE: Final = "px4_msgs/msg"
 NESTED: Final = 1  # type id of a nested message
-BYTE: Final = 16  # type id of a byte, which has the values of a uint8
-LITERAL_CHAR: Final = 13  # type id of the IDL's char, which some libraries give a char; in a .msg file, that is a uint8
+_IDS: Final = {name: base.ros2 for name, base in BASES.items()} | {"byte": 16}
+TYPE_IDS: Final = {False: _IDS, True: _IDS | {"char": 13}}
+"""Type ids of base types; True: as libraries have them that take the char of a .msg file, a uint8, for the IDL's."""
+
 _ARRAY: Final = 48  # offset of fixed-size arrays in type_description_interfaces/msg/FieldType
 _RIHS01: Final = "RIHS01_"
 
@@ -42,10 +44,11 @@ def _named_layouts() -> Iterator[tuple[str, Definition[Any], Layout]]:
             yield from ((name, definition, layout) for name in (ros2_type(definition), *layout.aliases))
 
 
-def hash_of(layout: Layout, ros2_type: str, *, char: int = BASES["char"].ros2) -> str:
+def hash_of(layout: Layout, ros2_type: str, *, literal_char: bool = False) -> str:
     """Return the RIHS01 hash (REP 2016) of a ROS 2 type with the fields of a layout: `RIHS01_` and 64 hex digits."""
-    ids = ((name, char if kind.is_text else BASES[kind.base].ros2, kind.length) for name, kind in layout.types.items())
-    return type_hash((ros2_type, [describe_field(name, type_id, length or 0) for name, type_id, length in ids]))
+    ids = TYPE_IDS[literal_char]
+    fields = [describe_field(name, ids[kind.base], kind.length or 0) for name, kind in layout.types.items()]
+    return type_hash((ros2_type, fields))
 
 
 def type_hash(*types: tuple[str, Sequence[Mapping[str, object]]]) -> str:
@@ -71,16 +74,15 @@ def definition_text(definition: Definition[Any], layout: Layout) -> str:
 def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
     """Return the message and layout with a type hash, given with or without `RIHS01_`; None if unknown."""
     digits = text.removeprefix(_RIHS01).lower()
-    return _by_hash().get(digits) or _by_hash(LITERAL_CHAR).get(digits)
+    return _by_hash(False).get(digits) or _by_hash(True).get(digits)
 
 
-def has_literal_char(text: str) -> bool:
-    """Return whether a type hash is that of a built-in message whose `char` is taken literally, unlike in ROS 2."""
-    digits = text.removeprefix(_RIHS01).lower()
-    return digits in _by_hash(LITERAL_CHAR) and digits not in _by_hash()
+def has_char_hash(text: str) -> bool:
+    """Return whether a type hash is known only with `literal_char`."""
+    return message_of_type_hash(text) is not None and text.removeprefix(_RIHS01).lower() not in _by_hash(False)
 
 
 @cache
-def _by_hash(char: int = BASES["char"].ros2) -> Mapping[str, tuple[Definition[Any], Layout]]:
-    hashes = ((hash_of(layout, name, char=char), each, layout) for name, each, layout in _named_layouts())
+def _by_hash(literal_char: bool) -> Mapping[str, tuple[Definition[Any], Layout]]:
+    hashes = [(hash_of(at, name, literal_char=literal_char), each, at) for name, each, at in _named_layouts()]
     return {text.removeprefix(_RIHS01): (each, layout) for text, each, layout in hashes}

@@ -200,7 +200,7 @@ class RateLimit:
 class LogMessageBuilder:
     """Add `log_message` messages to the records of a log or a stream.
 
-    A logged string with a trailing tab repeats an event that was logged before it in more detail, and is dropped.
+    A logged string with a trailing tab repeats an event in more detail: whichever of the two comes second is dropped.
     PX4 reports all failed checks when one changes: only new ones become messages, with severity info if they do not
     affect the current mode.
 
@@ -213,6 +213,7 @@ class LogMessageBuilder:
         self._packed = b""
         self._metadata: _EventMetadata | None = None
         self._events: deque[tuple[int, str]] = deque(maxlen=100)  # unmatched events: time, first words of a check
+        self._texts: deque[tuple[Any, ...]] = deque(maxlen=100)  # unmatched texts: time, and what may match them
         self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log an event twice
         self._failed: dict[str, tuple[int, int]] = {}  # checks in the current report: level, blocked modes
         self._earlier: dict[str, tuple[int, int]] = {}
@@ -265,7 +266,12 @@ class LogMessageBuilder:
             level = shown
         elif event.lists_checks_of and text.endswith(":"):
             text += " " + ", ".join(name for name, (_, modes) in self._failed.items() if modes & event.lists_checks_of)
-        self._events.append((timestamp, _first_words(text) if is_check else ""))
+        check = _first_words(text) if is_check else ""
+        for time, *words in self._texts:
+            if abs(timestamp - time) <= _WINDOW and check in words:
+                self._texts.remove((time, *words))
+                return None
+        self._events.append((timestamp, check))
         return LoggedText(level, timestamp, text)
 
     def _decode(self, number: int, arguments: bytes) -> _Event | None:
@@ -278,11 +284,12 @@ class LogMessageBuilder:
 
     def _is_duplicate(self, record: LoggedText) -> bool:
         """Return whether an event has already reported this text; each event matches one text."""
-        words = {_first_words(record.text), "" if record.text.endswith("\t") else "-"}
+        words = _first_words(record.text), "" if record.text.endswith("\t") else "-"
         for timestamp, check in self._events:
             if abs(timestamp - record.timestamp) <= _WINDOW and check in words:
                 self._events.remove((timestamp, check))
                 return True
+        self._texts.append((record.timestamp, *words))
         return False
 
 

@@ -142,6 +142,17 @@ def test_string_that_duplicates_an_event_is_dropped() -> None:
     ]  # fmt: skip
 
 
+def test_event_that_duplicates_a_string_is_dropped() -> None:
+    """Each event matches one string with a trailing tab, whichever comes first, as in a log sorted by time."""
+    log = Log()
+    log.text(5_000_000, b"[commander] Armed by RC switch\t")
+    log.event(5_000_001, 1, b"\2")
+    log.event(5_000_500, 1, b"\3")  # another one
+    log.text(6_000_000, b"[commander] Armed by RC switch\t")
+    log.event(6_100_000, 1, b"\2")  # too late
+    assert [each[0] for each in log.log_messages()] == [5_000_000, 5_000_500, 6_000_000, 6_100_000]
+
+
 def test_event_arguments_are_formatted() -> None:
     """Numbers with digits and units, enums, bit fields, profiles, links and escapes are formatted as by libevents."""
     log = Log()

@@ -20,17 +20,7 @@ from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Rejection, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session, Tls, TopicKey
-from nedbus_msgs import (
-    LITERAL_CHAR,
-    Address,
-    Definition,
-    bases_of_msg,
-    dds_type,
-    decode_with,
-    define_msg,
-    hash_of_msg,
-    ros2_type,
-)
+from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
 
 from .streams import Definitions, NotAcceptedError, StreamRegistry
 
@@ -154,10 +144,7 @@ class Px4ZenohNode:
                     names, extra = ", ".join(form.unknown), about("newer_layout", stream.address, source="px4-zenoh")
                     _log.warning("%s: left out unknown fields %s; update nedbus", stream.key, names, extra=extra)
                 if form.is_literal:
-                    extra = about("notice", stream.address, source="px4-zenoh")
-                    text = (
-                        "%s: this publisher's type hash takes char literally, unlike ROS 2, whose nodes do not match it"
-                    )
+                    text, extra = "%s: hashed with a literal char, unlike in ROS 2", about("notice", stream.address)
                     _log.warning(text, stream.key, extra=extra)
             definition, layout, unknown, _ = form
             address = stream.address
@@ -239,7 +226,7 @@ def _read_definitions(paths: str) -> Definitions:
             try:
                 text = _with_nested_messages(file)
                 definition = define_msg(file.stem, text)
-                hashes = hash_of_msg(file.stem, text), hash_of_msg(file.stem, text, char=LITERAL_CHAR)
+                hashes = hash_of_msg(file.stem, text), hash_of_msg(file.stem, text, literal_char=True)
             except OSError as exc:
                 raise ConfigError(str(file), (exc.strerror or str(exc)).lower(), key="msg") from None
             except ValueError as exc:  # such as MsgError

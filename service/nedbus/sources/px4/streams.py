@@ -16,7 +16,7 @@ from nedbus_msgs import (
     Layout,
     dds_type,
     get_topic,
-    has_literal_char,
+    has_char_hash,
     is_vehicle_input,
     message_of_type_hash,
     ros2_types,
@@ -33,7 +33,7 @@ _SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after whic
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each vehicle its own namespace or domain"
 
-# Supplied by the user, by DDS type and ROS 2 type hash, the latter also with LITERAL_CHAR.
+# Supplied by the user, by DDS type and ROS 2 type hash, the latter also with `literal_char`.
 Definitions = Mapping[str, Mapping[tuple[str, str], Definition[Any]]]
 
 
@@ -145,7 +145,7 @@ class StreamRegistry:
         definition, layout = self._layout_of(stream.key, stream.address.topic)
         unknown = tuple(name for name, kind in layout.types.items() if kind not in definition.known_types.get(name, ()))
         digest, supplied = stream.key.type_hash, self._supplied.get(stream.key.dds_type, {})
-        is_literal = has_literal_char(digest) or any(literal == digest != own for own, literal in supplied)
+        is_literal = has_char_hash(digest) or any(literal == digest != own for own, literal in supplied)
         stream.wire_format = WireFormat(definition, layout, unknown, is_literal)
         stream.reboots = self._reboots.get(stream.address.vehicle, 0)
         return stream.wire_format

@@ -22,7 +22,6 @@ from nedbus.sources import SourceMessage, parse_source
 from nedbus.transport import NO_HASH, Attachment, Session, TopicKey
 from nedbus_msgs import (
     ANY,
-    LITERAL_CHAR,
     VehicleLocalPosition,
     dds_type,
     define_msg,
@@ -291,7 +290,7 @@ def test_hash_with_literal_char_is_accepted(
 ) -> None:
     """Messages of a library that hashes char as IDL's char are carried, although ROS 2 does not match them."""
     (tmp_path / f"{name}.msg").write_text(text)
-    own, literal = hash_of_msg(name, text), hash_of_msg(name, text, char=LITERAL_CHAR)
+    own, literal = hash_of_msg(name, text), hash_of_msg(name, text, literal_char=True)
     assert own != literal
     definition = define_msg(name, text)
     listener = listen(f"?msg={tmp_path}") if name == "Letter" else listen()

@@ -7,7 +7,7 @@ import pytest
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import NotAcceptedError, StreamRegistry
 from nedbus.transport import Attachment, TopicKey
-from nedbus_msgs import LITERAL_CHAR, MESSAGES, DecodeError, dds_type, hash_of, ros2_type
+from nedbus_msgs import MESSAGES, DecodeError, dds_type, hash_of, ros2_type
 from tests.flights.local_position import ROS2_TYPE, type_hash
 from tests.flights.messages import VLP
 
@@ -48,8 +48,9 @@ def streams() -> StreamRegistry:
 def test_hash_with_literal_char_is_recognized(streams: StreamRegistry, is_literal: bool) -> None:
     """The format of a stream says whether the publisher's type hash takes char literally, unlike ROS 2."""
     definition = MESSAGES["LogMessage"]
-    name, char = ros2_type(definition), {"char": LITERAL_CHAR} if is_literal else {}
-    topic = TopicKey(0, "fmu/out/log_message", dds_type(name), hash_of(definition.current, name, **char))
+    name = ros2_type(definition)
+    digest = hash_of(definition.current, name, literal_char=is_literal)
+    topic = TopicKey(0, "fmu/out/log_message", dds_type(name), digest)
     form = streams.wire_format_of(streams.on_message(str(topic), 100.0))
     assert (form.definition, form.layout.types, form.is_literal) == (
         definition, definition.current.types, is_literal,
