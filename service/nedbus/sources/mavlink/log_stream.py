@@ -122,11 +122,7 @@ class LogStream:
                     yield from self._open_stream(record.subscription)
                 stream = self._streams[record.subscription]
                 if stream is not None:
-                    reported = len(stream.omitted)
-                    message = self._message(stream, record.payload, now)
-                    for name, reason in [*stream.omitted.items()][reported:]:
-                        yield Rejection(f"{self._name} {name}", reason, count=0)
-                    yield message
+                    yield from self._convert(stream, record.payload, now)
             elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
             elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
@@ -239,11 +235,18 @@ class LogStream:
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
         self._streams[subscription] = stream
 
-    def _message(self, stream: ulog.LoggedStream, payload: bytes, now: float) -> SourceMessage:
+    def _convert(self, stream: ulog.LoggedStream, payload: bytes, now: float) -> Iterator[SourceMessage | Rejection]:
+        """Yield a message, after any new warnings about its fields."""
         self._streamed.add(stream.address)
+        topic, reported = stream.subscription.name, len(stream.omitted)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
         given, definition = stream.decode(payload) if stream.converted else None, stream.definition
-        return SourceMessage(
+        for name, reason in [*stream.omitted.items()][reported:]:
+            yield Rejection(f"{self._name} {topic}.{name}", reason, count=0)
+        if count := stream.subscription.layout.count_unset_bools(payload):
+            reason = f"{ulog.UNSET_BOOLS.format(topic)} ({count} in the first such message)"
+            yield Rejection(f"{self._name} {topic}", reason, count=0)
+        yield SourceMessage(
             now, stream.address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload
         )
 
