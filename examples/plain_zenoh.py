@@ -16,5 +16,5 @@ with suppress(KeyboardInterrupt), zenoh.open(config) as session:
     samples = session.declare_subscriber("nedbus/*/vehicle_local_position", zenoh.handlers.RingChannel(100))
     while True:
         sample = samples.recv()
-        array = msgpack.unpackb(sample.payload.to_bytes())
+        array = msgpack.unpackb(sample.payload.to_bytes(), raw=True)  # char fields of other publishers may not be UTF-8
         print(sample.key_expr, "timestamp", array[1], "x", array[7], "y", array[8], "z", array[9])
