@@ -20,8 +20,8 @@ def import_optional(extra: str, module: str) -> Any:
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
         # Never suggest installing nedbus by its name alone: on PyPI, this name belongs to another project.
-        command = f"pip install -e '.[{extra}]' in a clone of nedbus" if extra in EXTRAS else f"pip install {extra}"
-        raise ConfigError(missing, f"not installed; run {command}") from exc
+        hint = f"in a nedbus clone, run pip install -e '.[{extra}]'" if extra in EXTRAS else f"run pip install {extra}"
+        raise ConfigError(missing, f"not installed; {hint}") from exc
 
 
 def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:
