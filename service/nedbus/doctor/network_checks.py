@@ -141,6 +141,9 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
             advice = f"see the events before it with 'nedbus why --vehicle {name}'"
             text = f"{current.text[:_MAX_TEXT]}{format_since(current.since, now)}"
             yield Finding("vehicle", name, "wrong" if current.severity == "bad" else "warning", text, advice)
+    if not seen.alive.complete:
+        advice = "a vehicle may have over 1,000 publishers: the log names it; otherwise, try again"
+        yield Finding("vehicle", "", "unknown", "not all streams are listed", advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission
