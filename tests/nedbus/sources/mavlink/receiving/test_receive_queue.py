@@ -170,7 +170,7 @@ def test_silent_vehicle_saves_no_time(host: Host) -> None:
     for number in range(5):
         host.put(number, system=1)
         host.put(number, system=2)
-    systems = []
+    systems = list[int]()
     while len(systems) < 10:
         for each in host.queue.read(0.0, lost_by_host=0):
             if isinstance(each, Received):
