@@ -25,10 +25,10 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
     if not seen.routers:
         yield Finding("router", "", "ok", "connected; its other sessions are not visible to this client")
     for router in seen.routers:
-        text = f"connected sessions: {router.sessions:,}"
+        is_full, text = False, f"connected sessions: {router.sessions:,}"
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-        is_full = (router.load or 0.0) >= _NEARLY_FULL
+            is_full = router.sessions >= _NEARLY_FULL * router.max_sessions
         advice = "raise max_sessions and the limit of open files, or run a second router (docs/hosts.md)"
         yield Finding("router", router.zid, "warning" if is_full else "ok", text, advice if is_full else "")
 

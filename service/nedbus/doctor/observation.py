@@ -10,16 +10,7 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus import clock, transport
-from nedbus.client import (
-    FleetTokens,
-    Publishers,
-    ServiceStatus,
-    SourceStatus,
-    VehicleDirectory,
-    find_reports,
-    find_services,
-)
+from nedbus import client, clock, transport
 from nedbus.events import AccountReport
 from nedbus.timings import TIMINGS
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, codec_of
@@ -53,11 +44,11 @@ class Observation:
     version: str
     vehicle: str | None
     verdict: transport.Verdict | None = None
-    services: list[ServiceStatus] = field(default_factory=list)
+    services: list[client.ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
-    alive: Publishers = field(default_factory=Publishers)
+    alive: client.Publishers = field(default_factory=client.Publishers)
     ages: dict[Address, float | None] = field(default_factory=dict)
     delays: dict[Address, float | None] = field(default_factory=dict)
     errors: dict[Address, str] = field(default_factory=dict)
@@ -67,7 +58,7 @@ class Observation:
     listened: float = 0.0
 
     @property
-    def sources(self) -> list[SourceStatus]:
+    def sources(self) -> list[client.SourceStatus]:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
 
@@ -78,10 +69,11 @@ class Observation:
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
         self.routers = transport.query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
-        self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
+        self.services = client.find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
-        self.accounts = find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        with closing(VehicleDirectory(partial(FleetTokens, open_session, prefix=prefix), prefix=prefix)) as directory:
+        self.accounts = client.find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
+        follow = partial(client.FleetTokens, open_session, prefix=prefix)
+        with closing(client.VehicleDirectory(follow, prefix=prefix)) as directory:
             self.alive = directory.publishers(timeout=_LIST_TIMEOUT)
         tokens = transport.token_keys(session, transport.px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(transport.PublisherToken.parse, tokens)
