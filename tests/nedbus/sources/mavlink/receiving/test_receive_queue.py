@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from itertools import islice
+from itertools import groupby, islice
 from typing import Any
 
 import pytest
@@ -159,6 +159,24 @@ def test_vehicles_share_the_time_of_the_source(host: Host) -> None:
     assert read[2] == 400
     assert 4 <= read[1] <= 15
     assert wait < 0.25
+
+
+def test_silent_vehicle_saves_no_time(host: Host) -> None:
+    """A vehicle that was silent while another one was served gets no more than its share when it returns."""
+    for number in range(20):
+        host.put(number, system=2)
+        for _ in host.queue.read(0.0, lost_by_host=0):
+            host.time += 0.1
+    for number in range(5):
+        host.put(number, system=1)
+        host.put(number, system=2)
+    systems = list[int]()
+    while len(systems) < 10:
+        for each in host.queue.read(0.0, lost_by_host=0):
+            if isinstance(each, Received):
+                systems.append(each.system)
+                host.time += 0.1
+    assert max(len(list(run)) for _, run in groupby(systems)) <= 2, systems
 
 
 def test_rejections_are_counted_together(host: Host) -> None:
