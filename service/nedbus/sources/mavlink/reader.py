@@ -17,7 +17,7 @@ from .fields import DECODED
 from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
-from .receive_queue import Received, ReceiveQueue
+from .receive_queue import Received, ReceiveQueue, join_data
 from .saved_stream import read_stream, state_path
 from .sequence import SequenceCounter
 
@@ -34,6 +34,7 @@ _LOG_DATA: Final[Mapping[int, str]] = {
     number: each.msgname for number, each in dialect.mavlink_map.items() if each.msgname.startswith("LOGGING_DATA")
 }
 _TICK: Final = 0.05  # s, the longest wait of the thread
+_PAUSE: Final = 0.01  # s between two reads during a stream: several messages at once need less processor time
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
@@ -59,7 +60,7 @@ class LinkReader:
 def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterator[Received | Rejection]:
     """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival."""
     for message in parser.parse_buffer(data) or []:
-        raw = bytes(message.get_msgbuf())
+        raw = message.get_msgbuf()
         if message.get_type() == "BAD_DATA":
             yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue
@@ -183,8 +184,15 @@ class LogReceiver:
             self._waiting.fail(exc)
 
     def _step(self) -> None:
-        for item in self._reader.read(_TICK):
-            self._waiting.put(self._process(item) if isinstance(item, Received) else item)
+        if any(vehicle.client.status.state == "streaming" for vehicle in self.vehicles.values()):
+            self._stop.wait(_PAUSE)
+        items = list[Received | Rejection]()
+        try:
+            for item in self._reader.read(_TICK):
+                items.append(self._process(item) if isinstance(item, Received) else item)
+        finally:  # the link may break
+            if items:
+                self._waiting.put(*join_data(items))
         for vehicle in self.vehicles.values():
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 

@@ -2,20 +2,20 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from threading import Condition
 from typing import Any, Final, NamedTuple
 
 from nedbus.sources.source import LinkLoad, Rejection
+from nedbus.timings import TIMINGS
 
 from .link import Peer
 from .log_reassembly import Chunk
 
 _MAX_WAITING: Final = 16_384  # messages of all vehicles; beyond it the oldest of the longest queue is dropped
-_MAX_WAIT: Final = 2.0  # s; a message that waited longer is dropped, and
-_FRESH: Final = 0.2  # s; so are those behind it that waited longer than this, so that the next ones are fresh
+_FRESH: Final = 0.2  # s; of the messages behind one that waited too long, those that waited longer are dropped, too
 _LATE: Final = 0.5  # s; a longer wait means that the host is overloaded
 _MEMORY: Final = 5.0  # s without a late or dropped message until the overload has ended
 _MAX_READ: Final = 100  # messages per call of `read`
@@ -27,6 +27,7 @@ class Received(NamedTuple):
     """A message of an autopilot. `time`: arrival, monotonic [s]; `lost`: messages lost before it; `chunk`: ULog data.
 
     `sequence`: MAVLink's. A late message, which was counted as lost, has `lost` -1.
+    `parts`: number of messages whose ULog data was joined.
     """
 
     message: Any
@@ -36,6 +37,37 @@ class Received(NamedTuple):
     time: float
     lost: int = 0
     chunk: Chunk | None = None
+    parts: int = 1
+
+    def joined(self, later: "Received") -> "Received | None":
+        """Return one message with the ULog data of both; None unless the later data continues this one.
+
+        Acknowledged data is not joined, because it may wait longer.
+        """
+        one, two = self.chunk, later.chunk
+        if one is None or two is None or not (one.verdict == two.verdict == "delivered"):
+            return None
+        if two.begins or two.lost or later.lost or later.peer != self.peer:
+            return None
+        if not self.message.get_type() == later.message.get_type() == "LOGGING_DATA":
+            return None
+        offset = one.offset if one.offset < len(one.data) else len(one.data) + two.offset
+        chunk = one._replace(data=one.data + two.data, offset=offset)
+        return self._replace(message=later.message, chunk=chunk, parts=self.parts + later.parts)
+
+
+def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:
+    """Join the ULog data of each vehicle as far as it is contiguous; it may overtake other messages."""
+    found, last = list[Received | Rejection](), dict[int, int]()  # index of the last data by vehicle
+    for item in items:
+        if isinstance(item, Received) and item.chunk is not None:
+            before = found[last[item.system]] if item.system in last else None
+            if isinstance(before, Received) and (joined := before.joined(item)):
+                found[last[item.system]] = joined
+                continue
+            last[item.system] = len(found)
+        found.append(item)
+    return found
 
 
 @dataclass(slots=True)
@@ -52,9 +84,9 @@ class _VehicleQueue:
     def drop(self, received: Received) -> None:
         """Count a removed message as lost."""
         chunk = received.chunk
-        self.lost += received.lost + 1
+        self.lost += received.lost + received.parts
         if chunk is not None:
-            self.lost_chunks += chunk.lost + (chunk.verdict in ("delivered", "unsynchronised"))
+            self.lost_chunks += chunk.lost + received.parts * (chunk.verdict in ("delivered", "unsynchronised"))
             self.is_cut, self.is_undefined = True, self.is_undefined or chunk.begins
 
     def resume(self, received: Received) -> Received:
@@ -93,19 +125,20 @@ class ReceiveQueue:
         self._turn = 0.0  # `used` of the vehicle that is served
         self._load, self._overload_end, self._longest_wait = LinkLoad(), 0.0, 0.0
 
-    def put(self, item: Received | Rejection) -> None:
-        """Add a message; drop the oldest one of the longest queue if there are too many."""
+    def put(self, *items: Received | Rejection) -> None:
+        """Add messages; drop the oldest ones of the longest queue while there are too many."""
         with self._changed:
-            if isinstance(item, Rejection):
-                is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
-                self._rejections[item if is_known else next(iter(self._rejections))] += item.count
-            else:
+            for item in items:
+                if isinstance(item, Rejection):
+                    is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
+                    self._rejections[item if is_known else next(iter(self._rejections))] += item.count
+                    continue
                 vehicle = self._vehicles.setdefault(item.system, _VehicleQueue())
                 if not vehicle.waiting:  # time in which it had no messages is not owed to it
                     vehicle.used = max(vehicle.used, self._turn)
                 vehicle.waiting.append(item)
-                self._count += 1
-                if self._count > _MAX_WAITING:
+                self._count += item.parts
+                while self._count > _MAX_WAITING:
                     longest = max(self._vehicles.values(), key=lambda each: len(each.waiting))
                     self._drop(longest, longest.waiting.popleft())
             self._changed.notify()
@@ -147,12 +180,12 @@ class ReceiveQueue:
         """Remove the next message of the vehicle that has used the least time; drop those that waited too long."""
         with self._changed:
             while ready := [each for each in self._vehicles.values() if each.waiting]:
-                vehicle, limit = min(ready, key=attrgetter("used")), _MAX_WAIT
+                vehicle, limit = min(ready, key=attrgetter("used")), TIMINGS.link_wait
                 self._turn = vehicle.used
                 while vehicle.waiting:
                     received = vehicle.waiting.popleft()
                     if now - received.time <= limit or received.message.get_type() == "LOGGING_DATA_ACKED":
-                        self._count -= 1
+                        self._count -= received.parts
                         return vehicle, vehicle.resume(received)
                     limit = _FRESH
                     self._drop(vehicle, received)
@@ -160,7 +193,7 @@ class ReceiveQueue:
 
     def _drop(self, vehicle: _VehicleQueue, received: Received) -> None:
         vehicle.drop(received)
-        self._count, self._dropped = self._count - 1, self._dropped + 1
+        self._count, self._dropped = self._count - received.parts, self._dropped + received.parts
 
     def _measure(self, wait: float, lost_by_host: int, now: float) -> LinkLoad:
         """Return the load of the host, given the wait of the next message."""

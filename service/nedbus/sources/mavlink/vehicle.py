@@ -117,11 +117,14 @@ class Vehicle:
         if counted is not None:
             self._certain = self.lost
 
+    @property
+    def has_news(self) -> bool:
+        """Whether losses or a reboot were not reported yet."""
+        return bool(self.lost or self._rebooted)
+
     def report(self, message: SourceMessage, log: LogStream | None = None) -> SourceMessage:
         """Add the losses and the reboot that were not reported yet; during a ULog stream only losses of others."""
-        lost = self.lost
-        if lost and log is not None and log.is_streaming:
-            lost = min(lost, self._certain)
+        lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
         if not (lost or self._rebooted):
             return message
         rebooted, self._rebooted, self.lost, self._certain = self._rebooted, False, self.lost - lost, 0
