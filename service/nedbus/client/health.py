@@ -124,9 +124,11 @@ class _Window:
         self.intervals = number + 1, new, squares + (interval - mean) * (interval - new)
 
     def add_latency(self, latency: float) -> None:
-        """Add a latency [s], up to a maximum number."""
+        """Add a latency [s]; beyond the maximum number it replaces the oldest one."""
         if len(self.latencies) < _MAX_MEASURED:
             self.latencies.append(latency)
+        else:
+            self.latencies[(self.messages - 1) % _MAX_MEASURED] = latency
 
     @property
     def mean(self) -> float:
