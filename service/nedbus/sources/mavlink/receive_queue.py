@@ -39,35 +39,45 @@ class Received(NamedTuple):
     chunk: Chunk | None = None
     parts: int = 1
 
-    def joined(self, later: "Received") -> "Received | None":
-        """Return one message with the ULog data of both; None unless the later data continues this one.
+    def continues(self, before: "Received") -> bool:
+        """Return whether this message has ULog data that directly follows the data of an earlier one.
 
-        Acknowledged data is not joined, because it may wait longer.
+        Acknowledged data is never joined, because it may wait longer.
         """
-        one, two = self.chunk, later.chunk
-        if one is None or two is None or not (one.verdict == two.verdict == "delivered"):
-            return None
-        if two.begins or two.lost or later.lost or later.peer != self.peer:
-            return None
-        if not self.message.get_type() == later.message.get_type() == "LOGGING_DATA":
-            return None
-        offset = one.offset if one.offset < len(one.data) else len(one.data) + two.offset
-        chunk = one._replace(data=one.data + two.data, offset=offset)
-        return self._replace(message=later.message, chunk=chunk, parts=self.parts + later.parts)
+        one, two = before.chunk, self.chunk
+        if one is None or two is None or two.begins or two.lost or self.lost or self.peer != before.peer:
+            return False
+        if not one.verdict == two.verdict == "delivered":
+            return False
+        return {before.message.get_type(), self.message.get_type()} == {"LOGGING_DATA"}
 
 
 def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:
     """Join the ULog data of each vehicle as far as it is contiguous; it may overtake other messages."""
-    found, last = list[Received | Rejection](), dict[int, int]()  # index of the last data by vehicle
+    found, runs = list[Received | Rejection | list[Received]](), dict[int, list[Received]]()  # last run by vehicle
     for item in items:
-        if isinstance(item, Received) and item.chunk is not None:
-            before = found[last[item.system]] if item.system in last else None
-            if isinstance(before, Received) and (joined := before.joined(item)):
-                found[last[item.system]] = joined
-                continue
-            last[item.system] = len(found)
-        found.append(item)
-    return found
+        if isinstance(item, Rejection) or item.chunk is None:
+            found.append(item)
+        elif item.system in runs and item.continues(runs[item.system][-1]):
+            runs[item.system].append(item)
+        else:
+            found.append(run := [item])
+            runs[item.system] = run
+    return [_joined(each) if isinstance(each, list) else each for each in found]
+
+
+def _joined(run: list[Received]) -> Received:
+    """Return one message with the ULog data of all."""
+    first, chunks = run[0], [each.chunk for each in run if each.chunk is not None]
+    if len(run) == 1:
+        return first
+    offset = begin = 0
+    for chunk in chunks:
+        offset, begin = begin + chunk.offset, begin + len(chunk.data)
+        if offset < begin:  # a record begins in this one
+            break
+    data = b"".join(chunk.data for chunk in chunks)
+    return first._replace(message=run[-1].message, chunk=chunks[0]._replace(data=data, offset=offset), parts=len(run))
 
 
 @dataclass(slots=True)

@@ -173,12 +173,13 @@ class Vehicle:
             timestamp = self.clock.newest
         if topic not in self._topics or is_redundant or timestamp is None:
             return None
-        fields = {name: value for name, value in fields_of(message).items() if value is not None}
-        if not fields:
-            return None
         instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
         address = Address(self._name, topic, instance)
-        if log is not None and log.delivers(address):
+        is_delivered = log is not None and log.delivers(address)
+        if is_delivered and kind in CONVERSIONS:
+            return None
+        fields = {name: value for name, value in fields_of(message).items() if value is not None}
+        if not fields or is_delivered:  # a text is discarded
             return None
         if timestamp < (last := self._last.get(address, 0)):
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
