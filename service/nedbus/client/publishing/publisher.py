@@ -178,7 +178,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         require_unforked()
         encoding = self._encoding
         if len(provided) != len(self._all):
-            if provided is not (last := self._partial[0]) and provided != last:  # usually the same fields are missing
+            known = self._partial[0]
+            if provided is not known and provided != known:  # rare: usually the same fields are missing
                 self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
         writer, downsampler = self._writer, self._downsampler
