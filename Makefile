@@ -107,6 +107,7 @@ bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow
 	$(BIN)/python -m benchmarks.ulog.files
 	$(BIN)/python -m benchmarks.ulog.stream
 	$(BIN)/python -m benchmarks.ulog.service
+	$(BIN)/python -m benchmarks.ulog.memory
 	$(BIN)/python -m benchmarks.metrics
 
 $(READY): pyproject.toml  # dependencies of nedbus
