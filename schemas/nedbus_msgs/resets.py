@@ -38,7 +38,7 @@ JUMP_FIELDS: Final = (
     *sorted({each for names in (*_VALUES.values(), *_RATES.values()) for each in names}),
     *(f"delta_{name}" for name in _VALUES), *_ORIGIN, "unaided_heading",
 )  # fmt: skip
-"""The fields that `jump_of` needs besides `timestamp`, `xy_global` and the reset counter."""
+"""The fields that `jump_of` needs besides `timestamp` and the reset counter."""
 
 _REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
 _MAX_INTERVAL: Final = 3.0  # s for which the rates at both ends determine the motion well enough to find a step
@@ -126,8 +126,7 @@ class ResetTracker:
 
 def _by_name(message: Message) -> dict[str, Any]:
     """Return what `jump_of` needs of a model or a row."""
-    names = ("timestamp", "xy_global", *RESET_COUNTERS.values(), *JUMP_FIELDS)
-    return {name: getattr(message, name) for name in names}
+    return {name: getattr(message, name) for name in ("timestamp", *RESET_COUNTERS.values(), *JUMP_FIELDS)}
 
 
 def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any]) -> Point | None:
@@ -142,7 +141,8 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     delta = after[f"delta_{name}"]
     announced = [delta if isinstance(delta, tuple) else (delta,)] * ((after[counter] - before[counter]) % 256 == 1)
     if name in ("xy", "z") and _is_moved(*(tuple(fields[each] for each in _ORIGIN) for fields in (before, after))):
-        announced += [(0.0,) * len(values), _shift_of_origin(name, before, after)]
+        shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])
+        announced += [(0.0,) * len(values), shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],)]
     announced = [jump for jump in announced if all(map(math.isfinite, jump))]
     motion = [_motion(value, before, after, seconds) for value in values]
     is_known = all(map(math.isfinite, motion))
@@ -177,12 +177,3 @@ def _motion(value: str, before: Mapping[str, Any], after: Mapping[str, Any], sec
         if rates := [rate for rate in (before[name], after[name]) if math.isfinite(rate)]:
             return fmean(rates) * seconds * (-1 if value == "dist_bottom" else 1)
     return math.nan
-
-
-def _shift_of_origin(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any]) -> Point:
-    """Return by how much a moved origin shifts coordinates; NaN if one of the origins is unknown."""
-    if name == "z":
-        return (after["ref_alt"] - before["ref_alt"],)
-    if not (before["xy_global"] and after["xy_global"]):
-        return (math.nan, math.nan)
-    return MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])

@@ -24,6 +24,7 @@ _RELATIVE: Final = "timestamp_time_relative"  # us from the message's timestamp 
 _TOLERANCE: Final = 1_000_000  # us; messages this close to the median agree
 _AGREEING: Final = 0.9  # fraction that must agree; a smaller one indicates several boots or a clock step
 _TAIL: Final = 0.1  # share of the messages that determines the offset after a correction
+_MIN_PART: Final = 3  # messages after the last correction
 _MAX_PARTS: Final = 3  # offsets until the last correction; more are a drift
 _MAX_CORRECTION: Final = 20e6  # us, more than all leap seconds; a larger step may be another boot
 _APART: Final = 1e6  # us between the messages of a source and all others, if both use the same clock
@@ -126,9 +127,7 @@ def _find_utc(streams: Mapping[str, MessageArray], boot_utc: int = 0) -> UtcOffs
                 reasons.append(f"the timestamps of {name}, which has UTC, are not on the clock of the other messages")
             elif (parts := _stable_parts(times[is_known], offsets)) is None:
                 low, high = np.quantile(offsets, [0.05, 0.95]) / 1e6
-                reasons.append(
-                    f"the UTC of {name} varies by {high - low:.0f} s: a drift, or a mixture of clocks or boots"
-                )
+                reasons.append(f"the UTC of {name} varies by {high - low:.0f} s: a drift, or several clocks or boots")
             else:
                 final, middle = parts[0], int(np.median(parts[0]))
                 corrected = middle - int(np.median(parts[1])) if len(parts) > 1 else 0
@@ -154,14 +153,13 @@ def _stable_parts(times: Any, offsets: Any) -> list[Any] | None:
         return None  # several boots
     parts, few = list[Any](), (1 - _AGREEING) * len(offsets)
     while len(offsets) > few:
-        tail = offsets[-max(1, int(_TAIL * len(offsets))) :]
-        is_late = _is_near(offsets, tail)
+        is_late = _is_near(offsets, offsets[-max(1, int(_TAIL * len(offsets))) :])
         begin = int(np.argmax(np.append(0, np.cumsum(np.where(is_late, -1, 1)))))
         if len(parts) == _MAX_PARTS or is_late[begin:].mean() < _AGREEING:
             return None
         parts.append(offsets[begin:][is_late[begin:]])
         offsets = offsets[:begin]
-    return parts if np.ptp([*map(np.median, parts)]) <= _MAX_CORRECTION else None
+    return parts if len(parts[0]) >= _MIN_PART and np.ptp([*map(np.median, parts)]) <= _MAX_CORRECTION else None
 
 
 def _is_near(offsets: Any, typical: Any) -> Any:

@@ -357,6 +357,7 @@ _OFF = 2_000_000
         ([_OFF] * 20 + [0] * 20 + [10**13] + [0] * 19, -_OFF),  # one wild value
         ([0] * 8 + [_OFF] * 3 + [0], None),
         ([-(10**11)] + [_OFF] * 20 + [0] * 20, -_OFF),  # a wild first value
+        ([0, 5_000_000, 10_000_000], None),
         ([_OFF, 0] * 10, None),  # two receivers in one stream
         ([300_000 * number for number in range(40)], None),  # a drift
         ([30_000_000] * 20 + [0] * 20, None),  # another boot

@@ -42,10 +42,7 @@ class NotAcceptedError(Exception):
 
 
 class WireFormat(NamedTuple):
-    """Definition and layout of a stream's messages.
-
-    `unknown`: fields of a newer layout, by name or type. `is_literal`: the type hash takes `char` literally.
-    """
+    """Definition and layout of messages; `unknown`: fields of a newer layout; `is_literal`: of a hash with literal char."""
 
     definition: Definition[Any]
     layout: Layout
