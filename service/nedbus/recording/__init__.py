@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .reading import read
     from .recorder import Recorder
     from .ulog_reader import UlogReader
-    from .utc import UtcOffset, utc_of
+    from .utc import UtcOffset, find_utc, utc_of
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
@@ -26,7 +26,7 @@ else:
         ("", "reading"): "read",
         ("", "flight_files"): "check_recording distinct_names find_format format_of matching open_flight",
         ("", "ulog_reader"): "UlogReader",
-        ("", "utc"): "UtcOffset utc_of",
+        ("", "utc"): "UtcOffset find_utc utc_of",
         ("mcap", "mcap_reader"): "RecordedMessage RecordingReader",
         ("mcap", "recorder"): "Recorder",
         ("mcap", "mcap_writer"): "RecordingWriter",

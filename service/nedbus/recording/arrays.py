@@ -175,10 +175,6 @@ def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
         parts = [np.full(len(table), np.nan) if old is None else columns[old] for old in olds]
         messages[name] = [convert(*values) for values in zip(*(part.tolist() for part in parts), strict=True)]
     decoded.valid[:] = arrays_of(definition).valid_mask(messages)
-    for name, column in columns.items():
-        if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
-            invalid = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
-            decoded.valid[invalid.reshape(len(messages), -1).any(axis=1)] = False
     return decoded
 
 

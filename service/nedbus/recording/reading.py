@@ -16,7 +16,7 @@ from nedbus_msgs.arrays import MessageArray
 
 from .arrays import Flight, Library, Pandas, Polars, Streams, addresses_of, to_dataframe
 from .flight_files import distinct_names, matching, require_one_vehicle, single_match
-from .utc import utc_of
+from .utc import find_utc
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,8 +114,9 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
         wanted = topics and [each.removeprefix(f"{name}/") for each in topics if each.partition("/")[0] not in others]
         if vehicle not in (ANY, name) or wanted == []:
             continue
-        if (utc := utc_of(path, vehicle=own)) is None:
-            raise SourceError(str(path), "no message provides UTC, which reading several files requires; read it alone")
+        if isinstance(utc := find_utc(path, vehicle=own), str):
+            reason = utc or "no message contains UTC"
+            raise SourceError(str(path), f"{reason}, which reading several files requires; read it alone")
         found, start = read_streams(path, wanted, vehicle=own)
         starts.append(int(utc.unix_us(start)) if start else 0)
         for stream, (messages, absent) in found.items():

@@ -40,18 +40,20 @@ class UlogReader:
         self._checksums: dict[ulog.LoggedStream, int] = {}
         self._firsts: dict[ulog.LoggedStream, ulog.LoggedStream] = {}
         self.streams: dict[Address, ulog.LoggedStream] = {}
-        self.dropout, self.damaged = 0.0, False
+        self._unset_bools: Counter[str] = Counter()  # by topic
+        self.dropout, self.damaged, self._is_read = 0.0, False, False
 
     @property
     def warnings(self) -> list[str]:
-        """Damage found and parts skipped so far."""
+        """Damage found and parts skipped so far; counts are listed once the log has been read."""
         warnings = self._warnings + [reason for stream in self.streams.values() for reason in stream.omitted.values()]
-        if self._damages > _MAX_NAMED:
-            warnings.append(f"further damaged locations ({self._damages - _MAX_NAMED})")
-        if self._parser.undecodable:
-            warnings.append(f"skipped messages without a definition ({self._parser.undecodable})")
-        if self._texts.limit.omitted:
-            warnings.append(f"left out log messages above 100 per second ({self._texts.limit.omitted})")
+        counts = {
+            "further damaged locations": self._damages - _MAX_NAMED,
+            "skipped messages without a definition": self._parser.undecodable,
+            "left out log messages above 100 per second": self._texts.limit.omitted,
+            **{ulog.UNSET_BOOLS.format(topic): count for topic, count in self._unset_bools.items()},
+        }
+        warnings += [f"{text} ({count})" for text, count in counts.items() if count > 0 and self._is_read]
         return [*warnings, *filter(None, [self._texts.problem])]
 
     def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:
@@ -60,6 +62,7 @@ class UlogReader:
         Raises SourceError if the file is not a ULog file, or has none of the topics.
         """
         streams, checksums, firsts, data = self._opened, self._checksums, self._firsts, ulog.Data
+        to_int = int.from_bytes
         for records in self._records():
             for record in self._texts.merge(records):
                 if not isinstance(record, data):
@@ -74,6 +77,8 @@ class UlogReader:
                     if stream in checksums:
                         checksums[stream] = crc32(payload, checksums[stream])
                     if stream not in firsts:
+                        if (mask := subscription.layout.bool_mask) and to_int(payload, "little") & mask:
+                            self._unset_bools[subscription.name] += subscription.layout.count_unset_bools(payload)
                         yield stream, payload
         for second, first in firsts.items():
             if checksums.get(second) != checksums.get(first):
@@ -96,6 +101,7 @@ class UlogReader:
                     self.position += len(chunk)
                     yield self._parser.feed(chunk)
             yield self._parser.close()
+            self._is_read = True
             self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
         except ulog.UlogError as exc:
             raise SourceError(str(self._path), f"not a readable ULog file ({exc})") from exc

@@ -74,10 +74,17 @@ class Flights:
 
     @cached_property
     def times(self) -> Times:  # lazy, because it loads NumPy
-        """The UTC offset of each vehicle for which `utc_of` finds one."""
-        names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
-        found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
-        return Times(offsets={name: utc.offset_us / 1e6 for name, utc in found if utc is not None})
+        """The UTC offset of each vehicle for which `find_utc` finds one, and remarks on it."""
+        offsets, remarks = dict[str, float](), dict[str, str]()
+        for path, own, name in ((path, own, name) for path, _, names in self._files for own, name in names.items()):
+            utc = recording.find_utc(path, vehicle=own)
+            if not isinstance(utc, str):
+                offsets[name] = utc.offset_us / 1e6
+                seconds = utc.corrected_us / 1e6
+                utc = f"{utc.source} corrected its UTC by {seconds:+.1f} s in flight" if seconds else ""
+            if utc:
+                remarks[name] = utc
+        return Times(offsets=offsets, remarks=remarks)
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in chronological order; raise SourceError if one of several files has no UTC."""
@@ -96,7 +103,8 @@ class Flights:
         times = ((self.times.utc_of_boot(names[each.address.vehicle], boot), each.due) for each, boot in known)
         found = [utc - due for utc, due in times if utc is not None]
         if not found:
-            raise SourceError(str(path), "no message provides UTC, which merging several files requires; read it alone")
+            reason = next(filter(None, map(self.times.remarks.get, names.values())), "no message contains UTC")
+            raise SourceError(str(path), f"{reason}, which merging several files requires; read it alone")
         return median(found)
 
     def _shift(self, run: ReplayRun, names: Mapping[str, str], offset: float) -> Iterator[SourceMessage]:

@@ -223,7 +223,7 @@ class LoggedStream:
         """A function that validates and encodes a message; it returns None for an invalid one."""
         layout = self.subscription.layout
         types = {name: kind for name, kind, _ in layout.fields}
-        return record_encoder(self.definition, types, layout.unpack, layout.bool_mask)
+        return record_encoder(self.definition, types, layout.unpack)
 
     def decode(self, payload: bytes) -> dict[str, Any]:
         """Decode a message; leave out fields whose value does not fit their target type."""

@@ -17,7 +17,7 @@ from .fields import DECODED
 from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
-from .receive_queue import Received, ReceiveQueue
+from .receive_queue import Received, ReceiveQueue, join_data
 from .saved_stream import read_stream, state_path
 from .sequence import SequenceCounter
 
@@ -34,6 +34,7 @@ _LOG_DATA: Final[Mapping[int, str]] = {
     number: each.msgname for number, each in dialect.mavlink_map.items() if each.msgname.startswith("LOGGING_DATA")
 }
 _TICK: Final = 0.05  # s, the longest wait of the thread
+_PAUSE: Final = 0.01  # s between two reads during a stream: several messages at once need less processor time
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
@@ -59,7 +60,7 @@ class LinkReader:
 def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterator[Received | Rejection]:
     """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival."""
     for message in parser.parse_buffer(data) or []:
-        raw = bytes(message.get_msgbuf())
+        raw = message.get_msgbuf()
         if message.get_type() == "BAD_DATA":
             yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue
@@ -183,8 +184,15 @@ class LogReceiver:
             self._waiting.fail(exc)
 
     def _step(self) -> None:
-        for item in self._reader.read(_TICK):
-            self._waiting.put(self._process(item) if isinstance(item, Received) else item)
+        if any(vehicle.client.status.state == "streaming" for vehicle in self.vehicles.values()):
+            self._stop.wait(_PAUSE)
+        items = list[Received | Rejection]()
+        try:
+            for item in self._reader.read(_TICK):
+                items.append(self._process(item) if isinstance(item, Received) else item)
+        finally:  # the link may break
+            if items:
+                self._waiting.put(*join_data(items))
         for vehicle in self.vehicles.values():
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
@@ -234,17 +242,15 @@ class LogReceiver:
         if not vehicle.client.accepts(*target):
             if not is_ours:
                 return received
-            where, reason = (
-                f"{self._reader.name} system {received.system}",
-                f"{kind} of a stream that was not requested",
-            )
-            if vehicle.refusal:
-                where, reason = f"{where}, ULog stream", "the ULog stream of an earlier process cannot be continued"
-                reason += f", because {vehicle.refusal}; it restarts after disarming, or at once with log=armed"
-            return Rejection(where, reason)
+            where = f"{self._reader.name} system {received.system}"
+            if not vehicle.refusal:
+                return Rejection(where, f"{kind} of a stream that was not requested")
+            reason = f"the ULog stream of an earlier process cannot be continued, because {vehicle.refusal}"
+            remedy = "it restarts after disarming, or at once with log=armed"
+            return Rejection(f"{where}, ULog stream", f"{reason}; {remedy}")
         fields = message.sequence, message.length, message.first_message_offset, message.data
         chunk = vehicle.reassembly.add(*fields, now)
-        received = received._replace(chunk=chunk)
+        received = Received(*received[:-2], chunk)  # takes a third of the time of `_replace`
         if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
             vehicle.clock.confirm()
         is_acked = kind == "LOGGING_DATA_ACKED"
