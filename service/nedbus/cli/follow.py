@@ -1,11 +1,13 @@
 """Receive loop of commands with a subscription; it logs when the router link is lost and restored."""
 
 import logging
+import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 from nedbus.client import Bus, Sample, Subscription
-from nedbus.errors import NoDataError
+from nedbus.errors import ClosedError, NoDataError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
@@ -23,7 +25,7 @@ def follow(
     duration: float | None,
     each_second: Callable[[], object] = lambda: None,
 ) -> None:
-    """Handle samples until `count` are counted or `duration` [s] has passed.
+    """Handle samples until `count` are counted, or all that are received until `duration` [s] has passed or Ctrl-C.
 
     `handle` returns False for a sample that does not count. Every second, the link is checked and `each_second` called.
 
@@ -33,23 +35,30 @@ def follow(
     end = float("inf") if duration is None else start + duration
     next_second = start + 1.0
     connected, noticed, seen = True, False, 0
-    while (now := time.monotonic()) < end and (count is None or seen < count):
-        if now >= next_second:
-            next_second = max(next_second + 1.0, now)
-            if connected != bus.connected:
-                connected = not connected
-                text = "the link to %s is up again" if connected else "the link to %s is lost: reconnecting"
-                event = "link_up" if connected else "link_lost"
-                _log.warning(text, " or ".join(bus.routers), extra=about(event))
-            each_second()
-        if not seen and not noticed and now > start + TIMINGS.first_sample:
-            noticed = True
-            write_notice(subscription)
-        try:
-            sample = subscription.receive(max(0.0, min(end, next_second) - now))
-        except NoDataError:
-            continue
-        seen += handle(sample) is not False
+    try:
+        while (now := time.monotonic()) < end and (count is None or seen < count):
+            if now >= next_second:
+                next_second = max(next_second + 1.0, now)
+                if connected != bus.connected:
+                    connected = not connected
+                    text = "the link to %s is up again" if connected else "the link to %s is lost: reconnecting"
+                    event = "link_up" if connected else "link_lost"
+                    _log.warning(text, " or ".join(bus.routers), extra=about(event))
+                each_second()
+            if not seen and not noticed and now > start + TIMINGS.first_sample:
+                noticed = True
+                write_notice(subscription)
+            try:
+                sample = subscription.receive(max(0.0, min(end, next_second) - now))
+            except NoDataError:
+                continue
+            seen += handle(sample) is not False
+    finally:
+        if not isinstance(sys.exception(), Exception):  # the end, or Ctrl-C; a second Ctrl-C ends the output
+            subscription.drain()
+            with suppress(ClosedError):
+                while count is None or seen < count:
+                    seen += handle(subscription.receive(0.0)) is not False
     if not seen:
         raise NoDataError(subscription.name, duration or 0.0)
     each_second()

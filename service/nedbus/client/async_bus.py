@@ -93,8 +93,8 @@ class AsyncBus:
     ) -> AsyncSubscription[Any]:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
-        pending_queue = bus._make_queue(selection, mode, max_rate)
-        return AsyncSubscription(partial(self._in_thread, bus._open_receiver, pending_queue), pending_queue)
+        inbox = bus._make_inbox(selection, mode, max_rate)
+        return AsyncSubscription(partial(self._in_thread, bus._open_receiver, inbox), inbox)
 
     @overload
     async def latest(

@@ -20,7 +20,7 @@ from .fleet_tokens import FleetTokens
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver, find_schemas
+from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiver, Receiver, find_schemas
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
@@ -99,8 +99,8 @@ class Bus(AbstractContextManager["Bus"]):
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
     ) -> Subscription[Any]:
         """Subscribe to a selection of addresses; see `subscribe`."""
-        pending_queue = self._make_queue(selection, mode, max_rate)
-        return Subscription(self._open_receiver(pending_queue), pending_queue, owner=self)
+        inbox = self._make_inbox(selection, mode, max_rate)
+        return Subscription(self._open_receiver(inbox), inbox, owner=self)
 
     @overload
     def latest(
@@ -225,20 +225,18 @@ class Bus(AbstractContextManager["Bus"]):
         if self.closed:
             raise ClosedError
 
-    def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> PendingQueue:
+    def _make_inbox(self, selection: Selection, mode: Mode, max_rate: float | None) -> Inbox:
         """Return the queue of a new subscription; also used by AsyncBus."""
         self._require_open()
         decoder = Decoder(self._layouts, prefix=self.prefix)
         if max_rate is None:
-            return PendingQueue(mode, decoder, name=selection.key_expr(prefix=self.prefix))
-        return MaxRateQueue(mode, decoder, selection, max_rate=max_rate)
+            return Inbox(mode, decoder, name=selection.key_expr(prefix=self.prefix))
+        return MaxRateInbox(mode, decoder, selection, max_rate=max_rate)
 
-    def _open_receiver(self, pending: PendingQueue) -> Receiver:
+    def _open_receiver(self, inbox: Inbox) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
         session = self._session
-        receiver = (
-            MaxRateReceiver(session, pending) if isinstance(pending, MaxRateQueue) else Receiver(session, pending)
-        )
+        receiver = MaxRateReceiver(session, inbox) if isinstance(inbox, MaxRateInbox) else Receiver(session, inbox)
         self._receivers.add(receiver)
         if self.closed:  # closed by another thread in the meantime
             receiver.close()

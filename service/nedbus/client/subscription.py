@@ -17,7 +17,7 @@ from nedbus.errors import ClosedError, NoDataError
 from nedbus.transport import require_unforked
 
 from .closing import Finalizer
-from .receiving import PendingQueue, Receiver
+from .receiving import Inbox, Receiver
 from .sample import Counts, M_co, Sample
 
 if TYPE_CHECKING:
@@ -27,37 +27,37 @@ _T = TypeVar("_T")
 
 
 class _SubscriptionBase(Generic[M_co]):
-    def __init__(self, pending_queue: PendingQueue) -> None:
-        self.name = pending_queue.name
-        self._queue = pending_queue
-        self._pop_row = partial(pending_queue.pop, rows=True)
+    def __init__(self, inbox: Inbox) -> None:
+        self.name = inbox.name
+        self._inbox = inbox
+        self._pop_row = partial(inbox.pop, rows=True)
 
     @property
     def closed(self) -> bool:
         """True once the subscription or its bus is closed, or receiving has failed."""
-        return self._queue.ended
+        return self._inbox.ended
 
     @property
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far."""
-        return self._queue.counts
+        return self._inbox.counts
 
     @property
     def waiting(self) -> int:
         """Number of received messages not yet read."""
-        return self._queue.waiting
+        return self._inbox.waiting
 
 
 class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription[M_co]"]):
     """Iterator over received samples; `bus.subscribe(...)` returns one.
 
-    Iteration waits for the next sample and ends when the subscription or the bus is closed; it raises ReceiveError if
-    the session or the receiving thread fails.
+    Iteration waits for the next sample and ends when the subscription or the bus is closed. If the session or the
+    receiving thread fails, it raises ReceiveError after the last sample received.
     The subscription closes itself when it is no longer referenced and when the process exits.
     """
 
-    def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, owner: object) -> None:
-        super().__init__(pending_queue)
+    def __init__(self, receiver: Receiver, inbox: Inbox, *, owner: object) -> None:
+        super().__init__(inbox)
         self._receiver, self._owner = receiver, owner  # the owner keeps the bus open
         self._finalizer = Finalizer(self, receiver.close)
 
@@ -67,14 +67,14 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
         Raises NoDataError if none arrives within `timeout` seconds, ClosedError if the subscription is closed,
         ReceiveError if it has failed.
         """
-        return self._next(self._queue.pop, timeout)
+        return self._next(self._inbox.pop, timeout)
 
     def receive_batch(self, timeout: float | None = None) -> Batch:
         """Wait for at least one message and return unread ones as arrays, as `batches` does.
 
         Raises the errors of `receive`.
         """
-        return self._next(self._queue.pop_batch, timeout)
+        return self._next(self._inbox.pop_batch, timeout)
 
     def rows(self) -> Iterator[Sample[M_co]]:
         """Iterate over samples whose `message` is a Row, a named tuple: faster, with the same validation."""
@@ -85,10 +85,17 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
 
         In mode `every` a batch has up to 4096 messages, in mode `latest` the newest of each of up to 10,000 keys.
         """
-        return self._each(self._queue.pop_batch)
+        return self._each(self._inbox.pop_batch)
+
+    def drain(self) -> None:
+        """End reception: received samples can still be read, then iteration ends, and `receive` raises ClosedError.
+
+        In mode "every", gaps that are being recovered count as lost.
+        """
+        self._receiver.close(discard=False)
 
     def close(self) -> None:
-        """Close the subscription; a second call does nothing."""
+        """Close the subscription; unread messages count as dropped. A second call does nothing."""
         self._finalizer.close_now()
 
     def __iter__(self) -> Iterator[Sample[M_co]]:
@@ -96,7 +103,7 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
 
     def __next__(self) -> Sample[M_co]:
         try:
-            return self._next(self._queue.pop)
+            return self._next(self._inbox.pop)
         except ClosedError:
             raise StopIteration from None
 
@@ -106,14 +113,15 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
     def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
         require_unforked()
         deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
-        if self._queue.newest_only:
+        if self._inbox.newest_only:
             self._receiver.receive()  # newer samples may be in the ring
         while True:
-            if self._queue.ended:
-                raise self._queue.end_error
+            ended = self._inbox.ended  # before `pop`: all that was received is in the inbox then
             item = pop()
             if item is not None:
                 return item
+            if ended:
+                raise self._inbox.end_error
             if not self._receiver.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
                 raise NoDataError(self.name, timeout or 0.0)
 
@@ -130,9 +138,10 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
     It opens on first use and is bound to the event loop running at that time.
     """
 
-    def __init__(self, open_receiver: Callable[[], Awaitable[Receiver]], pending_queue: PendingQueue) -> None:
-        super().__init__(pending_queue)
+    def __init__(self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox) -> None:
+        super().__init__(inbox)
         self._open_receiver = open_receiver
+        self._receiver: Receiver | None = None
         self._finalizer: Finalizer | None = None
         self._opening: asyncio.Task[None] | None = None
         self._arrival = asyncio.Event()
@@ -140,11 +149,11 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
     async def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it; `timeout` and errors as in `Subscription.receive`."""
-        return await self._next(self._queue.pop, timeout)
+        return await self._next(self._inbox.pop, timeout)
 
     async def receive_batch(self, timeout: float | None = None) -> Batch:
         """Wait for at least one message and return unread ones, as `Subscription.receive_batch` does."""
-        return await self._next(self._queue.pop_batch, timeout)
+        return await self._next(self._inbox.pop_batch, timeout)
 
     def rows(self) -> AsyncIterator[Sample[M_co]]:
         """Iterate over rows as `Subscription.rows` does."""
@@ -152,23 +161,29 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
     def batches(self) -> AsyncIterator[Batch]:
         """Iterate over NumPy arrays as `Subscription.batches` does."""
-        return self._each(self._queue.pop_batch)
+        return self._each(self._inbox.pop_batch)
+
+    async def drain(self) -> None:
+        """End reception, as `Subscription.drain` does; a subscription that has not been opened is closed."""
+        if self._receiver is None:
+            await self.close()
+        else:
+            await _in_new_thread(partial(self._receiver.close, discard=False))
 
     async def close(self) -> None:
-        """Close the subscription; a second call does nothing."""
-        self._queue.end()
+        """Close the subscription, as `Subscription.close` does; a second call does nothing."""
+        self._inbox.end(discard=True)
         if self._opening is not None:
             await asyncio.wait([self._opening])
         if self._finalizer is not None:
-            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new thread: the pool's threads may be blocked
-            await asyncio.get_running_loop().run_in_executor(thread, self._finalizer.close_now)
+            await _in_new_thread(self._finalizer.close_now)
 
     def __aiter__(self) -> AsyncIterator[Sample[M_co]]:
         return self
 
     async def __anext__(self) -> Sample[M_co]:
         try:
-            return await self._next(self._queue.pop)
+            return await self._next(self._inbox.pop)
         except ClosedError:
             raise StopAsyncIteration from None
 
@@ -188,11 +203,12 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
                 await self._open()
                 while True:
                     self._arrival.clear()
-                    if self._queue.ended:
-                        raise self._queue.end_error
+                    ended = self._inbox.ended  # before `pop`, as in Subscription
                     item = pop()
                     if item is not None:
                         return item
+                    if ended:
+                        raise self._inbox.end_error
                     await self._arrival.wait()
         except TimeoutError:
             raise NoDataError(self.name, timeout or 0.0) from None
@@ -208,7 +224,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         loop, opening = asyncio.get_running_loop(), self._opening
         if opening is not None and opening.get_loop() is not loop:
             raise RuntimeError(f"the subscription to {self.name} is bound to another event loop: subscribe in this one")
-        if self._finalizer is not None or self._queue.ended:
+        if self._finalizer is not None or self._inbox.ended:
             return
         if opening is None or opening.done():
             opening = self._opening = loop.create_task(self._open_in(loop))
@@ -216,10 +232,15 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         await asyncio.shield(opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._queue.on_wake = partial(_wake, loop, self._arrival)
-        receiver = await self._open_receiver()
+        self._inbox.on_wake = partial(_wake, loop, self._arrival)
+        receiver = self._receiver = await self._open_receiver()
         receiver.pump()
         self._finalizer = Finalizer(self, receiver.close)
+
+
+async def _in_new_thread(close: Callable[[], object]) -> None:
+    """Close in a new thread, because the pool's threads may be blocked."""
+    await asyncio.get_running_loop().run_in_executor(ThreadPoolExecutor(1, "nedbus-close"), close)
 
 
 def _wake(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> None:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import suppress
 from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
@@ -43,7 +44,7 @@ class Recorder:
         return ", ".join([f"{self.messages} message{'s' * (self.messages != 1)}", *counts])
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
-        """Record until `stop` is set, for `duration` seconds, or until the subscription is closed.
+        """Record until `stop` is set, for `duration` seconds, or until the subscription is closed; then drain it.
 
         Raises OutputError if the file exists or cannot be written. Raises NoDataError, and removes the file, if no
         message arrived.
@@ -63,6 +64,10 @@ class Recorder:
                 if now >= next_flush:
                     self._writer.flush()
                     next_flush = now + _FLUSH_INTERVAL
+            self._subscription.drain()
+            with suppress(ClosedError):  # all is written
+                while True:
+                    _write(self._writer, self._subscription.receive_batch(0.0))
         if not self.messages:
             self._path.unlink(missing_ok=True)
             raise NoDataError(self._subscription.name, time.monotonic() - start)

@@ -7,13 +7,13 @@ from functools import partial
 from types import SimpleNamespace
 
 import nedbus
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
+from nedbus.client.receiving import Decoder, Inbox, LayoutLookup, Receiver
 from nedbus.transport import RawSample, RetransmitRequest, Session
 
 from .numbered import publish, receive_timestamps
 
 
-class LossyQueue(PendingQueue):
+class LossyQueue(Inbox):
     """A queue that loses the messages whose sequence numbers are in `missing`."""
 
     def __init__(self, key_expr: str) -> None:

@@ -19,7 +19,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
+from nedbus.client.receiving import Decoder, Inbox, LayoutLookup, Receiver
 from nedbus.transport import Session, open_router
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
@@ -304,7 +304,7 @@ def test_garbage_collection_closes_on_the_closer_thread() -> None:
             with lock:
                 closed.append(threading.current_thread())
 
-    queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
+    queue = Inbox("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
     subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, owner=None)
     with lock:  # garbage collection may run while this thread holds it
         del subscription

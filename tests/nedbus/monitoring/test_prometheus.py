@@ -37,10 +37,10 @@ TIMEOUT = 90.0  # s until all alerts have fired, or cleared
 # nedbus with timeouts of one second for retransmission and backoff, and queues of 100 instead of 65,536 messages, which
 # a small burst overflows.
 SHORT_TIMEOUTS = """
-import nedbus.client.receiving.pending_queue
+import nedbus.client.receiving.inbox
 from nedbus.cli import main
 from nedbus.timings import TIMINGS
-nedbus.client.receiving.pending_queue.CAPACITY = 100
+nedbus.client.receiving.inbox.CAPACITY = 100
 TIMINGS.retransmit_timeout, TIMINGS.backoff = 1.0, (1.0,)
 main()
 """

@@ -3,72 +3,29 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final
 
 import zenoh
 
 from nedbus import clock
 from nedbus.client.protocol import LIVE
-from nedbus.client.rate_gate import RateGate
 from nedbus.client.sample import Sample
 from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
 from nedbus.transport import RawSample
-from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, Provenance, codec_of, identity_of, provenance_of
+from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, codec_of, identity_of, provenance_of
 
+from .arrival import NO_LAYOUTS, Arrival, DetachedSample, Layouts, Stream, encoding_of
 from .layout_lookup import LayoutLookup, Sender
-
-if TYPE_CHECKING:
-    from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
 
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
 _MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
-_MAX_ENCODING: Final = 512  # characters kept of an encoding; nedbus's own encodings have at most 250
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
-
-
-@dataclass(slots=True, eq=False)
-class KeyState:
-    """State of a key: address, codec, writer proxies and losses not yet reported."""
-
-    key: str  # key of the full-rate stream
-    wire_key: str  # key on which messages arrive, perhaps downsampled
-    address: Address
-    codec: Codec[Any] | None = None  # None for messages not built in: each encoding identifies a definition
-    size: int = -1  # bytes of a payload with all fields
-    encoding: tuple[object, str] = None, ""  # last encoding: Zenoh's object and its text; accessed by two threads
-    provenance: tuple[str, Provenance] = "", Provenance()  # last provenance, with its encoding
-    writers: dict[str, WriterProxy] = field(default_factory=dict)  # by name
-    writer: WriterProxy | None = None  # publisher of the last message
-    last_active: float = 0.0  # monotonic time of the last message or heartbeat [s]
-    gap: int = 0  # messages lost before the next delivery
-    unreported: int = 0  # messages lost before one that was dropped or invalid; the next sample read reports them
-    gate: RateGate | None = None  # set with a maximum rate, once a downsampled message has arrived
-    last_sent: float = -math.inf  # with a maximum rate, time of sending of the retained message [ns]
-
-
-class DetachedSample(NamedTuple):
-    """Metadata of a sample, detached from Zenoh's receive buffer, which a waiting sample would keep in memory."""
-
-    timestamp: zenoh.Timestamp | None
-    source_info: zenoh.SourceInfo | None
-    encoding: str
-    retained: bool
-
-
-Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int, int]
-"""An admitted message: key state, payload (empty if rejected), metadata, number of messages lost before it, and the
-time at which it left Zenoh's ring [ns].
-
-A plain tuple: a class with named fields would add 0.1 us to the 0.3 us that a message of a batch takes.
-"""
 
 
 class Decoder:
@@ -79,10 +36,10 @@ class Decoder:
         self._warned: set[int] = set()  # hashes, because keys may be long
         self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject
 
-    def open(self, key: str) -> KeyState:
+    def open(self, key: str) -> Stream:
         """Return the state of a new stream; raise AddressError if the key has no address."""
         address = Address.from_key(key.partition(RATE)[0], prefix=self.prefix)
-        stream = KeyState(address.key(prefix=self.prefix), key, address)
+        stream = Stream(address.key(prefix=self.prefix), key, address)
         if address.topic in BY_TOPIC:
             stream.codec = codec_of(BY_TOPIC[address.topic])
             stream.size = stream.codec.size
@@ -100,44 +57,51 @@ class Decoder:
             stream = None
             try:
                 stream = self.open(key)
-                self.inspect(stream, payload, raw)
+                codec, newer = self.inspect(stream, payload, raw)
+                arrival = Arrival(stream, payload, raw, codec, 0, received, newer)
             except (AddressError, DecodeError) as exc:
                 self.reject(key, exc, stream)
             else:
-                if sample := self.decode((stream, payload, raw, 0, received), rows=False):
+                if sample := self.decode(arrival, rows=False):
                     sample.retained = True
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     yield sample
 
-    def find_codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
-        """Return the codec of the definition in the encoding, from its publisher; None if no publisher has it.
+    def inspect(self, stream: Stream, payload: bytes, raw: RawSample) -> tuple[Codec[Any] | None, Layouts]:
+        """Return the codec of a sample's definition, and its layout if that is newer than those built in.
 
-        `wait`: wait for a lookup in progress; never do so on a receiving thread.
-        Raises DecodeError if the encoding identifies no message.
+        The codec is None while a lookup is in progress, which this may start; it does not wait.
+        Raises DecodeError if the sample is invalid. A payload of the expected size is checked when it is read.
         """
-        encoding = encoding_of(stream, raw)
-        identity = identity_of(encoding)
-        if identity is None:
-            text = f"the encoding {encoding!r:.100} has no message name and hash"
-            raise DecodeError(f"unknown message or layout, and {text}")
-        sender = Sender(stream.address.vehicle, raw.source_info and raw.source_info.source_id.zid)
-        return self._layouts.codec(*identity, sender=sender, wait=wait)
+        if len(payload) > PAYLOAD_LIMIT:
+            raise DecodeError(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
+        if raw.kind == zenoh.SampleKind.DELETE:
+            raise DecodeError("a delete sample, which nedbus publishers never send")
+        newer = NO_LAYOUTS
+        codec = stream.codec or self._find_codec(stream, raw)
+        if codec and len(payload) != codec.size:
+            try:
+                codec.decode(payload)
+            except UnknownLayoutError as exc:
+                newer = self._find_layout(exc, stream, raw)
+                codec.decode(payload, newer=newer)
+        return codec, newer
 
-    def _newer(
-        self, error: UnknownLayoutError, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True
-    ) -> Mapping[int, Sequence[str]]:
-        """Return the fields of an unknown layout, which the hash in the encoding identifies; {} if there are none."""
-        if stream.codec is None:
-            return {}  # a definition that was looked up has a single layout
-        codec, name = self.find_codec(stream, raw, wait=wait), stream.codec.definition.name
-        return {error.layout: codec.definition.names} if codec and codec.definition.name == name else {}
+    def define(self, arrivals: Sequence[Arrival]) -> Sequence[Arrival]:
+        """Return arrivals of one type with their codec; wait for its lookup, but never on a receiving thread.
+
+        This is the only wait for a definition, and all arrivals get the same answer.
+        """
+        unknown = next((each for each in arrivals if each.codec is None), None)
+        if unknown is None:
+            return arrivals
+        known = next((each.codec for each in arrivals if each.codec), None)
+        codec = known or self._find_codec(unknown.stream, unknown.raw, wait=True)
+        return [arrival._replace(codec=codec) for arrival in arrivals]
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
         """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
-        stream, payload, raw, _, received = arrival
-        if not payload:
-            return None
-        codec = stream.codec or self.find_codec(stream, raw)
+        stream, payload, raw, codec, _, received, newer = arrival
         encoding = encoding_of(stream, raw)
         if codec is None:
             self.reject(stream.key, DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"), stream)
@@ -145,9 +109,9 @@ class Decoder:
         decode = codec.decode_row if rows else codec.decode
         try:
             try:
-                message = decode(payload)
-            except UnknownLayoutError as exc:
-                message = decode(payload, newer=self._newer(exc, stream, raw))
+                message = decode(payload, newer=newer) if newer else decode(payload)
+            except UnknownLayoutError as exc:  # a newer layout that has the expected size
+                message = decode(payload, newer=self._find_layout(exc, stream, raw))
         except DecodeError as exc:
             self.reject(stream.key, exc, stream)
             return None
@@ -163,7 +127,7 @@ class Decoder:
         with self._counting:
             self.invalid += count
 
-    def reject(self, key: str, error: Exception, stream: KeyState | None) -> None:
+    def reject(self, key: str, error: Exception, stream: Stream | None) -> None:
         """Count an invalid sample and log the reason once per key, for the first 100 keys only."""
         with self._counting:
             self.invalid += 1
@@ -175,46 +139,22 @@ class Decoder:
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("ignored an invalid message on %r (%s)%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
-    def inspect(self, stream: KeyState, payload: bytes, raw: RawSample) -> None:
-        """Check a sample without waiting for a lookup, which it may start; raise DecodeError if it is invalid."""
-        if len(payload) > PAYLOAD_LIMIT:
-            raise DecodeError(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
-        if raw.kind == zenoh.SampleKind.DELETE:
-            raise DecodeError("a delete sample, which nedbus publishers never send")
-        codec = stream.codec or self.find_codec(stream, raw, wait=False)
-        if codec and len(payload) != codec.size:  # None: decoded on read; the lookup may be done by then
-            try:
-                codec.decode(payload)
-            except UnknownLayoutError as exc:
-                codec.decode(payload, newer=self._newer(exc, stream, raw, wait=False))
+    def _find_layout(self, error: UnknownLayoutError, stream: Stream, raw: RawSample | DetachedSample) -> Layouts:
+        """Return the fields of an unknown layout, which the hash in the encoding identifies; {} if it is not known."""
+        if stream.codec is None:
+            return NO_LAYOUTS  # a definition that was looked up has a single layout
+        codec, name = self._find_codec(stream, raw), stream.codec.definition.name
+        return {error.layout: codec.definition.names} if codec and codec.definition.name == name else NO_LAYOUTS
 
+    def _find_codec(self, stream: Stream, raw: RawSample | DetachedSample, *, wait: bool = False) -> Codec[Any] | None:
+        """Return the codec of the definition in the encoding, from its publisher; None if no publisher has it.
 
-def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:
-    """Return an arrival without a reference to Zenoh's receive buffer; `retained`: it predates the subscription."""
-    stream, payload, raw, lost, received = arrival
-    if isinstance(raw, DetachedSample):
-        return arrival
-    detached = DetachedSample(raw.timestamp, raw.source_info, encoding_of(stream, raw), retained)
-    return stream, payload, detached, lost, received
-
-
-def mark_retained(arrival: Arrival) -> Arrival:
-    """Return the first arrival of a publisher, marked as retained if Zenoh's history query returned it.
-
-    Only replies to queries use congestion control BLOCK; nedbus publishers use DROP.
-    """
-    raw = arrival[2]
-    is_reply = not isinstance(raw, DetachedSample) and raw.congestion_control == zenoh.CongestionControl.BLOCK
-    return detach(arrival, retained=True) if is_reply else arrival
-
-
-def encoding_of(stream: KeyState, raw: RawSample | DetachedSample) -> str:
-    """Return the encoding of a sample as text; it rarely changes, so the last one is cached and shared."""
-    if isinstance(raw, DetachedSample):
-        return raw.encoding
-    encoding = raw.encoding
-    known, text = stream.encoding
-    if encoding != known:
-        text = str(encoding)[:_MAX_ENCODING]
-        stream.encoding = zenoh.Encoding(text), text  # a copy: the original keeps its receive buffer in memory
-    return text
+        `wait`: wait for a lookup in progress. Raises DecodeError if the encoding identifies no message.
+        """
+        encoding = encoding_of(stream, raw)
+        identity = identity_of(encoding)
+        if identity is None:
+            text = f"the encoding {encoding!r:.100} has no message name and hash"
+            raise DecodeError(f"unknown message or layout, and {text}")
+        sender = Sender(stream.address.vehicle, raw.source_info and raw.source_info.source_id.zid)
+        return self._layouts.codec(*identity, sender=sender, wait=wait)

@@ -21,8 +21,9 @@ from nedbus.timings import TIMINGS
 from nedbus.transport import LivelinessTokens, RawSample, Session, send_query
 from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
 
-from .decoder import Arrival, Decoder, detach
-from .pending_queue import PendingQueue
+from .arrival import Arrival, detach
+from .decoder import Decoder
+from .inbox import Inbox
 from .receiver import Receiver
 
 _log = logging.getLogger(__name__)
@@ -32,7 +33,7 @@ _LAST_POLL: Final = 0.02  # s between polls for last messages
 _MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
 
 
-class MaxRateQueue(PendingQueue):
+class MaxRateInbox(Inbox):
     """Limit each stream to `max_rate` messages per second (see RateGate); raise ArgumentError unless it is valid.
 
     Messages omitted to limit the rate count neither as lost nor as dropped.
@@ -46,12 +47,14 @@ class MaxRateQueue(PendingQueue):
 
     def put_last(self, batch: Sequence[RawSample]) -> None:
         """Queue the last messages of streams that have delivered none yet."""
+        last: list[Arrival] = []
         with self._lock:
             for arrival in self._admit(batch):
-                stream = self._stream(self._rate_key(arrival[0].address))
-                if arrival[1] and stream.gate is None and stream.last_sent == -math.inf:
+                stream = self._streams.open(self._rate_key(arrival.stream.address), self._clock())
+                if arrival.payload and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
-                    self.counters.delivered.append(detach(arrival, retained=True))
+                    last.append(detach(arrival, retained=True))
+            self.gaps.delivered = last
             super()._queue()
         self.wake()
 
@@ -65,29 +68,29 @@ class MaxRateQueue(PendingQueue):
         return address.rate_key(self.rate, prefix=self.decoder.prefix)
 
     def _queue(self) -> int:
-        self.counters.delivered = [arrival for arrival in self.counters.delivered if self._passes(arrival)]
+        self.gaps.delivered = [arrival for arrival in self.gaps.delivered if self._passes(arrival)]
         return super()._queue()
 
     def _passes(self, arrival: Arrival) -> bool:
-        stream = arrival[0]
+        stream = arrival.stream
         stream.gate = stream.gate or RateGate(self._max_rate)
         passes = not 0 <= stream.last_sent - _sent(arrival) <= _MAX_OVERTAKE
         if self.rate > self._max_rate:  # below the lowest rate of publishers
             passes = passes and stream.gate.passes(time.monotonic_ns())
         if not passes:
-            stream.unreported += arrival[3]
+            stream.unreported += arrival.lost
         return passes
 
 
 class MaxRateReceiver(Receiver):
-    """Put downsampled and last messages into a MaxRateQueue until closed."""
+    """Put downsampled and last messages into a MaxRateInbox until closed."""
 
-    def __init__(self, session: Session, queue: MaxRateQueue) -> None:
-        self._prefix, self._rate_queue, selection = queue.decoder.prefix, queue, queue.selection
+    def __init__(self, session: Session, inbox: MaxRateInbox) -> None:
+        self._prefix, self._rate_inbox, selection = inbox.decoder.prefix, inbox, inbox.selection
         self._awaiting: dict[Address, float] = {}  # time at which the token of a stream without a message appeared [s]
         self._tokens = LivelinessTokens(session, selection.alive_key_expr(prefix=self._prefix))
         self._last = send_query(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
-        super().__init__(session, queue, history=False)
+        super().__init__(session, inbox, history=False)
         self._undeclares.append(self._tokens.undeclare)
         self.pump()  # last messages bypass the ring, so no reader may block on it
 
@@ -97,7 +100,7 @@ class MaxRateReceiver(Receiver):
             found = [reply.ok for reply in self._last.poll() if reply.ok is not None]
             # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
-                self._rate_queue.put_last(live)
+                self._rate_inbox.put_last(live)
             self._check_publishers(now)
         return pause if self._last.ended else min(pause, _LAST_POLL)
 
@@ -113,7 +116,7 @@ class MaxRateReceiver(Receiver):
         due = [address for address, since in self._awaiting.items() if now - since >= TIMINGS.downsampled_timeout]
         for address in due:
             del self._awaiting[address]
-        if missing := [address for address in due if not self._rate_queue.has_downsampled(address)]:
+        if missing := [address for address in due if not self._rate_inbox.has_downsampled(address)]:
             key, more = missing[0].key(prefix=self._prefix), f" and {len(missing) - 1} more" if missing[1:] else ""
             text = "no downsampled messages of %s%s arrive: subscribe without a maximum rate, or check the access rules"
             _log.warning(text, key, more, extra=about("unsupported"))
@@ -121,5 +124,5 @@ class MaxRateReceiver(Receiver):
 
 def _sent(arrival: Arrival) -> float:
     """Return the time of sending [ns]; infinity without a timestamp."""
-    stamp = arrival[2].timestamp
+    stamp = arrival.raw.timestamp
     return math.inf if stamp is None else stamp.get_time_as_ntp64().as_nanos()

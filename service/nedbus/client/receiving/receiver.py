@@ -24,7 +24,7 @@ from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ack_key
 
 from .decoder import WAKE_UP
-from .pending_queue import MAX_ACK_REQUESTS, AckRequest, PendingQueue
+from .inbox import MAX_ACK_REQUESTS, AckRequest, Inbox
 from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
@@ -42,14 +42,14 @@ _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
 
 
 class Receiver:
-    """Declare an advanced subscriber on a PendingQueue's key expression, and put samples into the queue until closed.
+    """Declare an advanced subscriber on an Inbox's key expression, and put samples into the inbox until closed.
 
     In mode `every` it also requests retransmissions and answers acknowledgement requests.
     With `history` the first samples are the last message of each publisher.
     """
 
-    def __init__(self, session: Session, pending_queue: PendingQueue, *, history: bool = True) -> None:
-        self._session, self._queue, key_expr = session, pending_queue, pending_queue.name
+    def __init__(self, session: Session, inbox: Inbox, *, history: bool = True) -> None:
+        self._session, self._inbox, key_expr = session, inbox, inbox.name
         self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", key_expr)
         self._changing = threading.Lock()
         self._closed = False
@@ -69,15 +69,15 @@ class Receiver:
         self._take_link: Callable[[], zenoh.TransportEvent | None] | None = None
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
-        if not pending_queue.newest_only:
+        if not inbox.newest_only:
             with translate_zenoh_errors():
                 queryable = session.declare_queryable(ack_key(key_expr), zenoh.handlers.RingChannel(MAX_ACK_REQUESTS))
                 links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
             self._undeclares += [queryable.undeclare, links.undeclare]
             self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
-            self._retransmission = Retransmission(session, pending_queue)
+            self._retransmission = Retransmission(session, inbox)
         self._job = Job(self._poll)
-        self._queue.on_gap = self._job.wake
+        self._inbox.on_gap = self._job.wake
 
     def receive(self) -> bool:
         """Drain the ring into the queue; return False at once if another thread is receiving."""
@@ -92,13 +92,13 @@ class Receiver:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until the queue may have a sample; return False after `timeout` seconds."""
-        if timeout is not None or self._pump is not None:
+        if timeout is not None or self._pump is not None or self._closed:
             self.pump()
-            return self._queue.wait(timeout)
+            return self._inbox.wait(timeout)
         if self._busy:
             time.sleep(_BUSY_PAUSE)
         if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds the lock for a shorter time
-            return self._queue.wait(None)
+            return self._inbox.wait(None)
         try:
             self._receive(if_empty=True)
         finally:
@@ -112,17 +112,21 @@ class Receiver:
                 self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
                 self._pump.start()
 
-    def close(self) -> None:
-        """End the subscription; a second call does nothing."""
+    def close(self, *, discard: bool = True) -> None:
+        """End the subscription; a second call does nothing, except to drop what a call without `discard` has left.
+
+        `discard`: drop and count what is unread; otherwise readers get it first.
+        """
         with self._changing:
-            if self._closed:
-                return
-            self._closed = True
-        self._queue.end()
+            is_first, self._closed = not self._closed, True
+        if discard:
+            self._inbox.end(discard=True)
+        if not is_first:
+            return
         self._job.end()
+        self.receive()  # samples in the ring have been received
         if self._retransmission is not None:
             self._retransmission.close()
-        self._queue.give_up()
         for undeclare in self._undeclares:
             with suppress(zenoh.ZError):  # the session is already closed
                 undeclare()
@@ -130,17 +134,19 @@ class Receiver:
             join_thread(self._pump, _JOIN_TIMEOUT)
         if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
             self._receiving.release()
+        self._inbox.give_up()
+        self._inbox.end()
 
     def _run(self) -> None:
         try:
-            while not self._queue.ended:
+            while not (self._closed or self._inbox.ended):
                 if self._busy:
                     time.sleep(_BUSY_PAUSE)
                 with self._receiving:
                     self._receive()
         except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
-            _log.exception("%s: unexpected error, subscription ended", self._queue.name, extra=about("error"))
-            self._queue.end(f"unexpected {type(exc).__name__}: {exc}")
+            _log.exception("%s: unexpected error, subscription ended", self._inbox.name, extra=about("error"))
+            self._inbox.end(f"unexpected {type(exc).__name__}: {exc}")
 
     def _receive(self, *, if_empty: bool = False) -> None:
         """Wait for a sample and drain the ring into the queue; end the queue if the subscriber is gone.
@@ -150,13 +156,15 @@ class Receiver:
         handler = self._handler
         self._idle = True
         try:
-            if if_empty and self._queue.waiting:
+            if if_empty and self._inbox.waiting:
                 return
             batch = [handler.recv()]
             self._idle = False
             drain(handler, batch)
         except zenoh.ZError:
-            self._queue.end("its Zenoh session was closed")  # no effect after `close`
+            if not self._closed:  # else `close` ends the inbox, once it has everything
+                self._inbox.give_up()
+                self._inbox.end("its Zenoh session was closed")
             return
         finally:
             self._idle = False
@@ -164,15 +172,13 @@ class Receiver:
         self._put(batch)
 
     def _put(self, batch: list[zenoh.Sample]) -> None:
-        if self._queue.ended:
-            return
         self._take_events()
         try:  # not `with`, which costs two calls per batch
-            self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
+            self._inbox.put(batch, overflowed=len(batch) >= RING_CAPACITY)
         except BaseException as exc:
             if not self._errors.survives(exc):
                 raise
-            self._queue.decoder.count_invalid(len(batch))
+            self._inbox.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:
         """Job of the I/O thread: drain the ring, acknowledge and recover; return the seconds until the next call."""
@@ -181,10 +187,10 @@ class Receiver:
         if self._retransmission is None:
             return _POLL
         if drained:
-            self._queue.acknowledge(drained=True)
+            self._inbox.acknowledge(drained=True)
         recovered_key, pause = self._retransmission.poll(now, drained=drained)
         if recovered_key:
-            self._queue.wake()
+            self._inbox.wake()
             if self._idle:  # only a session-local sample, which the decoder discards, ends a blocking receive
                 here = zenoh.Locality.SESSION_LOCAL
                 with suppress(zenoh.ZError):  # the session is closed
@@ -197,16 +203,16 @@ class Receiver:
             return
         try:
             while self._take_link() is not None:
-                self._queue.on_link_change()
+                self._inbox.on_link_change()
             for query in islice(iter(self._take_query, None), MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
                 self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
                 key, get = str(query.key_expr), query.parameters.get
                 publisher, number = get("publisher"), get("number") or ""
                 if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
                     continue  # dropping the query ends it
-                reply, stream_key = partial(_reply, query, key, self._queue), key.removesuffix(ack_key(""))
+                reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
                 request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
-                self._queue.acknowledge(request, drained=self._idle)
+                self._inbox.acknowledge(request, drained=self._idle)
         except zenoh.ZError:  # undeclared
             pass
 
@@ -221,9 +227,9 @@ def drain(handler: zenoh.Handler[zenoh.Sample], batch: list[zenoh.Sample]) -> li
     return batch
 
 
-def _reply(query: zenoh.Query, key: str, pending_queue: PendingQueue) -> None:
+def _reply(query: zenoh.Query, key: str, inbox: Inbox) -> None:
     try:
         with query:
-            query.reply(key, CLOSED if pending_queue.ended else b"")
+            query.reply(key, CLOSED if inbox.ended else b"")
     except zenoh.ZError as exc:  # the query timed out, or the publisher is gone
         _log.debug("%s: cannot answer an acknowledgement request: %s", key, exc)

@@ -15,7 +15,8 @@ from nedbus.log_event import UnexpectedErrors
 from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats
 from nedbus_msgs import PAYLOAD_LIMIT
 
-from .pending_queue import CAPACITY, PendingQueue
+from .inbox import Inbox
+from .unread import CAPACITY
 from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
@@ -32,12 +33,12 @@ _ANSWER_POLL: Final = 0.005  # s between polls for answers
 class Retransmission:
     """Send a queue's retransmission requests and collect the answers; a job of the I/O thread."""
 
-    def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
-        self._session, self._queue = session, pending_queue
+    def __init__(self, session: Session, inbox: Inbox) -> None:
+        self._session, self._inbox = session, inbox
         text = "%s: unexpected error, recovered messages discarded (logged once)"
-        self._errors = UnexpectedErrors(_log, text, pending_queue.name)
+        self._errors = UnexpectedErrors(_log, text, inbox.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}
-        self._take_heartbeats, self._undeclare = follow_heartbeats(session, pending_queue.name)
+        self._take_heartbeats, self._undeclare = follow_heartbeats(session, inbox.name)
         self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
@@ -51,18 +52,18 @@ class Retransmission:
         if drained and now >= self._next_heartbeat_poll:
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
-                self._queue.on_heartbeat(key, publisher, number)
+                self._inbox.on_heartbeat(key, publisher, number)
             self._heartbeats = self._take_heartbeats()
         recovered_key = ""
         for writer, answers in list(self._open.items()):
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
-        if self._queue.waiting <= _MAX_WAITING:
-            for writer in list(self._queue.counters.requesting):  # copied: other threads add to it
+        if self._inbox.waiting <= _MAX_WAITING:
+            for writer in list(self._inbox.gaps.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
                 if writer in self._open or not self._may_open(writer):
                     continue
-                if (numbers := self._queue.next_request(writer, now)) is not None:
+                if (numbers := self._inbox.next_request(writer, now)) is not None:
                     key, name = writer.stream.wire_key, writer.name
                     with suppress(NedbusError):  # the session is closed
                         self._open[writer] = RetransmitRequest(self._session, key, name, numbers, timeout=_TIMEOUT)
@@ -82,9 +83,9 @@ class Retransmission:
         elif not found:
             return ""
         with self._errors:
-            return key if self._queue.on_retransmission(writer, found, ended=ended, now=now) else ""
+            return key if self._inbox.on_retransmission(writer, found, ended=ended, now=now) else ""
         self._open.pop(writer, None)
-        return key if self._queue.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
+        return key if self._inbox.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
 
     def _may_open(self, writer: WriterProxy) -> bool:
         share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]

@@ -12,7 +12,7 @@ from typing import Final
 from nedbus.timings import TIMINGS
 from nedbus.transport import MAX_REPLIES
 
-from .decoder import Arrival, KeyState, detach
+from .arrival import Arrival, Stream, detach
 
 NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
 MAX_GAP: Final = 2**30
@@ -25,12 +25,19 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the las
 
 @dataclass(slots=True, eq=False)
 class LossCounters:
-    """Loss counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
+    """Message counts of a subscription, as in Counts."""
 
+    received: int = 0
     lost: int = 0
-    dropped: int = 0  # messages dropped by a full ring or queue
-    discarded: int = 0  # duplicates and late messages
-    forgotten: int = 0  # keys evicted beyond the limit
+    dropped: int = 0
+    discarded: int = 0
+    forgotten: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class Gaps:
+    """Open gaps of a subscription, and the messages that have passed them."""
+
     held: int = 0  # messages held back behind gaps
     opened: int = 0  # gaps so far
     delivered: list[Arrival] = field(default_factory=list)  # messages to be queued, in order
@@ -56,10 +63,11 @@ class Request:
 class WriterProxy:
     """One publisher on one key; not thread-safe."""
 
-    stream: KeyState
+    stream: Stream
     name: str  # `zid` and `eid` combined
     expected: int  # the next number
     counters: LossCounters
+    gaps: Gaps
     zid: object = None  # `zid` and `eid` are set by the first message
     eid: int | None = None
     history_end: int = 0  # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
@@ -109,7 +117,7 @@ class WriterProxy:
         if request.deadline is None:
             request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
         request.attempts += 1
-        self.counters.requesting[self] = self.counters.requesting.pop(self)
+        self.gaps.requesting[self] = self.gaps.requesting.pop(self)
         request.requested = range(max(self.expected, last - MAX_REPLIES + 1), last + 1)
         return request.requested
 
@@ -168,13 +176,13 @@ class WriterProxy:
             self.counters.discarded += 1
         else:
             self.held[number] = detach(arrival)
-            self.counters.held += 1
+            self.gaps.held += 1
 
     def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
-            self.counters.requesting[self] = None
-            self.counters.opened += 1
+            self.gaps.requesting[self] = None
+            self.gaps.opened += 1
         self.request.stop = max(self.request.stop, stop)
 
     def _count_gap(self, number: int, *, overflowed: bool = False) -> None:
@@ -190,19 +198,18 @@ class WriterProxy:
     def _deliver(self, arrival: Arrival) -> None:
         self.expected = (self.expected + 1) % NUMBERS
         self.history_end = 0
-        stream, payload, raw, _, received = arrival
-        if payload:
-            self.counters.delivered.append((stream, payload, raw, stream.gap, received))
-            stream.gap = 0
+        if arrival.payload:
+            self.gaps.delivered.append(arrival._replace(lost=self.stream.gap) if self.stream.gap else arrival)
+            self.stream.gap = 0
 
     def _release(self) -> None:
         request = self.request
         if request is None:
             return
         while (arrival := self.held.pop(self.expected, None)) is not None:
-            self.counters.held -= 1
+            self.gaps.held -= 1
             self._deliver(arrival)
             request.deadline, request.attempts = None, 0
         if self.expected >= request.stop:
             self.request = None
-            del self.counters.requesting[self]
+            del self.gaps.requesting[self]

@@ -88,7 +88,7 @@ class Reader:
                 for index, row in zip(batch.address_index, batch.messages.tolist(), strict=True):
                     self.read.append((batch.addresses[index].vehicle, dict(zip(names, row, strict=True))))
                 continue
-            pop = partial(self.subscription._queue.pop, rows=self.form == "rows")  # `rows()` has no timeout
+            pop = partial(self.subscription._inbox.pop, rows=self.form == "rows")  # `rows()` has no timeout
             sample = self.subscription._next(pop, DEADLINE)
             self.read.append((sample.vehicle, as_dict(sample.message)))
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, SharedWindow
-from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.receiver import RING_CAPACITY
+from nedbus.client.receiving.unread import CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
 from tests.waits import DEADLINE

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple, Protocol
-from unittest import mock
+from typing import Final, Literal, NamedTuple, Protocol, get_args
 
 from nedbus import Counts, Mode
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, pending_queue
+from nedbus.client.receiving import Decoder, Inbox, LayoutLookup
 from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.transport import RawSample
 from tests.waits import changing_timings
 
 from .raw_samples import INVALID, name_of, raw
+
+Ending = Literal["closed", "drained", "failed"]
 
 UNLIMITED: Final = 100_000
 """More messages than any run of a publisher sends."""
@@ -47,6 +48,7 @@ class ReceivePath(Protocol):
     `link`: report that the link broke, or that it has been up for so long that an unknown publisher must be new.
     `answer`: pass the samples of a reply; with `final`, requested messages that are not among them are lost.
     `read`: return the timestamps of one or more messages, and the losses that they report.
+    `finish`: end reception, as a receiver does.
     """
 
     def __init__(self, setting: InitialState) -> None: ...
@@ -56,24 +58,21 @@ class ReceivePath(Protocol):
     def requests(self) -> list[Request]: ...
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None: ...
     def read(self, *, batch: bool) -> tuple[list[int], int] | None: ...
+    def finish(self, ending: Ending) -> None: ...
     @property
     def counts(self) -> Counts: ...
     @property
     def held(self) -> int: ...
 
 
-class QueueReceivePath(PendingQueue):
-    """The receive path of PendingQueue, with a fake clock."""
+class InboxReceivePath(Inbox):
+    """The receive path of Inbox, with a fake clock."""
 
     def __init__(self, setting: InitialState) -> None:
         self._now, self._since_link = 0.0, 0.0
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
-        super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # time passes only between steps
-        self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
-
-    def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        with self._capacity:
-            super().put(batch, overflowed=overflowed)
+        limit = setting.capacity if setting.mode == "every" else None
+        super().__init__(setting.mode, decoder, limit=limit, clock=lambda: self._since_link)  # advances between steps
 
     def heartbeat(self, key: str, publisher: str, number: int) -> None:
         self.on_heartbeat(key, publisher, number)
@@ -88,21 +87,26 @@ class QueueReceivePath(PendingQueue):
         with changing_timings() as timings:
             timings.retransmit_timeout = 1e6
             self._now += 1.0
-            for writer in list(self.counters.requesting):
+            for writer in list(self.gaps.requesting):
                 self.next_request(writer, self._now)
-        opened = [(each, each.request.requested) for each in self.counters.requesting if each.request is not None]
+        opened = [(each, each.request.requested) for each in self.gaps.requesting if each.request is not None]
         return [Request(writer, writer.name, numbers) for writer, numbers in opened if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
         assert isinstance(request.handle, WriterProxy)
         found = {sample.source_info.source_sn: sample for sample in samples if sample.source_info}
         self._now += 1e7 if final else 0.0
-        with self._capacity:
-            self.on_retransmission(request.handle, found, ended=True, now=self._now)
+        self.on_retransmission(request.handle, found, ended=True, now=self._now)
 
     @property
     def held(self) -> int:
-        return self.counters.held
+        return self.gaps.held
+
+    def finish(self, ending: Ending) -> None:
+        if ending == "closed":
+            self.end(discard=True)
+        self.give_up()
+        self.end("failed" if ending == "failed" else "")
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:
@@ -249,6 +253,15 @@ class Simulation:
         self._settle()
         assert self._reported == self.path.counts.lost, "not every loss is reported once"
 
+    def finish(self, ending: int) -> None:
+        """End the subscription: what has been received can be read, or counts as dropped if it is closed."""
+        how: Ending = get_args(Ending)[ending]
+        read, self._slow = self.path.counts.received, self._slow or how == "closed"
+        self.path.finish(how)
+        self.read(UNLIMITED, batch=ending % 2)
+        assert how != "closed" or self.path.counts.received == read, "messages were read after the end"
+        self._check_total()
+
     def _settle(self) -> None:
         for _ in range(20):
             self.deliver(len(self.in_flight))
@@ -259,16 +272,19 @@ class Simulation:
                 if request in self.path.requests():
                     self.answer(0, final=1)
             self.read(UNLIMITED)
-        assert (self.path.held, self.path.requests()) == (0, []), "messages or requests remain"
-        total, most = self._total(), sum(run.known + 1 for run in self._runs)
-        least = most - sum(map(self._unknown, self._runs))
-        assert least <= total <= most, f"received + lost + dropped + invalid is {total}, not {least} to {most}"
+        self._check_total()
         for run in self._runs:
             if self._latest and self._newest.get(run.slot) is run:
                 assert max(run.arrived) in {*run.read, *run.invalid}, "the newest message was not read"
             complete = run.whole and run.cache == UNLIMITED and not run.given_up
             if complete and not (self._latest or self._slow or self._overflowed):
                 assert run.read == [number for number in range(run.known + 1) if number not in run.invalid]
+
+    def _check_total(self) -> None:
+        assert (self.path.held, self.path.requests()) == (0, []), "messages or requests remain"
+        total, most = self._total(), sum(run.known + 1 for run in self._runs)
+        least = most - sum(map(self._unknown, self._runs))
+        assert least <= total <= most, f"received + lost + dropped + invalid is {total}, not {least} to {most}"
 
     def _total(self) -> int:
         counts = self.path.counts

@@ -12,7 +12,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
+from nedbus.client.receiving import Decoder, Inbox, LayoutLookup
 from nedbus.transport import RawSample
 from tests.flights.local_position import encode, encoding_of
 from tests.flights.messages import message
@@ -72,22 +72,22 @@ def junk(payload: bytes, key: str = KEY) -> RawSample:
     return raw(None, payload=Payload(payload), key=key)
 
 
-def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> PendingQueue:
+def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> Inbox:
     """Return an empty queue."""
-    return PendingQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name="queue", clock=clock)
+    return Inbox(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name="queue", clock=clock)
 
 
-def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
+def put(inbox: Inbox, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
     """Put samples into a queue, and count all gaps as lost, because no publisher replies."""
-    pending_queue.put(samples, overflowed=overflowed)
-    pending_queue.give_up()
+    inbox.put(samples, overflowed=overflowed)
+    inbox.give_up()
 
 
-def drain(pending_queue: PendingQueue) -> list[nedbus.Sample]:
+def drain(inbox: Inbox) -> list[nedbus.Sample]:
     """Remove and return all queued samples."""
-    return list(iter(partial(pending_queue.pop, rows=False), None))
+    return list(iter(partial(inbox.pop, rows=False), None))
 
 
-def timestamps(pending_queue: PendingQueue) -> list[int]:
+def timestamps(inbox: Inbox) -> list[int]:
     """Remove all queued samples and return their timestamps."""
-    return [sample.message.timestamp for sample in drain(pending_queue)]
+    return [sample.message.timestamp for sample in drain(inbox)]

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from nedbus.client.receiving.pending_queue import MAX_ACK_REQUESTS, AckRequest
+from nedbus.client.receiving.inbox import MAX_ACK_REQUESTS, AckRequest
 from nedbus.transport import RawSample
 
 from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, raw
@@ -138,9 +138,10 @@ def test_acknowledgement_waits_until_gap_is_closed(reader: AcknowledgingReader) 
     assert reader.put(raw(3)) == ["2"]
 
 
-def test_dropped_message_is_acknowledged(reader: AcknowledgingReader, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dropped_message_is_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
     """A request with `read` is acknowledged if its message was dropped."""
-    monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 10)
+    monkeypatch.setattr("nedbus.client.receiving.inbox.CAPACITY", 10)
+    reader = AcknowledgingReader()
     reader.put(raw(0), raw(1))
     assert reader.request(1, read=True) == []
     assert reader.put(*map(raw, range(2, 20))) == ["1"]

@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from nedbus import Mode
 
-from .loss_model import UNLIMITED, InitialState, QueueReceivePath, Simulation
+from .loss_model import UNLIMITED, InboxReceivePath, InitialState, Simulation
 
 SLOT, POSITION, COUNT, FLAG = st.integers(0, 2), st.integers(0, 40), st.integers(1, 12), st.integers(0, 1)
 MISSING = st.sampled_from([0, 0, -1]) | st.integers(0, 255)
@@ -29,16 +29,18 @@ def step(name: str, *arguments: st.SearchStrategy[int], when: str = "simulation"
 
 
 class LossMachine(RuleBasedStateMachine):
-    """Run random steps, then settle."""
+    """Run random steps, then settle, or end the subscription in one of three ways."""
 
     @initialize(
         mode=st.sampled_from(["every", "every", "latest"]),
         caches=st.lists(st.sampled_from([UNLIMITED, 3, 0]), min_size=1, max_size=3),
         capacity=st.sampled_from([UNLIMITED, UNLIMITED, 16]),
+        ending=st.sampled_from([None, 0, 1, 2]),
     )
-    def begin(self, mode: Mode, caches: list[int], capacity: int) -> None:
+    def begin(self, mode: Mode, caches: list[int], capacity: int, ending: int | None) -> None:
+        self.ending = ending
         setting = InitialState(mode, tuple(caches), capacity)
-        self.simulation = Simulation(setting, QueueReceivePath(setting))
+        self.simulation = Simulation(setting, InboxReceivePath(setting))
 
     publish = step("publish", SLOT, COUNT, FLAG)
     restart = step("restart", SLOT)
@@ -54,7 +56,7 @@ class LossMachine(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         if hasattr(self, "simulation") and self.simulation.intact:
-            self.simulation.step("settle")
+            self.simulation.step(*(["settle"] if self.ending is None else ["finish", self.ending]))
 
 
 TestLossAccounting = LossMachine.TestCase
@@ -86,6 +88,6 @@ SEEDS = [
 @pytest.mark.parametrize(("setting", "steps"), SEEDS)
 def test_invariants_hold_after_steps_that_found_bugs(setting: InitialState, steps: str) -> None:
     """All invariants hold after step sequences that found a bug in an earlier receive path."""
-    simulation = Simulation(setting, QueueReceivePath(setting))
+    simulation = Simulation(setting, InboxReceivePath(setting))
     for name, *arguments in map(str.split, f"{steps}, settle".split(", ")):
         simulation.step(name, *map(int, arguments))

@@ -12,7 +12,7 @@ from hypothesis import given
 
 from nedbus import Counts, Mode
 from nedbus.client.rate_gate import RATES, RateGate, check_max_rate, rate_step
-from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateQueue
+from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateInbox
 from nedbus.errors import ArgumentError
 from nedbus.transport import RawSample
 from nedbus_msgs import Address, Selection
@@ -22,9 +22,9 @@ from .raw_samples import KEY, drain, put, raw, timestamps
 DOWNSAMPLED = f"{KEY}/@rate/5"
 
 
-def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateQueue:
+def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateInbox:
     """Return an empty queue."""
-    return MaxRateQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate)
+    return MaxRateInbox(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate)
 
 
 class Clock:

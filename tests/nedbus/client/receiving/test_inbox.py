@@ -9,19 +9,25 @@ import weakref
 from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
+import nedbus
 from nedbus import Batch, Counts, Mode
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
-from nedbus.client.receiving import pending_queue as module
-from nedbus.client.receiving.decoder import KeyState
+from nedbus.client.receiving import Decoder, Inbox, LayoutLookup
+from nedbus.client.receiving import inbox as module
+from nedbus.client.receiving import streams as streams_module
+from nedbus.client.receiving import unread as unread_module
+from nedbus.client.receiving.arrival import Stream
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
-from nedbus.client.receiving.pending_queue import CAPACITY
+from nedbus.client.receiving.unread import CAPACITY
 from nedbus.client.receiving.writer_proxy import NUMBERS, WriterProxy
 from nedbus.timings import Timings
 from nedbus.transport import RawSample
+from nedbus_msgs import Codec, Definition, codec_of
+from nedbus_msgs import encoding_of as provenance_encoding
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.local_position import encode, encoding_of
 from tests.waits import DEADLINE
@@ -47,19 +53,19 @@ STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_first_reply_of_a_publisher_is_retained(mode: Mode) -> None:
     """The first sample of a publisher is marked as retained if it is a reply to the query for the last message."""
-    pending_queue, block, drop = make_queue(mode), zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+    inbox, block, drop = make_queue(mode), zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
     arriving = [(4, "a", block), (5, "a", block), (6, "a", drop), (1, "b", drop), (2, "b", block)]
     seen = []
     for number, publisher, control in arriving:
-        put(pending_queue, [raw(number, publisher=publisher, congestion_control=control)])
-        seen += [sample.retained for sample in drain(pending_queue)]
+        put(inbox, [raw(number, publisher=publisher, congestion_control=control)])
+        seen += [sample.retained for sample in drain(inbox)]
     assert seen == [True, False, False, False, False]
 
 
 class Guarded(int):
     """A counter that may only be increased by the owner of a queue's lock."""
 
-    queue: PendingQueue
+    queue: Inbox
 
     def __add__(self, other: int) -> Guarded:
         assert self.queue._lock._is_owned()  # type: ignore[attr-defined] # not in typeshed
@@ -71,78 +77,78 @@ class Guarded(int):
 @pytest.mark.parametrize("form", ["models", "batches"])
 def test_counters_are_changed_with_the_lock(form: str) -> None:
     """Reading valid and invalid messages changes the counters only with the lock, because several threads may read."""
-    pending_queue = make_queue("every")
-    put(pending_queue, [raw(0), raw(3, payload=INVALID), raw(4)])
-    zero = pending_queue._received = Guarded()
-    zero.queue = pending_queue
-    for stream in pending_queue._streams.values():
+    inbox = make_queue("every")
+    put(inbox, [raw(0), raw(3, payload=INVALID), raw(4)])
+    zero = inbox._counters.received = Guarded()
+    zero.queue = inbox
+    for stream in inbox._streams:
         stream.unreported = zero
     if form == "batches":
-        while pending_queue.pop_batch():
+        while inbox.pop_batch():
             pass
     else:
-        drain(pending_queue)
-    assert pending_queue.counts == Counts(received=2, lost=2, invalid=1)
+        drain(inbox)
+    assert inbox.counts == Counts(received=2, lost=2, invalid=1)
 
 
 def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the limit of messages held back, here 10, the gap with the most messages behind it counts as lost."""
-    monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_HELD", 10)
-    pending_queue = make_queue("every")
-    pending_queue.put([raw(0), raw(2, timestamp=2)])
-    pending_queue.put([raw(number, key=OTHER_KEY, publisher="b") for number in (0, *range(2, 12))])
-    assert Counter(sample.vehicle for sample in drain(pending_queue)) == {"1": 1, "2": 11}
-    pending_queue.put([raw(1)])
-    assert timestamps(pending_queue) == [1, 2]
-    assert pending_queue.counts == Counts(received=14, lost=1)
+    monkeypatch.setattr("nedbus.client.receiving.reorder.MAX_HELD", 10)
+    inbox = make_queue("every")
+    inbox.put([raw(0), raw(2, timestamp=2)])
+    inbox.put([raw(number, key=OTHER_KEY, publisher="b") for number in (0, *range(2, 12))])
+    assert Counter(sample.vehicle for sample in drain(inbox)) == {"1": 1, "2": 11}
+    inbox.put([raw(1)])
+    assert timestamps(inbox) == [1, 2]
+    assert inbox.counts == Counts(received=14, lost=1)
 
 
 @pytest.mark.parametrize(("before", "after", "lost"), [(-4, -2, 0), (-4, -1, 2), (-2, 0, 1), (-3, 1, 3), (-1, 2, 0)])
 def test_gap_across_the_wrap_of_sequence_numbers_is_lost(before: int, after: int, lost: int) -> None:
     """A gap up to the highest sequence number, or across it, counts as lost at once; others are requested."""
-    pending_queue = make_queue("every")
-    pending_queue.put([raw(before % NUMBERS), raw(after % NUMBERS, timestamp=2)])
-    assert bool(pending_queue.counters.requesting) == (lost == 0)
-    assert [each.lost for each in drain(pending_queue)] == [0, lost][: 1 + bool(lost)]
-    assert pending_queue.counts.lost == lost
+    inbox = make_queue("every")
+    inbox.put([raw(before % NUMBERS), raw(after % NUMBERS, timestamp=2)])
+    assert bool(inbox.gaps.requesting) == (lost == 0)
+    assert [each.lost for each in drain(inbox)] == [0, lost][: 1 + bool(lost)]
+    assert inbox.counts.lost == lost
 
 
 def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
     """The timeout of a gap begins again with each message that fills a part of it."""
-    pending_queue, now = make_queue("every"), 100.0
-    pending_queue.put([raw(0), raw(6, timestamp=6)])
-    [writer] = pending_queue.counters.requesting
+    inbox, now = make_queue("every"), 100.0
+    inbox.put([raw(0), raw(6, timestamp=6)])
+    [writer] = inbox.gaps.requesting
     for number in range(1, 6):
         now += 0.9 * timings.retransmit_timeout
-        assert pending_queue.next_request(writer, now) == range(number, 6)
-        pending_queue.on_retransmission(writer, {number: raw(number, timestamp=number)}, ended=True, now=now)
-    assert timestamps(pending_queue) == [1, 1, 2, 3, 4, 5, 6]
-    assert pending_queue.counts == Counts(received=7)
+        assert inbox.next_request(writer, now) == range(number, 6)
+        inbox.on_retransmission(writer, {number: raw(number, timestamp=number)}, ended=True, now=now)
+    assert timestamps(inbox) == [1, 1, 2, 3, 4, 5, 6]
+    assert inbox.counts == Counts(received=7)
 
 
 @pytest.mark.parametrize("when", ["during a gap", "after it"])
 def test_unresponsive_publisher_gets_more_than_one_request_after_a_link_change(timings: Timings, when: str) -> None:
     """A publisher that did not answer gets one request per gap, until a link change: perhaps its link was down."""
-    pending_queue, now = make_queue("every"), 100.0
+    inbox, now = make_queue("every"), 100.0
 
     def attempt() -> int:
         """Send the request of the gap, without an answer; return the number of messages lost so far."""
-        [writer] = pending_queue.counters.requesting
-        assert pending_queue.next_request(writer, now) is not None
-        pending_queue.on_retransmission(writer, {}, ended=True, now=now)
-        return pending_queue.counts.lost
+        [writer] = inbox.gaps.requesting
+        assert inbox.next_request(writer, now) is not None
+        inbox.on_retransmission(writer, {}, ended=True, now=now)
+        return inbox.counts.lost
 
-    pending_queue.put([raw(0), raw(2)])
+    inbox.put([raw(0), raw(2)])
     assert attempt() == 0
     now += timings.retransmit_timeout
     assert attempt() == 1
-    pending_queue.put([raw(4)])
+    inbox.put([raw(4)])
     assert attempt() == 2
     if when == "after it":
-        pending_queue.on_link_change()
-    pending_queue.put([raw(6)])
+        inbox.on_link_change()
+    inbox.put([raw(6)])
     if when == "during a gap":
-        pending_queue.on_link_change()
+        inbox.on_link_change()
     assert attempt() == 2
     now += timings.retransmit_timeout
     assert attempt() == 3
@@ -160,33 +166,33 @@ def test_loss_is_reported_by_the_next_sample_read(
     mode: Mode, arriving: list[RawSample], losses: list[int], counts: Counts
 ) -> None:
     """A loss is reported by the next valid sample after the gap, even after invalid or superseded samples."""
-    pending_queue = make_queue(mode)
-    put(pending_queue, [raw(0)])
-    put(pending_queue, arriving)
-    assert [sample.lost for sample in drain(pending_queue)] == losses
-    assert pending_queue.counts == counts
+    inbox = make_queue(mode)
+    put(inbox, [raw(0)])
+    put(inbox, arriving)
+    assert [sample.lost for sample in drain(inbox)] == losses
+    assert inbox.counts == counts
 
 
 def test_gap_within_a_batch_is_reported_by_the_sample_after_it() -> None:
     """A gap within a batch is reported by the sample after the gap, a gap at the end by the next batch."""
-    pending_queue = make_queue("every")
+    inbox = make_queue("every")
     for start in range(0, 2000, 50):
-        put(pending_queue, [raw(number) for number in range(start, start + 50)])
-    assert not any(sample.lost for sample in drain(pending_queue))
-    put(pending_queue, [raw(number) for number in range(2000, 2050) if number not in {2020, 2021, 2049}])
-    assert [sample.lost for sample in drain(pending_queue)] == [0] * 20 + [2] + [0] * 26
-    put(pending_queue, [raw(number) for number in range(2050, 2100)])
-    assert [sample.lost for sample in drain(pending_queue)] == [1] + [0] * 49
-    assert pending_queue.counts == Counts(received=2097, lost=3)
+        put(inbox, [raw(number) for number in range(start, start + 50)])
+    assert not any(sample.lost for sample in drain(inbox))
+    put(inbox, [raw(number) for number in range(2000, 2050) if number not in {2020, 2021, 2049}])
+    assert [sample.lost for sample in drain(inbox)] == [0] * 20 + [2] + [0] * 26
+    put(inbox, [raw(number) for number in range(2050, 2100)])
+    assert [sample.lost for sample in drain(inbox)] == [1] + [0] * 49
+    assert inbox.counts == Counts(received=2097, lost=3)
 
 
 def test_mode_latest_keeps_the_newest_of_each_key(caplog: pytest.LogCaptureFixture) -> None:
     """A newer sample of a key replaces the queued one, which counts as dropped, without a warning."""
-    pending_queue = make_queue("latest")
-    put(pending_queue, [raw(0, key=OTHER_KEY, publisher="b"), *(raw(each, timestamp=each) for each in range(1, 1001))])
-    assert pending_queue.counts == Counts(dropped=999)
-    assert [(each.vehicle, each.message.timestamp) for each in drain(pending_queue)] == [("2", 1), ("1", 1000)]
-    assert pending_queue.counts == Counts(received=2, dropped=999)
+    inbox = make_queue("latest")
+    put(inbox, [raw(0, key=OTHER_KEY, publisher="b"), *(raw(each, timestamp=each) for each in range(1, 1001))])
+    assert inbox.counts == Counts(dropped=999)
+    assert [(each.vehicle, each.message.timestamp) for each in drain(inbox)] == [("2", 1), ("1", 1000)]
+    assert inbox.counts == Counts(received=2, dropped=999)
     assert not caplog.messages
 
 
@@ -199,22 +205,22 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogC
     put(latest, [raw(0, timestamp=5), junk(b"junk")])
     assert timestamps(latest) == [5]
     caplog.clear()
-    pending_queue = make_queue("every")
+    inbox = make_queue("every")
     wrong_key = raw(None, key="nedbus/*/vehicle_local_position")
-    put(pending_queue, [junk(b"junk"), junk(b""), junk(bytes(5000)), wrong_key, raw(None, timestamp=7)])
-    assert timestamps(pending_queue) == [7]
-    assert pending_queue.counts == Counts(received=1, invalid=4)
+    put(inbox, [junk(b"junk"), junk(b""), junk(bytes(5000)), wrong_key, raw(None, timestamp=7)])
+    assert timestamps(inbox) == [7]
+    assert inbox.counts == Counts(received=1, invalid=4)
     assert len(caplog.messages) == 2
 
 
 def test_number_of_tracked_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader keeps the state of at most 10,000 keys, here 10; messages on additional keys still arrive."""
-    monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_KEYS", 10)
-    pending_queue = make_queue("every")
+    monkeypatch.setattr("nedbus.client.receiving.streams.MAX_KEYS", 10)
+    inbox = make_queue("every")
     tracemalloc.start()
     for number in range(2000):
-        put(pending_queue, [raw(None, key=f"nedbus/{number}/vehicle_local_position")])
-        assert len(drain(pending_queue)) == 1
+        put(inbox, [raw(None, key=f"nedbus/{number}/vehicle_local_position")])
+        assert len(drain(inbox)) == 1
     allocated, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert allocated < 100_000
@@ -228,7 +234,7 @@ def vehicles_in_memory() -> list[str]:
     """Return the vehicle of each key state and of each writer proxy in memory."""
     gc.collect()
     objects = gc.get_objects()
-    streams = [each for each in objects if isinstance(each, KeyState)]
+    streams = [each for each in objects if isinstance(each, Stream)]
     streams += [each.stream for each in objects if isinstance(each, WriterProxy)]
     return [stream.address.vehicle for stream in streams]
 
@@ -238,39 +244,39 @@ def test_least_recently_active_key_is_evicted(
     mode: Mode, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Beyond the limit, the least recently active key is evicted and counted; losses of other keys still count."""
-    monkeypatch.setattr(module, "MAX_KEYS", 3)
+    monkeypatch.setattr(streams_module, "MAX_KEYS", 3)
     now = [0.0]
-    pending_queue = make_queue(mode, clock=lambda: now[0])
+    inbox = make_queue(mode, clock=lambda: now[0])
 
     def receive(vehicle: str, number: int) -> int:
         now[0] += 1.0
-        put(pending_queue, [raw(number, key=key_of(vehicle), publisher=vehicle)])
-        return sum(sample.lost for sample in drain(pending_queue))
+        put(inbox, [raw(number, key=key_of(vehicle), publisher=vehicle)])
+        return sum(sample.lost for sample in drain(inbox))
 
     for vehicle in "abcab":
         receive(vehicle, 0)
     assert not caplog.messages
     receive("d", 0)  # c is evicted
     assert [receive(vehicle, 9) for vehicle in "abd"] == [8, 8, 8]
-    assert pending_queue.counts.forgotten == 1
+    assert inbox.counts.forgotten == 1
     assert receive("c", 9) == 0  # a is evicted
     assert [receive(vehicle, 12) for vehicle in "bdc"] == [2, 2, 2]
-    assert (pending_queue.counts.forgotten, pending_queue.counts.lost) == (2, 30)
+    assert (inbox.counts.forgotten, inbox.counts.lost) == (2, 30)
     assert len(caplog.messages) == 1
     assert "more than 3 keys" in caplog.text
 
 
 def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -> None:
     """A key with a gap is evicted, and its gap counted as lost, only if all keys have a gap."""
-    monkeypatch.setattr(module, "MAX_KEYS", 3)
+    monkeypatch.setattr(streams_module, "MAX_KEYS", 3)
     now = [0.0]
-    pending_queue = make_queue("every", clock=lambda: now[0])
+    inbox = make_queue("every", clock=lambda: now[0])
     for vehicle, numbers in [("a", [0, 5]), ("b", [0]), ("c", [0, 3]), ("d", [0]), ("d", [2]), ("e", [0])]:
         now[0] += 1.0
-        pending_queue.put([raw(number, key=key_of(vehicle), publisher=vehicle) for number in numbers])
-    assert pending_queue.counts == Counts(lost=4, forgotten=2)  # b, then a
-    assert [sample.vehicle for sample in drain(pending_queue)] == list("abcdae")
-    assert len(pending_queue.counters.requesting) == 2
+        inbox.put([raw(number, key=key_of(vehicle), publisher=vehicle) for number in numbers])
+    assert inbox.counts == Counts(lost=4, forgotten=2)  # b, then a
+    assert [sample.vehicle for sample in drain(inbox)] == list("abcdae")
+    assert len(inbox.gaps.requesting) == 2
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
@@ -279,62 +285,62 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
-    monkeypatch.setattr("nedbus.client.receiving.pending_queue.KEPT_KEYS", 10)
+    monkeypatch.setattr("nedbus.client.receiving.streams.KEPT_KEYS", 10)
     now = [0.0]
-    pending_queue = make_queue(mode, clock=lambda: now[0])
+    inbox = make_queue(mode, clock=lambda: now[0])
     for number in range(2000):
         now[0] += 10.0
-        put(pending_queue, [raw(number, key=key_of("steady"), publisher="steady")])
-        pending_queue.on_heartbeat(key_of("silent"), name_of("silent"), 5)
+        put(inbox, [raw(number, key=key_of("steady"), publisher="steady")])
+        inbox.on_heartbeat(key_of("silent"), name_of("silent"), 5)
         vehicles = [str(each) for each in range(max(0, number - 8), number)]
-        put(pending_queue, [raw(number, key=key_of(each), publisher=each) for each in vehicles])
-        drain(pending_queue)
+        put(inbox, [raw(number, key=key_of(each), publisher=each) for each in vehicles])
+        drain(inbox)
     measured = Counter(vehicles_in_memory())
     assert {"steady", "silent", *map(str, range(1935, 1999))} <= measured.keys()
     assert len(measured) <= 72
     assert set(measured.values()) == {2}
-    assert pending_queue.counts.forgotten == 0, "only keys beyond the limit are counted"
+    assert inbox.counts.forgotten == 0, "only keys beyond the limit are counted"
 
 
 def test_losses_during_a_long_outage_are_counted() -> None:
     """Messages lost in an outage of an hour are counted, even if other vehicles appear during the outage."""
     now = [0.0]
-    pending_queue = make_queue("latest", clock=lambda: now[0])
-    put(pending_queue, [raw(0, key=key_of("7"), publisher="7")])
+    inbox = make_queue("latest", clock=lambda: now[0])
+    put(inbox, [raw(0, key=key_of("7"), publisher="7")])
     for other in range(100):
         now[0] += 36.0
-        put(pending_queue, [raw(0, key=key_of(f"v{other}"), publisher=f"v{other}")])
-    put(pending_queue, [raw(90, key=key_of("7"), publisher="7")])
-    drain(pending_queue)
-    assert pending_queue.counts.lost == 89
+        put(inbox, [raw(0, key=key_of(f"v{other}"), publisher=f"v{other}")])
+    put(inbox, [raw(90, key=key_of("7"), publisher="7")])
+    drain(inbox)
+    assert inbox.counts.lost == 89
 
 
 def test_queue_wait_returns_on_sample_wake_end_or_timeout() -> None:
     """A wait ends when a sample arrives, `wake` is called, the queue ends, or the timeout expires."""
-    pending_queue = make_queue("every")
-    assert not pending_queue.wait(0.0)
-    put(pending_queue, [raw(0)])
-    assert pending_queue.wait(None)
-    drain(pending_queue)
-    pending_queue.wait(0.0)  # may return True because of the sample already read
-    assert not pending_queue.wait(0.0)
+    inbox = make_queue("every")
+    assert not inbox.wait(0.0)
+    put(inbox, [raw(0)])
+    assert inbox.wait(None)
+    drain(inbox)
+    inbox.wait(0.0)  # may return True because of the sample already read
+    assert not inbox.wait(0.0)
     woken: list[bool] = []
-    pending_queue.on_wake = lambda: woken.append(True)
-    pending_queue.wake()
-    assert pending_queue.wait(None)
+    inbox.on_wake = lambda: woken.append(True)
+    inbox.wake()
+    assert inbox.wait(None)
     assert woken
-    pending_queue.end()
-    assert pending_queue.wait(None)
+    inbox.end()
+    assert inbox.wait(None)
 
 
 # Readers slower than the data
 
 
 @pytest.fixture
-def small_queue(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
+def small_queue(monkeypatch: pytest.MonkeyPatch) -> Inbox:
     """Return a queue for mode `every` that holds 10 samples, at most 4 of them with their receive buffers."""
     monkeypatch.setattr(module, "CAPACITY", 10)
-    monkeypatch.setattr(module, "_MAX_FRESH", 4)
+    monkeypatch.setattr(unread_module, "_MAX_FRESH", 4)
     return make_queue("every")
 
 
@@ -350,7 +356,7 @@ def test_documented_capacity_is_that_of_the_queue() -> None:
 
 
 def test_oldest_samples_are_dropped_counted_and_logged_once(
-    small_queue: PendingQueue, caplog: pytest.LogCaptureFixture
+    small_queue: Inbox, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A full queue drops the oldest samples, which count as dropped, not as lost, and are logged once."""
     for start in range(0, 40, 10):
@@ -362,7 +368,7 @@ def test_oldest_samples_are_dropped_counted_and_logged_once(
     assert caplog.messages == ["queue: the reader is slower than the data, so messages are dropped"]
 
 
-def test_losses_before_dropped_samples_are_reported_later(small_queue: PendingQueue) -> None:
+def test_losses_before_dropped_samples_are_reported_later(small_queue: Inbox) -> None:
     """A loss in transit is reported by a later sample of the key if the sample after the gap was dropped."""
     put(
         small_queue,
@@ -376,7 +382,7 @@ def test_losses_before_dropped_samples_are_reported_later(small_queue: PendingQu
     assert small_queue.counts == Counts(received=10, lost=4, dropped=5)
 
 
-def test_losses_are_reported_by_the_next_valid_sample(small_queue: PendingQueue) -> None:
+def test_losses_are_reported_by_the_next_valid_sample(small_queue: Inbox) -> None:
     """Losses before dropped and invalid samples are reported by the next valid sample of the key."""
     put(small_queue, [raw(0), raw(3)])
     put(small_queue, [raw(number, payload=INVALID) for number in range(4, 13)])
@@ -386,7 +392,7 @@ def test_losses_are_reported_by_the_next_valid_sample(small_queue: PendingQueue)
 
 
 @pytest.mark.parametrize("in_batches", [False, True])
-def test_waiting_samples_release_their_receive_buffer(small_queue: PendingQueue, in_batches: bool) -> None:
+def test_waiting_samples_release_their_receive_buffer(small_queue: Inbox, in_batches: bool) -> None:
     """Samples deep in the queue are detached from their receive buffers, which Zenoh samples keep alive.
 
     Detached samples keep their sequence number, timestamp and provenance.
@@ -416,19 +422,19 @@ class Encoding(str):
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_key_state_keeps_no_receive_buffer(mode: Mode) -> None:
     """The state of a key stores a copy of the encoding, because a Zenoh encoding keeps its receive buffer alive."""
-    pending_queue, encoding = make_queue(mode), Encoding(SOURCE)
+    inbox, encoding = make_queue(mode), Encoding(SOURCE)
     reference = weakref.ref(encoding)
-    put(pending_queue, [raw(0, encoding=encoding)])
+    put(inbox, [raw(0, encoding=encoding)])
     del encoding
-    assert [sample.source for sample in drain(pending_queue)] == ["sim"]
+    assert [sample.source for sample in drain(inbox)] == ["sim"]
     assert reference() is None
 
 
-def test_long_encodings_are_truncated(small_queue: PendingQueue) -> None:
+def test_long_encodings_are_truncated(small_queue: Inbox) -> None:
     """Queued samples keep at most 512 characters of a long encoding."""
     for number in range(9):
         put(small_queue, [raw(number, encoding=SOURCE + number * 10_000 * "x")])
-    encodings = [arrival[2].encoding for arrival in small_queue._every]
+    encodings = [arrival.raw.encoding for arrival in small_queue._unread._every]
     assert all(len(str(encoding)) <= 512 for encoding in encodings[5:])
     assert len(drain(small_queue)) == 9
 
@@ -438,21 +444,21 @@ def test_gaps_of_a_full_ring_count_as_dropped(caplog: pytest.LogCaptureFixture) 
 
     Gaps in later batches count as losses again.
     """
-    pending_queue = make_queue("every")
-    put(pending_queue, [raw(0), raw(1)])
-    put(pending_queue, [raw(50), raw(51), raw(60)], overflowed=True)
-    put(pending_queue, [raw(100)], overflowed=True)
-    put(pending_queue, [raw(101), raw(105)])
-    assert [sample.lost for sample in drain(pending_queue)] == [0] * 7 + [3]
-    assert pending_queue.counts == Counts(received=8, lost=3, dropped=48 + 8 + 39)
+    inbox = make_queue("every")
+    put(inbox, [raw(0), raw(1)])
+    put(inbox, [raw(50), raw(51), raw(60)], overflowed=True)
+    put(inbox, [raw(100)], overflowed=True)
+    put(inbox, [raw(101), raw(105)])
+    assert [sample.lost for sample in drain(inbox)] == [0] * 7 + [3]
+    assert inbox.counts == Counts(received=8, lost=3, dropped=48 + 8 + 39)
     assert len(caplog.messages) == 1
 
 
 # Batches
 
 
-def take_batch(pending_queue: PendingQueue) -> Batch:
-    batch = pending_queue.pop_batch()
+def take_batch(inbox: Inbox) -> Batch:
+    batch = inbox.pop_batch()
     assert batch is not None
     return batch
 
@@ -470,23 +476,54 @@ def undefined(payload: bytes = VALID, *, number: int | None = None, publisher: s
 
 def test_messages_left_by_a_batch_are_read_next() -> None:
     """A batch has messages of one type; the others stay queued and can be read as samples or batches."""
-    for take in (timestamps, lambda pending_queue: take_batch(pending_queue).messages["timestamp"].tolist()):
-        pending_queue = make_queue("every")
-        put(pending_queue, [raw(0), raw(None, key="nedbus/1/vehicle_attitude", payload=ATTITUDE)])
-        assert len(take_batch(pending_queue)) == 1
-        assert pending_queue.waiting == 1
-        assert pending_queue.wait(0.0)
-        assert take(pending_queue) == [7]
+    for take in (timestamps, lambda inbox: take_batch(inbox).messages["timestamp"].tolist()):
+        inbox = make_queue("every")
+        put(inbox, [raw(0), raw(None, key="nedbus/1/vehicle_attitude", payload=ATTITUDE)])
+        assert len(take_batch(inbox)) == 1
+        assert inbox.waiting == 1
+        assert inbox.wait(0.0)
+        assert take(inbox) == [7]
 
 
 def test_batch_skips_messages_without_a_definition() -> None:
     """Messages without a definition are invalid, and do not delay a batch of valid ones."""
     for payload in (VALID, VALID[:-1]):
-        pending_queue = make_queue("every")
-        put(pending_queue, [undefined(payload), raw(0)])
-        assert take_batch(pending_queue).sequence.tolist() == [0]
-        assert pending_queue.pop_batch() is None
-        assert pending_queue.counts == Counts(received=1, invalid=1)
+        inbox = make_queue("every")
+        put(inbox, [undefined(payload), raw(0)])
+        assert take_batch(inbox).sequence.tolist() == [0]
+        assert inbox.pop_batch() is None
+        assert inbox.counts == Counts(received=1, invalid=1)
+
+
+class LateLookup(LayoutLookup):
+    """A lookup whose answer arrives just after a reader has stopped waiting for it."""
+
+    def __init__(self, definition: Definition[Any]) -> None:
+        super().__init__(lambda _: {})
+        self.waits, self._definition = 0, definition
+
+    def codec(self, *_: object, wait: bool = False, **__: object) -> Codec[Any] | None:
+        self.waits += wait
+        return codec_of(self._definition) if self.waits > wait else None
+
+
+def test_definition_that_arrives_while_a_batch_is_decoded_does_not_apply_to_a_part_of_it() -> None:
+    """All messages of a batch get the same answer to the lookup of their definition, which is awaited once."""
+    definition = nedbus.define_msg("RangeBeacon", "uint64 timestamp\nfloat32 range\n")
+    payload = Payload(codec_of(definition).encode_fields({"timestamp": 1, "range": 2.5}))
+    lookup = LateLookup(definition)
+    inbox = Inbox("every", Decoder(lookup, prefix="nedbus"))
+    encoding = provenance_encoding(definition, None)
+
+    def put_three(first: int) -> None:
+        numbers = range(first, first + 3)
+        put(inbox, [raw(each, key="nedbus/1/range_beacon", payload=payload, encoding=encoding) for each in numbers])
+
+    put_three(0)
+    assert inbox.pop_batch() is None
+    assert (lookup.waits, inbox.counts) == (1, Counts(invalid=3))
+    put_three(3)
+    assert take_batch(inbox).messages["range"].tolist() == [2.5] * 3
 
 
 def test_definition_is_requested_again_for_another_publisher() -> None:
@@ -498,9 +535,9 @@ def test_definition_is_requested_again_for_another_publisher() -> None:
         return {}
 
     lookup = LayoutLookup(find, now=lambda: 0.0)
-    pending_queue = PendingQueue("every", Decoder(lookup, prefix="nedbus"))
+    inbox = Inbox("every", Decoder(lookup, prefix="nedbus"))
     for publisher, count in (("a", 1), ("a", 1), ("b", 2)):
-        pending_queue.put([undefined(number=0, publisher=publisher)])
+        inbox.put([undefined(number=0, publisher=publisher)])
         lookup.wait()
         assert len(queried) == count
 
@@ -515,12 +552,12 @@ def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -
         answered.wait(DEADLINE)
         return {}
 
-    pending_queue = PendingQueue("every", Decoder(LayoutLookup(find), prefix="nedbus"))
-    pending_queue.put([undefined()])
-    reader = threading.Thread(target=pending_queue.pop_batch)
+    inbox = Inbox("every", Decoder(LayoutLookup(find), prefix="nedbus"))
+    inbox.put([undefined()])
+    reader = threading.Thread(target=inbox.pop_batch)
     reader.start()
     assert queried.wait(DEADLINE)
-    pending_queue.put([raw(0)])
+    inbox.put([raw(0)])
     assert not answered.is_set()
     assert reader.is_alive()
     answered.set()
@@ -529,30 +566,30 @@ def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -
 
 def test_batch_in_mode_latest_reports_losses_before_superseded_samples() -> None:
     """In mode `latest` a batch has one message per key, and reports all losses before that message."""
-    pending_queue = make_queue("latest")
-    put(pending_queue, [raw(0), raw(3), raw(4)])
-    batch = take_batch(pending_queue)
+    inbox = make_queue("latest")
+    put(inbox, [raw(0), raw(3), raw(4)])
+    batch = take_batch(inbox)
     assert (batch.sequence.tolist(), batch.lost) == ([4], 2)
-    assert pending_queue.counts == Counts(received=1, lost=2, dropped=2)
+    assert inbox.counts == Counts(received=1, lost=2, dropped=2)
 
 
 def test_loss_is_reported_by_the_batch_after_the_gap() -> None:
     """Messages that do not fit into a full batch are left for the next one, which reports the losses before them."""
-    pending_queue = make_queue("every")
-    put(pending_queue, [raw(number) for number in range(5000) if number not in {4500, 4501}])
-    first, second = take_batch(pending_queue), take_batch(pending_queue)
+    inbox = make_queue("every")
+    put(inbox, [raw(number) for number in range(5000) if number not in {4500, 4501}])
+    first, second = take_batch(inbox), take_batch(inbox)
     assert (len(first), len(second)) == (4096, 902)
     assert (first.lost, second.lost) == (0, 2)
 
 
 def test_samples_and_batches_report_each_loss_once() -> None:
     """If a subscription is read alternately as samples and as batches, each loss is reported once."""
-    pending_queue = make_queue("every")
-    put(pending_queue, [raw(0), raw(5)])
-    assert sum(sample.lost for sample in drain(pending_queue)) == 4
-    put(pending_queue, [raw(6), raw(9)])
-    assert take_batch(pending_queue).lost == 2
-    put(pending_queue, [raw(11)])
-    assert [sample.lost for sample in drain(pending_queue)] == [1]
-    put(pending_queue, [raw(12)])
-    assert take_batch(pending_queue).lost == 0
+    inbox = make_queue("every")
+    put(inbox, [raw(0), raw(5)])
+    assert sum(sample.lost for sample in drain(inbox)) == 4
+    put(inbox, [raw(6), raw(9)])
+    assert take_batch(inbox).lost == 2
+    put(inbox, [raw(11)])
+    assert [sample.lost for sample in drain(inbox)] == [1]
+    put(inbox, [raw(12)])
+    assert take_batch(inbox).lost == 0

@@ -1,0 +1,104 @@
+"""Unread: the messages that a subscription has received and its reader has not read; no I/O."""
+
+from __future__ import annotations
+
+from collections import deque
+from operator import attrgetter
+from typing import Final
+
+from nedbus_msgs import identity_of
+
+from .arrival import Arrival, detach, encoding_of
+from .writer_proxy import LossCounters
+
+CAPACITY: Final = 65_536
+"""Unread messages of a subscription in mode `every`, unless `limit` is set; beyond that the oldest are dropped."""
+
+MAX_UNREAD_BYTES: Final = 64 * 2**20
+"""Bytes of payload in the unread messages of a subscription; beyond that the oldest are dropped."""
+
+MAX_BATCH: Final = 4096
+"""Messages in a batch in mode `every`, unless `max_messages` is set."""
+
+_MAX_FRESH: Final = 1024  # messages queued with Zenoh's receive buffer; later ones are detached from it
+_PAYLOAD: Final = attrgetter("payload")
+
+
+class Unread:
+    """Unread messages in order of arrival, with `newest_only` the newest of each key; drops the oldest at its limits.
+
+    `limit`: messages. Not thread-safe.
+    """
+
+    def __init__(self, counters: LossCounters, *, newest_only: bool, limit: int) -> None:
+        self.newest_only, self.arrived, self._counters, self._limit = newest_only, 0, counters, limit
+        self._bytes = 0
+        self._every: deque[Arrival] = deque()
+        self._newest: dict[str, Arrival] = {}
+
+    def __len__(self) -> int:
+        return len(self._every) or len(self._newest)
+
+    def add(self, arrivals: list[Arrival]) -> int:
+        """Add messages; drop superseded ones and, above a limit, the oldest; return how many the limits dropped."""
+        every, newest = self._every, self._newest
+        self.arrived += len(arrivals)
+        self._bytes += sum(map(len, map(_PAYLOAD, arrivals)))
+        if self.newest_only:
+            for arrival in arrivals:
+                key = arrival.stream.key
+                if (waiting := newest.get(key)) is not None:
+                    self._counters.dropped += 1
+                    self._bytes -= len(waiting.payload)
+                    newest[key] = arrival._replace(lost=arrival.lost + waiting.lost)
+                else:
+                    newest[key] = arrival
+        else:
+            every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
+        excess = 0
+        while len(every) > self._limit or len(newest) > self._limit or self._bytes > MAX_UNREAD_BYTES:
+            self._drop_oldest()
+            excess += 1
+        return excess
+
+    def pop(self) -> Arrival | None:
+        """Remove and return the oldest message; None if there is none."""
+        if self._every:
+            arrival = self._every.popleft()
+        elif self._newest:
+            arrival = self._newest.pop(next(iter(self._newest)))
+        else:
+            return None
+        self._bytes -= len(arrival.payload)
+        return arrival
+
+    def pop_batch(self, max_messages: int | None) -> list[Arrival]:
+        """Remove and return the messages of the same type as the oldest; the others stay in order."""
+        every, newest = self._every, self._newest
+        count = min(len(self), max_messages or (len(newest) if self.newest_only else MAX_BATCH))
+        oldest = list(newest.values())[:count] or [every.popleft() for _ in range(count)]
+        kinds = [each.codec if each.stream.codec else _identity(each) for each in oldest]
+        taken = [arrival for arrival, kind in zip(oldest, kinds, strict=True) if kind == kinds[0]]
+        if self.newest_only:
+            for arrival in taken:
+                del newest[arrival.stream.key]
+        else:
+            every.extendleft(
+                arrival for arrival, kind in zip(oldest[::-1], kinds[::-1], strict=True) if kind != kinds[0]
+            )
+        self._bytes -= sum(map(len, map(_PAYLOAD, taken)))
+        return taken
+
+    def discard(self) -> None:
+        """Drop all messages."""
+        while len(self):
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        if arrival := self.pop():
+            arrival.stream.unreported += arrival.lost
+            self._counters.dropped += 1
+
+
+def _identity(arrival: Arrival) -> tuple[str, str] | None:
+    return identity_of(encoding_of(arrival.stream, arrival.raw))
