@@ -71,6 +71,7 @@ def run_until_stopped(
             signal.signal(number, on_signal)
     on_terminal = _has_terminal()
     gc.freeze()  # modules live as long as the process, so collections need not examine them
+    gc.set_threshold(10_000)  # by default, each read of a log or link is examined several times
     thread = threading.Thread(target=run, name="nedbus-run", daemon=True)
     thread.start()
     while thread.is_alive() and not signals:

@@ -34,7 +34,7 @@ _LOG_DATA: Final[Mapping[int, str]] = {
     number: each.msgname for number, each in dialect.mavlink_map.items() if each.msgname.startswith("LOGGING_DATA")
 }
 _TICK: Final = 0.05  # s, the longest wait of the thread
-_PAUSE: Final = 0.01  # s between two reads during a stream: several messages at once need less processor time
+_PAUSE: Final = 0.015  # s between two reads during a stream: several messages at once need less processor time
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
