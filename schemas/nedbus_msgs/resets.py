@@ -33,7 +33,7 @@ RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" f
 """The field that counts the resets of each quantity, modulo 256."""
 
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-_read_origin: Final = attrgetter(*_ORIGIN)
+_read_origin: Final = attrgetter(*_ORIGIN)  # compared as text, in which NaN equals NaN
 JUMP_FIELDS: Final = (
     *sorted({each for names in (*_VALUES.values(), *_RATES.values()) for each in names}),
     *(f"delta_{name}" for name in _VALUES), *_ORIGIN, "unaided_heading",
@@ -94,7 +94,7 @@ class ResetTracker:
         last, self._last = self._last, message
         reset, discontinued = set[Quantity](), set[Quantity]()
         rebooted = last is not None and message.timestamp < last.timestamp - _REBOOT
-        origin_changed = last is not None and _is_moved(_read_origin(last), _read_origin(message))
+        origin_changed = last is not None and str(_read_origin(last)) != str(_read_origin(message))
         values: dict[str, float] = {}
         for name, fields in _VALUES.items():
             zero: Point = (0.0,) * len(fields)
@@ -140,7 +140,7 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
     delta = after[f"delta_{name}"]
     announced = [delta if isinstance(delta, tuple) else (delta,)] * ((after[counter] - before[counter]) % 256 == 1)
-    if name in ("xy", "z") and _is_moved(*(tuple(fields[each] for each in _ORIGIN) for fields in (before, after))):
+    if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str([after[each] for each in _ORIGIN]):
         shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])
         announced += [(0.0,) * len(values), shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],)]
     announced = [jump for jump in announced if all(map(math.isfinite, jump))]
@@ -162,10 +162,6 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     if best is not None and math.dist(best, step) <= tolerance:
         return best
     return step if is_measured else None
-
-
-def _is_moved(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
-    return before != after and str(before) != str(after)  # NaN equals NaN only as text
 
 
 def _motion(value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float) -> float:

@@ -60,6 +60,7 @@ class Vehicle:
         self.armed: bool | None = None
         self.time = self.last_seen = 0.0
         self.boot: float | None = None
+        self._is_off = False  # the last time since boot was not the expected one
         self._on_event = on_event
         self._common = common
         self.recent: deque[Event] = deque(maxlen=_MAX_RECENT)
@@ -96,7 +97,7 @@ class Vehicle:
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
-        self.time, self.boot = time, stamp / 1e6
+        self._set_boot(stamp / 1e6, time, is_queued=type(detector) is detectors.TextDetector)
         if type(detector) is PositionDetector:  # of `main`
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
@@ -334,6 +335,12 @@ class Vehicle:
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
             self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
+
+    def _set_boot(self, boot: float, time: float, *, is_queued: bool) -> None:
+        """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
+        expected = boot if self.boot is None else self.boot + time - self.time
+        was_off, self._is_off = self._is_off, is_queued or abs(boot - expected) > 1e-6 * _REBOOT
+        self.time, self.boot = time, boot if was_off or is_queued or not self._is_off else expected
 
     def _emit_all(self, found: Iterable[Finding], address: Address, time: float) -> None:
         for each in found:
