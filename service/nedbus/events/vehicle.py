@@ -97,15 +97,14 @@ class Vehicle:
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
-        self._set_boot(stamp / 1e6, time, is_queued=type(detector) is detectors.TextDetector)
+        is_queued = type(detector) is detectors.TextDetector  # a log may begin with old texts
+        self._set_boot(stamp / 1e6, time, is_queued=is_queued)
         if type(detector) is PositionDetector:  # of `main`
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
-        # PX4's log messages are queued, and a log may begin with old ones, so their timestamps reveal no reboot.
-        is_dated = type(detector) is not detectors.TextDetector
-        if is_dated and (stamp < before - _REBOOT or self._suspect is not None):
+        if not is_queued and (stamp < before - _REBOOT or self._suspect is not None):
             known = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
             found = detector.add(message, missing) if known is None else iter(known)
         self._emit_all(found or (), address, time)
