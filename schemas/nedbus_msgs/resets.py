@@ -33,7 +33,7 @@ RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" f
 """The field that counts the resets of each quantity, modulo 256."""
 
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-_read_origin: Final = attrgetter(*_ORIGIN)
+_read_origin: Final = attrgetter(*_ORIGIN)  # compared as text, in which NaN equals NaN
 JUMP_FIELDS: Final = (
     *sorted({each for names in (*_VALUES.values(), *_RATES.values()) for each in names}),
     *(f"delta_{name}" for name in _VALUES), *_ORIGIN, "unaided_heading",
@@ -43,11 +43,13 @@ JUMP_FIELDS: Final = (
 _REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
 _MAX_INTERVAL: Final = 3.0  # s for which the rates at both ends determine the motion well enough to find a step
 _MAX_UNKNOWN: Final = 0.5  # s, the same without rates
+_SURE_INTERVAL: Final = 0.15  # s; over longer intervals, a change of the rate makes the motion uncertain
 # Maximum difference between a delta and the step, in m, m/s or rad: for noise, for a jerk of 120 m/s^3 (the mean of two
-# rates is off by a twelfth of it times the interval cubed), and without rates or over long intervals.
+# rates is off by a twelfth of it times the interval cubed, but at most by _SPEED), and without rates.
 _NOISE: Final = 0.003
 _JERK: Final = 10.0
-_SPEED: Final = 5.0
+_SPEED: Final = 2.0
+_UNKNOWN_SPEED: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,7 @@ class ResetTracker:
         last, self._last = self._last, message
         reset, discontinued = set[Quantity](), set[Quantity]()
         rebooted = last is not None and message.timestamp < last.timestamp - _REBOOT
-        origin_changed = last is not None and _is_moved(_read_origin(last), _read_origin(message))
+        origin_changed = last is not None and str(_read_origin(last)) != str(_read_origin(message))
         values: dict[str, float] = {}
         for name, fields in _VALUES.items():
             zero: Point = (0.0,) * len(fields)
@@ -140,22 +142,23 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
     delta = after[f"delta_{name}"]
     announced = [delta if isinstance(delta, tuple) else (delta,)] * ((after[counter] - before[counter]) % 256 == 1)
-    if name in ("xy", "z") and _is_moved(*(tuple(fields[each] for each in _ORIGIN) for fields in (before, after))):
+    if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str([after[each] for each in _ORIGIN]):
         shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])
         announced += [(0.0,) * len(values), shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],)]
     announced = [jump for jump in announced if all(map(math.isfinite, jump))]
-    motion = [_motion(value, before, after, seconds) for value in values]
-    is_known = all(map(math.isfinite, motion))
-    motion = [moved if math.isfinite(moved) else 0.0 for moved in motion]
+    motions = [_motion(value, before, after, seconds) for value in values]
+    is_known = all(math.isfinite(moved) for moved, _ in motions)
+    motion, changes = zip(*(each if math.isfinite(each[0]) else (0.0, 0.0) for each in motions), strict=True)
     step = tuple(after[value] - before[value] - moved for value, moved in zip(values, motion, strict=True))
     if not all(map(math.isfinite, step)) or seconds <= 0:
         return announced[0] if announced else None
     if name == "heading":
         step = (wrap(step[0]),)
     is_measured = seconds <= (_MAX_INTERVAL if is_known else _MAX_UNKNOWN)
-    tolerance = _SPEED * seconds
+    tolerance = _UNKNOWN_SPEED * seconds
     if is_measured and is_known:
-        tolerance = _NOISE + min(_JERK * seconds**3, tolerance)
+        tolerance = _NOISE + min(_JERK * seconds**3, _SPEED * seconds)
+        tolerance += 2 * math.hypot(*changes) if seconds > _SURE_INTERVAL else 0.0
     elif not is_measured:
         tolerance += math.hypot(*motion)
     best = min(announced, key=lambda jump: math.dist(jump, step), default=None)
@@ -164,16 +167,13 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     return step if is_measured else None
 
 
-def _is_moved(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
-    return before != after and str(before) != str(after)  # NaN equals NaN only as text
-
-
-def _motion(value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float) -> float:
-    """Return how far a value moved between two messages by its rate of change at both; NaN if it is unknown."""
+def _motion(value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float) -> tuple[float, float]:
+    """Return how far a value moved by its rates at both messages, NaN if unknown, and by how much the rates differ."""
     if value == "heading":  # the gyroscopes' heading has no resets
         turned: float = after["unaided_heading"] - before["unaided_heading"]
-        return wrap(turned) if math.isfinite(turned) else math.nan
+        return (wrap(turned) if math.isfinite(turned) else math.nan), 0.0
     for name in _RATES[value]:
         if rates := [rate for rate in (before[name], after[name]) if math.isfinite(rate)]:
-            return fmean(rates) * seconds * (-1 if value == "dist_bottom" else 1)
-    return math.nan
+            sign = -1 if value == "dist_bottom" else 1
+            return sign * fmean(rates) * seconds, (max(rates) - min(rates)) * seconds
+    return math.nan, 0.0

@@ -50,13 +50,20 @@ float64 m
 float64[3] mm
 """
 NESTED: Final = "\n" + "=" * 80 + "\nMSG: px4_msgs/"
-ROSBAGS: Final = """
+LITERAL: Final = {
+    "rosbags==0.11.9": """
 import sys
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 store = get_typestore(Stores.EMPTY)
 store.register(get_types_from_msg(sys.stdin.read(), "px4_msgs/msg/LogMessage"))
 print(store.hash_rihs01("px4_msgs/msg/LogMessage"))
-"""
+""",
+    "zenoh-ros2-sdk==0.1.8": """
+import sys
+from zenoh_ros2_sdk.utils import get_type_hash
+print(get_type_hash("px4_msgs/msg/LogMessage", msg_definition=sys.stdin.read(), dependencies={}))
+""",
+}
 
 
 def install(folder: Path, *packages: str) -> Path:
@@ -107,17 +114,16 @@ def test_hash_equals_that_of_ros_2(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.timeout(420)
-def test_literal_hash_equals_that_of_rosbags(tmp_path: Path) -> None:
-    """Rosbags takes char literally; nedbus recognizes the hash, and knows that it is not the one of ROS 2."""
+@pytest.mark.parametrize("package", LITERAL)
+def test_literal_hash_equals_that_of_libraries(package: str, tmp_path: Path) -> None:
+    """Two libraries take char literally; nedbus recognizes their hash, and knows that it is not the one of ROS 2."""
     definition = MESSAGES["LogMessage"]
     (layout,) = definition.layouts.values()
     text = definition_text(definition, layout)
-    programs = install(tmp_path / "venv", "rosbags==0.11.9")
-    done = subprocess.run(
-        [str(programs / "python"), "-c", ROSBAGS], input=text, capture_output=True, text=True, timeout=60, check=False
-    )
+    command = [str(install(tmp_path / "venv", package) / "python"), "-c", LITERAL[package]]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    found = done.stdout.strip()
+    found = done.stdout.split()[-1]
     assert found == hash_of_msg("LogMessage", text, literal_char=True) != hash_of(layout, ros2_type(definition))
     assert has_char_hash(found)
     assert message_of_type_hash(found) == (definition, layout)

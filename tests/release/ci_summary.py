@@ -22,7 +22,7 @@ KNOWN: Final = {
     f"{_LANGUAGE}[node]": "needs Node.js, and a package from its registry",
     f"{_LANGUAGE}[cargo]": "needs Rust, and packages from its registry",
     f"{_LANGUAGES}.test_ros2_generator::test_hash_equals_that_of_ros_2": _PACKAGES,
-    f"{_LANGUAGES}.test_ros2_generator::test_literal_hash_equals_that_of_rosbags": _PACKAGES,
+    f"{_LANGUAGES}.test_ros2_generator::test_literal_hash_equals_that_of_libraries": _PACKAGES,
     f"{_LANGUAGES}.test_payloads::test_decoder_of_documentation_returns_every_value": _PACKAGES,
     f"{_LANGUAGES}.test_readers::test_every_value_of_a_recording_is_read": _PACKAGES,
     f"{_LANGUAGES}.test_readers::test_every_value_of_a_saved_stream_is_read": _PACKAGES,

@@ -60,6 +60,7 @@ class Vehicle:
         self.armed: bool | None = None
         self.time = self.last_seen = 0.0
         self.boot: float | None = None
+        self._is_off = False  # the last time since boot was not the expected one
         self._on_event = on_event
         self._common = common
         self.recent: deque[Event] = deque(maxlen=_MAX_RECENT)
@@ -96,15 +97,14 @@ class Vehicle:
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
-        self.time, self.boot = time, stamp / 1e6
+        is_queued = type(detector) is detectors.TextDetector  # a log may begin with old texts
+        self._set_boot(stamp / 1e6, time, is_queued=is_queued)
         if type(detector) is PositionDetector:  # of `main`
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
-        # PX4's log messages are queued, and a log may begin with old ones, so their timestamps reveal no reboot.
-        is_dated = type(detector) is not detectors.TextDetector
-        if is_dated and (stamp < before - _REBOOT or self._suspect is not None):
+        if not is_queued and (stamp < before - _REBOOT or self._suspect is not None):
             known = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
             found = detector.add(message, missing) if known is None else iter(known)
         self._emit_all(found or (), address, time)
@@ -334,6 +334,12 @@ class Vehicle:
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
             self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
+
+    def _set_boot(self, boot: float, time: float, *, is_queued: bool) -> None:
+        """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
+        expected = boot if self.boot is None else self.boot + time - self.time
+        was_off, self._is_off = self._is_off, is_queued or abs(boot - expected) > 1e-6 * _REBOOT
+        self.time, self.boot = time, boot if was_off or is_queued or not self._is_off else expected
 
     def _emit_all(self, found: Iterable[Finding], address: Address, time: float) -> None:
         for each in found:

@@ -538,7 +538,13 @@ def test_single_wild_position_is_no_jump(flight: Flight) -> None:
         (2.0, {"x": 7.0, "vx": 2.0, "xy_reset_counter": 2}, "xy by 5.0 m (5.0 north, 0.0 east)"),  # minus the motion
         (3.5, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
         (2.0, {"heading": 3.0, "heading_reset_counter": 2}, "heading by an unknown amount"),  # its rate is unknown
-        (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
+        (2.0, {"x": 6.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
+        (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 8.0 m (8.0 north, 0.0 east)"),
+        (
+            0.5,
+            {"x": 9.0, "vx": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)},
+            "xy by 3.0 m (3.0 north, 0.0 east)",
+        ),
         (0.1, {"vz": -3.0, "vz_reset_counter": 1, "delta_vz": -3.0}, "vz by 3.0 m/s"),
         (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
         (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
@@ -558,7 +564,7 @@ def test_reset_size_is_delta_or_observed_step(
 def test_reset_counter_wraps_from_255_to_0(flight: Flight) -> None:
     """PX4's reset counters are uint8: a step from 255 to 0 is one reset, whose size is its delta."""
     flight.wait(0.1).send(xy_reset_counter=255)
-    wrapped = flight.wait(2.0).send(x=8.0, xy_reset_counter=0, delta_xy=(3.0, 0.0))
+    wrapped = flight.wait(2.0).send(x=6.0, xy_reset_counter=0, delta_xy=(3.0, 0.0))
     assert [each.text for each in wrapped] == ["reset of xy by 3.0 m (3.0 north, 0.0 east)"]
 
 

@@ -118,6 +118,24 @@ def test_single_low_timestamp_is_not_a_reboot(vehicle: SimpleVehicle, stamp: int
     assert vehicle.state(7.0) == "bad"
 
 
+@pytest.mark.parametrize("stamp", [1, 10**11, 9 * 10**18])
+def test_wild_last_timestamp_does_not_date_later_events(vehicle: SimpleVehicle, stamp: int) -> None:
+    """Events after a message with a wild timestamp, such as silence, have the time since boot of the others."""
+    for second in range(5):
+        vehicle.send(float(second))
+    vehicle.send(5.0, timestamp=stamp)
+    vehicle.event_log.update(20.0, {MAIN: "stale"})
+    assert [(each.kind, each.boot) for each in vehicle.event_log.events] == [("silent", 30.0)]
+
+
+def test_event_after_an_old_text_has_its_own_time(vehicle: SimpleVehicle) -> None:
+    """A text from before the start of a log has its own time since boot, and so has the next event."""
+    vehicle.send(0.0)
+    vehicle.send(0.5, "log_message", timestamp=1_000_000, severity=6, text="old")
+    vehicle.send(1.0, xy_valid=False)
+    assert [(each.kind, each.boot) for each in vehicle.event_log.events] == [("text", 1.0), ("xy_invalid", 11.0)]
+
+
 def test_wild_first_timestamp_is_not_a_reboot(vehicle: SimpleVehicle) -> None:
     """If only the first message of the only stream was later, that time was wrong, and the vehicle did not reboot."""
     vehicle.send(0.0, timestamp=10**11)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from nedbus_msgs import (
+    MESSAGES,
     TOPICS,
     Address,
     AddressError,
     VehicleLocalPosition,
     dds_type,
+    hash_of,
     ros2_topic_of,
+    ros2_type,
     ros2_types,
     split_ros2_topic,
 )
@@ -100,6 +105,13 @@ def test_type_hash_matches_ros_2(layout: str, ros2_type: str) -> None:
     assert type_hash(layout, name=ros2_type) == f"RIHS01_{HASHES[layout, ros2_type]}"
     assert layout_of_type_hash(type_hash(layout, name=ros2_type)) == layout
     assert layout_of_type_hash(HASHES[layout, ros2_type]) == layout
+
+
+def test_hash_in_the_documentation_is_that_of_log_message() -> None:
+    """docs/live.md has the hash of LogMessage for libraries that compute another one."""
+    definition = MESSAGES["LogMessage"]
+    text = (Path(__file__).parents[3] / "docs/live.md").read_text()
+    assert f'type_hash="{hash_of(definition.current, ros2_type(definition))}"' in text
 
 
 def test_layout_is_found_by_hash() -> None:

@@ -42,7 +42,7 @@ class NotAcceptedError(Exception):
 
 
 class WireFormat(NamedTuple):
-    """Definition and layout; `unknown`: fields of a newer layout; `is_literal`: the hash takes `char` literally."""
+    """Definition and layout of messages; `unknown`: fields of a newer layout; `is_literal`: hash with literal char."""
 
     definition: Definition[Any]
     layout: Layout
