@@ -82,7 +82,7 @@ def test_waiting_reader_ends_when_another_thread_drains(endpoint: str) -> None:
     with nedbus.connect(endpoint) as bus, bus.subscribe(VLP) as subscription:
         reader = threading.Thread(target=read_all, args=(subscription,))
         reader.start()
-        wait_for(lambda: subscription._receiver._idle, what="the reader to wait")
+        wait_for(lambda: subscription._receiver._rings[0].idle, what="the reader to wait")
         subscription.drain()
         reader.join(DEADLINE)
         assert not reader.is_alive()
