@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from functools import partial
-from itertools import chain, islice
+from itertools import islice
 from typing import Final
 
 import zenoh
@@ -236,18 +236,21 @@ class Receiver:
         try:
             while self._take_link() is not None:
                 self._inbox.on_link_change()
-            queries = chain.from_iterable(iter(take, None) for take in self._take_queries)
-            for query in islice(queries, MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
-                self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
-                key, get = str(query.key_expr), query.parameters.get
-                publisher, number = get("publisher"), get("number") or ""
-                if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
-                    continue  # dropping the query ends it
-                reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
-                request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
-                self._inbox.acknowledge(request, drained=all(ring.idle for ring in self._rings))
+            for take in self._take_queries:
+                for query in islice(iter(take, None), MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
+                    self._on_ack_request(query)
         except zenoh.ZError:  # undeclared
             pass
+
+    def _on_ack_request(self, query: zenoh.Query) -> None:
+        self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
+        key, get = str(query.key_expr), query.parameters.get
+        publisher, number = get("publisher"), get("number") or ""
+        if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
+            return  # dropping the query ends it
+        reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
+        request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
+        self._inbox.acknowledge(request, drained=all(ring.idle for ring in self._rings))
 
     def _declare_keys(self) -> None:
         """Declare the exact keys of new streams: Zenoh then looks up the route of their messages once, not for each."""

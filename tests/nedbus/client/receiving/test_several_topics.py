@@ -161,7 +161,7 @@ def test_changes_of_the_link_are_reported() -> None:
             await asyncio.to_thread(first.close)
             await asyncio.to_thread(wait_for, lambda: in_loop == [False], what="the loss of the link")
             with open_router(listen=[endpoint]):
-                await asyncio.to_thread(wait_for, lambda: in_loop == [False, True], what="the link")
+                await asyncio.to_thread(wait_for, lambda: in_loop == changes == [False, True], what="the link")
 
     first = open_router(listen=[endpoint])
     with nedbus.connect(endpoint) as bus:
