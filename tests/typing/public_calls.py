@@ -33,7 +33,8 @@ def subscribe(bus: nedbus.Bus) -> None:
     assert_type(bus.subscribe(max_rate=5), nedbus.Subscription)
     bus.subscribe(max_rate="5")  # type: ignore[call-overload] # not a number
     bus.subscribe(mode="newest")  # type: ignore[call-overload] # neither "latest" nor "every"
-    bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-overload] # vehicle is keyword-only
+    bus.subscribe("vehicle_local_position", 7)  # type: ignore[call-overload] # vehicle is keyword-only
+    bus.subscribe(limit="1")  # type: ignore[call-overload] # not a number
 
 
 class WheelEncoders(nedbus.Message):
@@ -55,6 +56,14 @@ def subscribe_by_class_and_topic(bus: nedbus.Bus, any_topic: str) -> None:
     assert_type(bus.subscribe(topic="estimator_local_position").receive().message.x, float)
     assert_type(bus.subscribe(WheelEncoders).receive().message.wheel_speed, float)
     assert_type(bus.subscribe("*"), nedbus.Subscription[nedbus.Message])
+    both = bus.subscribe(nedbus.VehicleAttitude, nedbus.SensorGps, limit=100)
+    assert_type(both, nedbus.Subscription[nedbus.VehicleAttitude | nedbus.SensorGps])
+    three = bus.subscribe(nedbus.VehicleAttitude, nedbus.SensorGps, nedbus.HomePosition)
+    assert_type(three.receive().message, nedbus.VehicleAttitude | nedbus.SensorGps | nedbus.HomePosition)
+    assert_type(bus.subscribe(nedbus.VehicleAttitude, "sensor_gps"), nedbus.Subscription[nedbus.Message])
+    both.batches(max_messages="1")  # type: ignore[arg-type] # not a number
+    bus.publisher(nedbus.VehicleAttitude, vehicle=7)
+    bus.on_link(lambda is_up: assert_type(is_up, bool))
     assert_type(bus.subscribe(any_topic).receive().message.timestamp, int)
     bus.subscribe(any_topic).receive().message.x  # type: ignore[attr-defined] # unknown message type
     assert_type(bus.latest(nedbus.HomePosition)[0].message.alt, float)

@@ -6,7 +6,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, suppress
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
@@ -19,7 +19,7 @@ from nedbus_msgs import Definition, Message, Selection
 
 from .bus import Bus
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
-from .sample import M_co, Mode, Query, Sample, Subscribe
+from .sample import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
 
 _P = ParamSpec("_P")
@@ -80,21 +80,33 @@ class AsyncBus:
 
     @overload
     def subscribe(
-        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Subscribe]
+        self, message: type[M_co] = ..., /, *, topic: str = ..., **options: Unpack[Subscribe]
     ) -> AsyncSubscription[M_co]: ...
     @overload
-    def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
+    def subscribe(
+        self, message: type[M_co], other: type[M2], /, **options: Unpack[Subscribe]
+    ) -> AsyncSubscription[M_co | M2]: ...
+    @overload
+    def subscribe(
+        self, message: type[M_co], other: type[M2], third: type[M3], /, **options: Unpack[Subscribe]
+    ) -> AsyncSubscription[M_co | M2 | M3]: ...
+    @overload
+    def subscribe(self, *messages: type[Message] | str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
         return Bus.subscribe(cast("Bus", self), *message, **options)  # uses only `subscribe_to` of `self`
 
     def subscribe_to(
-        self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
+        self, *selections: Selection, mode: Mode = "latest", max_rate: float | None = None, limit: int | None = None
     ) -> AsyncSubscription[Any]:
-        """Subscribe to a selection of addresses; see `subscribe`."""
+        """Subscribe to selections of addresses; see `subscribe`."""
         bus = self._blocking
-        inbox = bus._make_inbox(selection, mode, max_rate)
+        inbox = bus._make_inbox(selections, mode, max_rate, limit)
         return AsyncSubscription(partial(self._in_thread, bus._open_receiver, inbox), inbox)
+
+    def on_link(self, call: Callable[[bool], object]) -> None:
+        """Call a function in the running event loop when the link to the router is lost or up; see `Bus.on_link`."""
+        self._blocking.on_link(partial(_call_in, asyncio.get_running_loop(), call))
 
     @overload
     async def latest(
@@ -114,8 +126,9 @@ class AsyncBus:
 
     async def publisher(
         self,
-        topic: str,
+        message: type[Message] | str,
         *,
+        topic: str | None = None,
         vehicle: str | int,
         instance: int | None = None,
         lossless: bool = False,
@@ -123,7 +136,9 @@ class AsyncBus:
         definition: Definition[Any] | None = None,
     ) -> AsyncPublisher:
         """Return a publisher with awaitable methods; see `Bus.publisher`."""
-        call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance, definition=definition)
+        call = partial(
+            self._blocking.publisher, message, topic=topic, vehicle=vehicle, instance=instance, definition=definition
+        )
         return AsyncPublisher(await self._in_thread(call, lossless=lossless, source=source))
 
     async def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
@@ -150,6 +165,11 @@ class AsyncBus:
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(call, *args, **kwargs))
+
+
+def _call_in(loop: asyncio.AbstractEventLoop, call: Callable[[bool], object], is_up: bool) -> None:
+    with suppress(RuntimeError):  # the loop is closed
+        loop.call_soon_threadsafe(call, is_up)
 
 
 def _stop_waiting(bus: Bus) -> None:

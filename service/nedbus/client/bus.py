@@ -2,13 +2,13 @@
 
 import threading
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack, overload
 
-from nedbus.errors import ClosedError, NedbusError
+from nedbus.errors import ArgumentError, ClosedError, NedbusError
 from nedbus.events import AccountReport
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked, token_keys
@@ -17,11 +17,12 @@ from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLoc
 from .closing import Finalizer
 from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_reports, find_services
 from .fleet_tokens import FleetTokens
+from .link import LinkWatch
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiver, Receiver, find_schemas
-from .sample import M_co, Mode, Query, Sample, Subscribe
+from .sample import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
 
@@ -45,11 +46,13 @@ class Bus(AbstractContextManager["Bus"]):
         self._directory = VehicleDirectory(partial(FleetTokens, reopen, prefix=prefix), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
+        self._links: list[LinkWatch] = []
         closing = ExitStack()  # runs in reverse order; closing the session ends an open query for layouts
         heartbeats = self._publishers.heartbeats  # not the registry: its publishers reference the bus
         for close in (self._layouts.close, self._directory.close, session.close, heartbeats.close, self._queries.close):
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
+        closing.callback(_close_all, self._links)
         self._finalizer = Finalizer(self, closing.close)
 
     @property
@@ -64,42 +67,56 @@ class Bus(AbstractContextManager["Bus"]):
 
     @overload
     def subscribe(
-        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Subscribe]
+        self, message: type[M_co] = ..., /, *, topic: str = ..., **options: Unpack[Subscribe]
     ) -> Subscription[M_co]: ...
     @overload
-    def subscribe(self, message: str, **options: Unpack[Subscribe]) -> Subscription[Message]: ...
+    def subscribe(
+        self, message: type[M_co], other: type[M2], /, **options: Unpack[Subscribe]
+    ) -> Subscription[M_co | M2]: ...
+    @overload
+    def subscribe(
+        self, message: type[M_co], other: type[M2], third: type[M3], /, **options: Unpack[Subscribe]
+    ) -> Subscription[M_co | M2 | M3]: ...
+    @overload
+    def subscribe(self, *messages: type[Message] | str, **options: Unpack[Subscribe]) -> Subscription[Message]: ...
     def subscribe(
         self,
-        message: type[Message] | str = VehicleLocalPosition,
-        *,
+        *messages: type[Message] | str,
         topic: str | None = None,
         vehicle: str | int = ANY,
         instance: int | None = None,
         mode: Mode = "latest",
         max_rate: float | None = None,
+        limit: int | None = None,
     ) -> Subscription[Any]:
         """Return a subscription to iterate over, which starts with the last message of each key.
 
-        `message`: a message class such as VehicleAttitude, for typed samples of its first topic or of `topic`, such as
-        "estimator_attitude"; or the name of a topic; or "*" for all topics.
+        `messages`: message classes such as VehicleAttitude, for typed samples of their first topic or, with one class,
+        of `topic`, such as "estimator_attitude"; or names of topics; or "*" for all topics.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which caches
-        about 20 s of messages. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
+        about 20 s of messages.
+        `limit`: unread samples kept for a slow reader, by default 65,536, or in mode "latest" the newest of 10,000
+        keys, in both cases up to 64 MiB of payload; beyond that the oldest are dropped.
         In both modes `counts` reports lost, dropped and invalid samples. A slow reader delays lossless publishers only.
         `max_rate`: messages per second of each stream on average, downsampled by its publisher, for slow links.
         The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`. If that is
         below 1, the reader downsamples further. Messages left out by downsampling count as neither lost nor dropped.
 
-        Raises ArgumentError for an invalid `mode`, or if `max_rate` is not a finite number above 0.
+        Raises ArgumentError for an invalid `mode` or `limit`, if `max_rate` is not a finite number above 0, and for
+        `topic` with several messages.
         """
-        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        return self.subscribe_to(selection, mode=mode, max_rate=max_rate)
+        if topic is not None and len(messages) > 1:
+            raise ArgumentError("topic", topic, "None with several messages: pass the names of the topics instead")
+        topics = [topic_of(message, topic) for message in messages or (VehicleLocalPosition,)]
+        selections = [Selection(each, vehicle_name(vehicle), instance) for each in dict.fromkeys(topics)]
+        return self.subscribe_to(*selections, mode=mode, max_rate=max_rate, limit=limit)
 
     def subscribe_to(
-        self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
+        self, *selections: Selection, mode: Mode = "latest", max_rate: float | None = None, limit: int | None = None
     ) -> Subscription[Any]:
-        """Subscribe to a selection of addresses; see `subscribe`."""
-        inbox = self._make_inbox(selection, mode, max_rate)
+        """Subscribe to selections of addresses; see `subscribe`."""
+        inbox = self._make_inbox(selections, mode, max_rate, limit)
         return Subscription(self._open_receiver(inbox), inbox, owner=self)
 
     @overload
@@ -164,15 +181,16 @@ class Bus(AbstractContextManager["Bus"]):
 
     def publisher(
         self,
-        topic: str,
+        message: type[Message] | str,
         *,
+        topic: str | None = None,
         vehicle: str | int,
         instance: int | None = None,
         lossless: bool = False,
         source: str | None = None,
         definition: Definition[Any] | None = None,
     ) -> Publisher:
-        """Return a publisher for one address.
+        """Return a publisher for one address; `message` and `topic` as in `subscribe`, but for one topic.
 
         Returns once the router has processed the declarations, so later subscribers receive the last message.
         `lossless`: flow control for replays at the readers' pace. `publish` slows down to 10 messages per second
@@ -184,7 +202,9 @@ class Bus(AbstractContextManager["Bus"]):
         Raises AddressInUseError if this bus already has a publisher for the address.
         """
         self._require_open()
-        address = Address(vehicle_name(vehicle), topic, instance)
+        address = Address(vehicle_name(vehicle), topic_of(message, topic), instance)
+        if definition is None and not isinstance(message, str):
+            definition = message.DEFINITION
         publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)
         try:
             # This key matches nothing: a session that queries its own token sometimes lists it forever (Zenoh 1.10).
@@ -193,6 +213,13 @@ class Bus(AbstractContextManager["Bus"]):
             publisher.close(timeout=0.0)
             raise
         return publisher
+
+    def on_link(self, call: Callable[[bool], object]) -> None:
+        """Call a function with False when the link to the router is lost, and with True when it is up again.
+
+        The calls are made on a separate thread, in order, until the bus is closed.
+        """
+        self._links.append(LinkWatch(self._session, call))
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
         """Open another Zenoh session, to the same routers or to `endpoint`; the caller closes it."""
@@ -225,13 +252,17 @@ class Bus(AbstractContextManager["Bus"]):
         if self.closed:
             raise ClosedError
 
-    def _make_inbox(self, selection: Selection, mode: Mode, max_rate: float | None) -> Inbox:
-        """Return the queue of a new subscription; also used by AsyncBus."""
+    def _make_inbox(
+        self, selections: Sequence[Selection], mode: Mode, max_rate: float | None, limit: int | None
+    ) -> Inbox:
+        """Return the inbox of a new subscription; also used by AsyncBus."""
         self._require_open()
         decoder = Decoder(self._layouts, prefix=self.prefix)
+        everything = [each for each in selections if each.topic == ANY]  # includes the other topics
+        wanted = everything[:1] if len({each.vehicle for each in selections}) == 1 and everything else selections
         if max_rate is None:
-            return Inbox(mode, decoder, name=selection.key_expr(prefix=self.prefix))
-        return MaxRateInbox(mode, decoder, selection, max_rate=max_rate)
+            return Inbox(mode, decoder, key_exprs=[each.key_expr(prefix=self.prefix) for each in wanted], limit=limit)
+        return MaxRateInbox(mode, decoder, wanted, max_rate=max_rate, limit=limit)
 
     def _open_receiver(self, inbox: Inbox) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
@@ -265,7 +296,7 @@ def connect(
     return Bus(load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls), timeout=timeout, tls=tls)
 
 
-def _close_all(receivers: Iterable[Receiver]) -> None:
+def _close_all(opened: Iterable[Receiver | LinkWatch]) -> None:
     with ExitStack() as closing:  # closes all, even if one fails
-        for receiver in list(receivers):
-            closing.callback(receiver.close)
+        for each in list(opened):
+            closing.callback(each.close)

@@ -11,6 +11,9 @@ from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition
 Mode = Literal["latest", "every"]  # a slow reader gets the newest message of each key, or every message
 M_co = TypeVar("M_co", bound=Message, default=VehicleLocalPosition, covariant=True)
 
+M2 = TypeVar("M2", bound=Message)  # of further topics of a subscription
+M3 = TypeVar("M3", bound=Message)
+
 
 class Query(TypedDict, total=False):
     """Options of `latest`."""
@@ -27,6 +30,7 @@ class Subscribe(TypedDict, total=False):
     instance: int | None
     mode: Mode
     max_rate: float | None
+    limit: int | None
 
 
 _UNKNOWN: Final = Provenance()
@@ -116,7 +120,8 @@ class Counts:
 
     `received`: returned to the caller.
     `lost`: lost in transit and not recovered.
-    `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
+    `dropped`: arrived but not read in time: superseded in mode "latest", beyond the limit of unread
+    messages or of 64 MiB, or unread when the subscription was closed.
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
     `forgotten`: keys evicted beyond the limit of 10,000, least recently active first; `lost` omits their next gap.

@@ -17,7 +17,7 @@ from nedbus.errors import ClosedError, NoDataError
 from nedbus.transport import require_unforked
 
 from .closing import Finalizer
-from .receiving import Inbox, Receiver
+from .receiving import Inbox, Receiver, check_count
 from .sample import Counts, M_co, Sample
 
 if TYPE_CHECKING:
@@ -47,6 +47,10 @@ class _SubscriptionBase(Generic[M_co]):
         """Number of received messages not yet read."""
         return self._inbox.waiting
 
+    def _pop_batch(self, max_messages: int | None) -> Callable[[], Batch | None]:
+        check_count("max_messages", max_messages)
+        return partial(self._inbox.pop_batch, max_messages)
+
 
 class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription[M_co]"]):
     """Iterator over received samples; `bus.subscribe(...)` returns one.
@@ -69,23 +73,24 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
         """
         return self._next(self._inbox.pop, timeout)
 
-    def receive_batch(self, timeout: float | None = None) -> Batch:
+    def receive_batch(self, timeout: float | None = None, *, max_messages: int | None = None) -> Batch:
         """Wait for at least one message and return unread ones as arrays, as `batches` does.
 
         Raises the errors of `receive`.
         """
-        return self._next(self._inbox.pop_batch, timeout)
+        return self._next(self._pop_batch(max_messages), timeout)
 
     def rows(self) -> Iterator[Sample[M_co]]:
         """Iterate over samples whose `message` is a Row, a named tuple: faster, with the same validation."""
         return self._each(self._pop_row)
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self, *, max_messages: int | None = None) -> Iterator[Batch]:
         """Iterate over batches of unread messages of one type as NumPy arrays, with the same validation.
 
-        In mode `every` a batch has up to 4096 messages, in mode `latest` the newest of each of up to 10,000 keys.
+        `max_messages`: the default is 4096 in mode `every`, in mode `latest` all: the newest of each key.
+        Raises ArgumentError if it is below 1.
         """
-        return self._each(self._inbox.pop_batch)
+        return self._each(self._pop_batch(max_messages))
 
     def drain(self) -> None:
         """End reception: received samples can still be read, then iteration ends, and `receive` raises ClosedError.
@@ -151,17 +156,17 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         """Wait for the next sample and return it; `timeout` and errors as in `Subscription.receive`."""
         return await self._next(self._inbox.pop, timeout)
 
-    async def receive_batch(self, timeout: float | None = None) -> Batch:
+    async def receive_batch(self, timeout: float | None = None, *, max_messages: int | None = None) -> Batch:
         """Wait for at least one message and return unread ones, as `Subscription.receive_batch` does."""
-        return await self._next(self._inbox.pop_batch, timeout)
+        return await self._next(self._pop_batch(max_messages), timeout)
 
     def rows(self) -> AsyncIterator[Sample[M_co]]:
         """Iterate over rows as `Subscription.rows` does."""
         return self._each(self._pop_row)
 
-    def batches(self) -> AsyncIterator[Batch]:
+    def batches(self, *, max_messages: int | None = None) -> AsyncIterator[Batch]:
         """Iterate over NumPy arrays as `Subscription.batches` does."""
-        return self._each(self._inbox.pop_batch)
+        return self._each(self._pop_batch(max_messages))
 
     async def drain(self) -> None:
         """End reception, as `Subscription.drain` does; a subscription that has not been opened is closed."""

@@ -17,7 +17,7 @@ class LossyQueue(Inbox):
     """A queue that loses the messages whose sequence numbers are in `missing`."""
 
     def __init__(self, key_expr: str) -> None:
-        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name=key_expr)
+        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), key_exprs=[key_expr])
         self.missing: Collection[int] = ()
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:

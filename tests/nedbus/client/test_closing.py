@@ -226,7 +226,7 @@ def test_failed_session_raises_in_asyncio(endpoint: str) -> None:
 def test_failed_pump_raises_in_iteration(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """An unexpected error in the pump thread raises ReceiveError, with the text of the error, in the reading thread."""
 
-    def fail(_: Receiver) -> None:
+    def fail(*_: object) -> None:
         raise RuntimeError("on purpose")
 
     monkeypatch.setattr(Receiver, "_receive", fail)

@@ -57,8 +57,8 @@ class AckRequest:
 class Inbox:
     """The messages of a subscription, from Zenoh's ring to the reader; thread-safe.
 
-    `name`: the key expressions. `limit`: unread messages, None for the default. `on_gap` is called, on any thread, when
-    a new gap may be filled by retransmission.
+    `key_exprs`: what to subscribe to. `limit`: unread messages, None for the default.
+    `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Inbox:
         mode: Mode,
         decoder: Decoder,
         *,
-        name: str = "",
+        key_exprs: Sequence[str] = (),
         limit: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -78,13 +78,13 @@ class Inbox:
         self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None  # wakes a reader on an event loop; called on any thread
-        self.name, self.decoder = name, decoder
+        self.key_exprs, self.name, self.decoder = key_exprs, ", ".join(key_exprs), decoder
         self._warned: set[str] = set()
         self._clock = clock
         self._lock = threading.RLock()  # reentrant, because log handlers may read the counts
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._counters = LossCounters()
-        self._streams = streams.Streams(decoder.open, self._on_evict)
+        self.streams = streams.Streams(decoder.open, self._on_evict)
         self._reorder = Reorder(self._counters, recovers=not self.newest_only, clock=clock)
         self.gaps = self._reorder.gaps
         limit = limit or (streams.MAX_KEYS if self.newest_only else CAPACITY)
@@ -122,17 +122,17 @@ class Inbox:
         if overflowed and not self.newest_only:
             self._warn_once(_SLOW)
         if self._ack_requests:
-            self.acknowledge(drained=True)
+            self.acknowledge(drained=len(self.key_exprs) <= 1)  # else other rings may have more
 
     def on_link_change(self) -> None:
         """Handle a link that broke or came back."""
         with self._lock:
-            self._reorder.on_link_change(self._streams)
+            self._reorder.on_link_change(self.streams)
 
     def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
         """Handle a heartbeat: the publisher, known or not, has sent `number`, which should have arrived by now."""
         with self._lock, suppress(AddressError):
-            self._reorder.on_heartbeat(self._streams.open(key, self._clock()), publisher, number)
+            self._reorder.on_heartbeat(self.streams.open(key, self._clock()), publisher, number)
 
     def next_request(self, writer: WriterProxy, now: float) -> range | None:
         """Return the numbers to request from a publisher now; None if no request is due."""
@@ -247,7 +247,7 @@ class Inbox:
                 taken[0].stream.unreported += lost
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
-        arrived, stream = self._unread.arrived, self._streams.get(request.key)
+        arrived, stream = self._unread.arrived, self.streams.get(request.key)
         if request.read_target is None and self._reorder.is_settled(
             stream, request.publisher, request.number, drained=drained
         ):
@@ -261,7 +261,7 @@ class Inbox:
         sample must neither displace a valid one nor use much memory.
         """
         admitted: list[Arrival] = []
-        known, received, opened_at = self._streams.get, clock.utc_ns(), self._clock()
+        known, received, opened_at = self.streams.get, clock.utc_ns(), self._clock()
         new_arrival = tuple.__new__  # 0.15 us less than the class
         for raw in batch:
             key = str(raw.key_expr)
@@ -273,7 +273,7 @@ class Inbox:
             if raw.encoding == WAKE_UP:
                 continue
             try:
-                stream = stream or self._streams.open(key, opened_at)
+                stream = stream or self.streams.open(key, opened_at)
                 codec, newer = stream.codec, NO_LAYOUTS
                 if len(payload) != stream.size:
                     codec, newer = self.decoder.inspect(stream, payload, raw)
@@ -306,7 +306,7 @@ class Inbox:
             _log.warning("%s: %s", self.name, text, extra=about("dropped" if text == _SLOW else "incomplete"))
 
 
-def check_count(name: str, count: int | None) -> None:
+def check_count(name: str, count: object) -> None:
     """Raise ArgumentError unless `count` is None or an integer above 0."""
-    if count is not None and (isinstance(count, bool) or count < 1):
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise ArgumentError(name, count, "a number of messages above 0, or None for the default")

@@ -39,18 +39,27 @@ class MaxRateInbox(Inbox):
     Messages omitted to limit the rate count neither as lost nor as dropped.
     """
 
-    def __init__(self, mode: Mode, decoder: Decoder, selection: Selection, *, max_rate: float) -> None:
+    def __init__(
+        self,
+        mode: Mode,
+        decoder: Decoder,
+        selections: Sequence[Selection],
+        *,
+        max_rate: float,
+        limit: int | None = None,
+    ) -> None:
         check_max_rate(max_rate)
         self.rate = rate_step(max_rate)  # requested from publishers
-        super().__init__(mode, decoder, name=selection.rate_key_expr(self.rate, prefix=decoder.prefix))
-        self.selection, self._max_rate = selection, max_rate
+        key_exprs = [each.rate_key_expr(self.rate, prefix=decoder.prefix) for each in selections]
+        super().__init__(mode, decoder, key_exprs=key_exprs, limit=limit)
+        self.selections, self._max_rate = selections, max_rate
 
     def put_last(self, batch: Sequence[RawSample]) -> None:
         """Queue the last messages of streams that have delivered none yet."""
         last: list[Arrival] = []
         with self._lock:
             for arrival in self._admit(batch):
-                stream = self._streams.open(self._rate_key(arrival.stream.address), self._clock())
+                stream = self.streams.open(self._rate_key(arrival.stream.address), self._clock())
                 if arrival.payload and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
                     last.append(detach(arrival, retained=True))
@@ -61,7 +70,7 @@ class MaxRateInbox(Inbox):
     def has_downsampled(self, address: Address) -> bool:
         """Return True if a downsampled message of a stream has arrived."""
         with self._lock:
-            stream = self._streams.get(self._rate_key(address))
+            stream = self.streams.get(self._rate_key(address))
             return stream is not None and stream.gate is not None
 
     def _rate_key(self, address: Address) -> str:
@@ -86,10 +95,12 @@ class MaxRateReceiver(Receiver):
     """Put downsampled and last messages into a MaxRateInbox until closed."""
 
     def __init__(self, session: Session, inbox: MaxRateInbox) -> None:
-        self._prefix, self._rate_inbox, selection = inbox.decoder.prefix, inbox, inbox.selection
+        self._prefix, self._rate_inbox = inbox.decoder.prefix, inbox
         self._awaiting: dict[Address, float] = {}  # time at which the token of a stream without a message appeared [s]
-        self._tokens = LivelinessTokens(session, selection.alive_key_expr(prefix=self._prefix))
-        self._last = send_query(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
+        tokens = [each.alive_key_expr(prefix=self._prefix) for each in inbox.selections]
+        self._tokens = LivelinessTokens(session, *tokens)
+        keys = [each.key_expr(prefix=self._prefix) for each in inbox.selections]
+        self._last = [send_query(session, key, timeout=_TIMEOUT) for key in keys]
         super().__init__(session, inbox, history=False)
         self._undeclares.append(self._tokens.undeclare)
         self.pump()  # last messages bypass the ring, so no reader may block on it
@@ -97,12 +108,12 @@ class MaxRateReceiver(Receiver):
     def _poll(self, now: float) -> float:
         pause = super()._poll(now)
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
-            found = [reply.ok for reply in self._last.poll() if reply.ok is not None]
+            found = [reply.ok for each in self._last for reply in each.poll() if reply.ok is not None]
             # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
                 self._rate_inbox.put_last(live)
             self._check_publishers(now)
-        return pause if self._last.ended else min(pause, _LAST_POLL)
+        return pause if all(each.ended for each in self._last) else min(pause, _LAST_POLL)
 
     def _check_publishers(self, now: float) -> None:
         for token, alive in self._tokens.poll():

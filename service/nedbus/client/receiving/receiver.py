@@ -8,8 +8,8 @@ starts a pump thread that takes over. While no reader waits, the I/O thread drai
 import logging
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
 from functools import partial
 from itertools import islice
 from typing import Final
@@ -32,6 +32,10 @@ _log = logging.getLogger(__name__)
 RING_CAPACITY: Final = 16_384
 """Samples that the ring holds between two polls: more than 0.2 s of the traffic of the largest fleet."""
 
+MAX_DECLARED_KEYS: Final = 1024
+"""Exact keys that a subscription declares to Zenoh, about 1.5 kB each; the messages of others cost more CPU time."""
+
+_MAX_DECLARATIONS: Final = 8  # keys declared per poll; with 5,000 keys, one takes 3 ms
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
@@ -41,76 +45,96 @@ _MAX_DIGITS: Final = 10  # digits of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
 
 
+class _Ring:
+    """The ring of one key expression, and the thread that receives on it."""
+
+    def __init__(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
+        self.handler = handler  # a blocking receive on the subscriber would prevent undeclaring it
+        self.lock = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
+        self.idle = False  # the holder is blocked on an empty ring
+        self.busy = False
+        self.pump: threading.Thread | None = None
+
+
 class Receiver:
-    """Declare an advanced subscriber on an Inbox's key expression, and put samples into the inbox until closed.
+    """Declare advanced subscribers on an Inbox's key expressions, and put samples into the inbox until closed.
 
     In mode `every` it also requests retransmissions and answers acknowledgement requests.
     With `history` the first samples are the last message of each publisher.
     """
 
     def __init__(self, session: Session, inbox: Inbox, *, history: bool = True) -> None:
-        self._session, self._inbox, key_expr = session, inbox, inbox.name
-        self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", key_expr)
+        self._session, self._inbox = session, inbox
+        self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", inbox.name)
         self._changing = threading.Lock()
         self._closed = False
-        self._receiving = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
-        self._idle = False  # the holder is blocked on an empty ring
-        self._busy = False
-        self._pump: threading.Thread | None = None
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
-        with translate_zenoh_errors():
-            ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
-            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
-        # Receive on the handler: a blocking receive on the subscriber prevents undeclaring it.
-        self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
-        self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
-        self._take_query: Callable[[], zenoh.Query | None] | None = None  # this and the next two: mode `every` only
-        self._take_link: Callable[[], zenoh.TransportEvent | None] | None = None
+        self._rings: list[_Ring] = []
+        self._undeclares: list[Callable[[], object]] = []
+        self._take_queries: list[Callable[[], zenoh.Query | None]] = []  # this and the next two: mode `every` only
+        self._take_link: Callable[[], zenoh.TransportEvent | None] = lambda: None
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
-        if not inbox.newest_only:
-            with translate_zenoh_errors():
-                queryable = session.declare_queryable(ack_key(key_expr), zenoh.handlers.RingChannel(MAX_ACK_REQUESTS))
+        self._declared: dict[str, zenoh.KeyExpr] = {}
+        with translate_zenoh_errors(), ExitStack() as undo:
+            undo.callback(self._undeclare)
+            for key_expr in inbox.key_exprs:
+                ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
+                subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
+                self._rings.append(_Ring(subscriber.handler))
+                self._undeclares.append(subscriber.undeclare)
+                if not inbox.newest_only:
+                    channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
+                    queryable = session.declare_queryable(ack_key(key_expr), channel)
+                    self._undeclares.append(queryable.undeclare)
+                    self._take_queries.append(queryable.handler.try_recv)
+            if not inbox.newest_only:
                 links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
-            self._undeclares += [queryable.undeclare, links.undeclare]
-            self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
-            self._retransmission = Retransmission(session, inbox)
+                self._undeclares.append(links.undeclare)
+                self._take_link = links.handler.try_recv
+                self._retransmission = Retransmission(session, inbox)
+            undo.pop_all()
         self._job = Job(self._poll)
         self._inbox.on_gap = self._job.wake
 
     def receive(self) -> bool:
-        """Drain the ring into the queue; return False at once if another thread is receiving."""
-        if not self._receiving.acquire(blocking=False):
-            return False
-        try:
-            if batch := drain(self._handler, []):
-                self._put(batch)
-        finally:
-            self._receiving.release()
-        return True
+        """Drain the rings into the inbox, except those that other threads drain; return True if all were empty then."""
+        drained = True
+        for ring in self._rings:
+            if not ring.lock.acquire(blocking=False):
+                drained = drained and ring.idle
+                continue
+            try:
+                if batch := drain(ring.handler, []):
+                    self._put(batch)
+            finally:
+                ring.lock.release()
+        return drained
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until the queue may have a sample; return False after `timeout` seconds."""
-        if timeout is not None or self._pump is not None or self._closed:
+        """Wait until the inbox may have a sample; return False after `timeout` seconds."""
+        ring = self._rings[0]
+        if timeout is not None or ring.pump is not None or self._closed or len(self._rings) > 1:
             self.pump()
             return self._inbox.wait(timeout)
-        if self._busy:
+        if ring.busy:
             time.sleep(_BUSY_PAUSE)
-        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds the lock for a shorter time
+        if not ring.lock.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds the lock for a shorter time
             return self._inbox.wait(None)
         try:
-            self._receive(if_empty=True)
+            self._receive(ring, if_empty=True)
         finally:
-            self._receiving.release()
+            ring.lock.release()
         return True
 
     def pump(self) -> None:
-        """Start the pump thread, which drains the ring from now on; a second call does nothing."""
+        """Start the pump threads, which drain the rings from now on; a second call does nothing."""
         with self._changing:
-            if self._pump is None and not self._closed:
-                self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
-                self._pump.start()
+            for ring in self._rings:
+                if ring.pump is None and not self._closed:
+                    ring.pump = threading.Thread(target=self._run, args=(ring,), name="nedbus-pump", daemon=True)
+                    ring.pump.start()
 
     def close(self, *, discard: bool = True) -> None:
         """End the subscription; a second call does nothing, except to drop what a call without `discard` has left.
@@ -127,39 +151,44 @@ class Receiver:
         self.receive()  # samples in the ring have been received
         if self._retransmission is not None:
             self._retransmission.close()
-        for undeclare in self._undeclares:
-            with suppress(zenoh.ZError):  # the session is already closed
-                undeclare()
-        if self._pump is not None:  # a thread still in Zenoh at interpreter exit aborts the process
-            join_thread(self._pump, _JOIN_TIMEOUT)
-        if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
-            self._receiving.release()
+        self._undeclare()
+        for ring in self._rings:
+            if ring.pump is not None:  # a thread still in Zenoh at interpreter exit aborts the process
+                join_thread(ring.pump, _JOIN_TIMEOUT)
+            if ring.lock.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
+                ring.lock.release()
         self._inbox.give_up()
         self._inbox.end()
 
-    def _run(self) -> None:
+    def _undeclare(self) -> None:
+        for undeclare in self._undeclares:
+            with suppress(zenoh.ZError):  # the session is already closed
+                undeclare()
+        self._forget_keys(list(self._declared))
+
+    def _run(self, ring: _Ring) -> None:
         try:
             while not (self._closed or self._inbox.ended):
-                if self._busy:
+                if ring.busy:
                     time.sleep(_BUSY_PAUSE)
-                with self._receiving:
-                    self._receive()
+                with ring.lock:
+                    self._receive(ring)
         except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
             _log.exception("%s: unexpected error, subscription ended", self._inbox.name, extra=about("error"))
             self._inbox.end(f"unexpected {type(exc).__name__}: {exc}")
 
-    def _receive(self, *, if_empty: bool = False) -> None:
-        """Wait for a sample and drain the ring into the queue; end the queue if the subscriber is gone.
+    def _receive(self, ring: _Ring, *, if_empty: bool = False) -> None:
+        """Wait for a sample and drain the ring into the inbox; end the inbox if the subscriber is gone.
 
-        With `if_empty`, return at once if the queue already has a sample; if one is added later, `_poll` ends the wait.
+        With `if_empty`, return at once if the inbox already has a sample; if one is added later, `_poll` ends the wait.
         """
-        handler = self._handler
-        self._idle = True
+        handler = ring.handler
+        ring.idle = True
         try:
             if if_empty and self._inbox.waiting:
                 return
             batch = [handler.recv()]
-            self._idle = False
+            ring.idle = False
             drain(handler, batch)
         except zenoh.ZError:
             if not self._closed:  # else `close` ends the inbox, once it has everything
@@ -167,8 +196,8 @@ class Receiver:
                 self._inbox.end("its Zenoh session was closed")
             return
         finally:
-            self._idle = False
-        self._busy = len(batch) >= _MIN_BUSY_BATCH
+            ring.idle = False
+        ring.busy = len(batch) >= _MIN_BUSY_BATCH
         self._put(batch)
 
     def _put(self, batch: list[zenoh.Sample]) -> None:
@@ -183,7 +212,8 @@ class Receiver:
     def _poll(self, now: float) -> float:
         """Job of the I/O thread: drain the ring, acknowledge and recover; return the seconds until the next call."""
         self._take_events()
-        drained = self.receive() or self._idle
+        drained = self.receive()
+        self._declare_keys()
         if self._retransmission is None:
             return _POLL
         if drained:
@@ -191,7 +221,9 @@ class Receiver:
         recovered_key, pause = self._retransmission.poll(now, drained=drained)
         if recovered_key:
             self._inbox.wake()
-            if self._idle:  # only a session-local sample, which the decoder discards, ends a blocking receive
+            if any(
+                ring.idle for ring in self._rings
+            ):  # only a session-local sample, which the decoder discards, ends a blocking receive
                 here = zenoh.Locality.SESSION_LOCAL
                 with suppress(zenoh.ZError):  # the session is closed
                     self._session.put(recovered_key, b"", encoding=WAKE_UP, allowed_destination=here)
@@ -199,22 +231,42 @@ class Receiver:
 
     def _take_events(self) -> None:
         """Handle link changes, which must precede the samples received since, and acknowledgement requests."""
-        if self._take_link is None or self._take_query is None:
+        if not self._take_queries:
             return
         try:
             while self._take_link() is not None:
                 self._inbox.on_link_change()
-            for query in islice(iter(self._take_query, None), MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
-                self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
-                key, get = str(query.key_expr), query.parameters.get
-                publisher, number = get("publisher"), get("number") or ""
-                if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
-                    continue  # dropping the query ends it
-                reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
-                request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
-                self._inbox.acknowledge(request, drained=self._idle)
+            for take in self._take_queries:
+                for query in islice(iter(take, None), MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
+                    self._on_ack_request(query)
         except zenoh.ZError:  # undeclared
             pass
+
+    def _on_ack_request(self, query: zenoh.Query) -> None:
+        self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
+        key, get = str(query.key_expr), query.parameters.get
+        publisher, number = get("publisher"), get("number") or ""
+        if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
+            return  # dropping the query ends it
+        reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
+        request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
+        self._inbox.acknowledge(request, drained=all(ring.idle for ring in self._rings))
+
+    def _declare_keys(self) -> None:
+        """Declare the exact keys of new streams: Zenoh then looks up the route of their messages once, not for each."""
+        streams = self._inbox.streams
+        self._forget_keys([streams.evicted.popleft() for _ in range(len(streams.evicted))])
+        with suppress(zenoh.ZError, IndexError):  # the session is closed; no more new keys
+            for _ in range(_MAX_DECLARATIONS):
+                key = streams.opened.popleft()
+                if len(self._declared) < MAX_DECLARED_KEYS:
+                    self._declared[key] = self._session.declare_keyexpr(key)
+
+    def _forget_keys(self, keys: Iterable[str]) -> None:
+        for key in keys:
+            if (declared := self._declared.pop(key, None)) is not None:
+                with suppress(zenoh.ZError):  # the session is closed
+                    self._session.undeclare(declared)
 
 
 def drain(handler: zenoh.Handler[zenoh.Sample], batch: list[zenoh.Sample]) -> list[zenoh.Sample]:

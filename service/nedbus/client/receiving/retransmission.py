@@ -38,7 +38,7 @@ class Retransmission:
         text = "%s: unexpected error, recovered messages discarded (logged once)"
         self._errors = UnexpectedErrors(_log, text, inbox.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}
-        self._take_heartbeats, self._undeclare = follow_heartbeats(session, inbox.name)
+        self._followed = [follow_heartbeats(session, each) for each in inbox.key_exprs]
         self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
@@ -53,7 +53,7 @@ class Retransmission:
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._inbox.on_heartbeat(key, publisher, number)
-            self._heartbeats = self._take_heartbeats()
+            self._heartbeats = {at: number for take, _ in self._followed for at, number in take().items()}
         recovered_key = ""
         for writer, answers in list(self._open.items()):
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
@@ -72,8 +72,9 @@ class Retransmission:
     def close(self) -> None:
         """Drop all requests: an answer channel left full would block the session."""
         self._open.clear()
-        with suppress(zenoh.ZError):  # the session is already closed
-            self._undeclare()
+        for _, undeclare in self._followed:
+            with suppress(zenoh.ZError):  # the session is already closed
+                undeclare()
 
     def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
         found = {number: raw for number, raw in answers.poll().items() if len(raw.payload) <= PAYLOAD_LIMIT}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from heapq import heappop, heappush, heapreplace
 from typing import Final
@@ -30,6 +31,8 @@ class Streams:
         self._streams: dict[str, Stream] = {}
         self._by_activity: list[tuple[float, str]] = []  # heap: each key, with a time at which it was active
         self.get = self._streams.get
+        self.opened: deque[str] = deque(maxlen=MAX_KEYS)  # keys for the receiver to declare to Zenoh
+        self.evicted: deque[str] = deque(maxlen=MAX_KEYS)
 
     def __iter__(self) -> Iterator[Stream]:
         return iter(self._streams.values())
@@ -43,6 +46,7 @@ class Streams:
             self._evict(now)
             self._streams[key] = stream
             heappush(self._by_activity, (now, key))
+            self.opened.append(key)
         return stream
 
     def _evict(self, now: float) -> None:
@@ -58,4 +62,5 @@ class Streams:
                 continue
             heappop(order)
             del self._streams[key]
+            self.evicted.append(key)
             self._on_evict(stream, since >= now - MAX_SILENCE)

@@ -72,9 +72,10 @@ def junk(payload: bytes, key: str = KEY) -> RawSample:
     return raw(None, payload=Payload(payload), key=key)
 
 
-def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> Inbox:
+def make_queue(mode: Mode, *, limit: int | None = None, clock: Callable[[], float] = time.monotonic) -> Inbox:
     """Return an empty queue."""
-    return Inbox(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name="queue", clock=clock)
+    decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
+    return Inbox(mode, decoder, key_exprs=("queue",), limit=limit, clock=clock)
 
 
 def put(inbox: Inbox, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:

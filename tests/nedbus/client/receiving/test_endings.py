@@ -82,7 +82,7 @@ def test_waiting_reader_ends_when_another_thread_drains(endpoint: str) -> None:
     with nedbus.connect(endpoint) as bus, bus.subscribe(VLP) as subscription:
         reader = threading.Thread(target=read_all, args=(subscription,))
         reader.start()
-        wait_for(lambda: subscription._receiver._idle, what="the reader to wait")
+        wait_for(lambda: subscription._receiver._rings[0].idle, what="the reader to wait")
         subscription.drain()
         reader.join(DEADLINE)
         assert not reader.is_alive()
@@ -104,22 +104,22 @@ def test_failure_raises_after_the_last_received_message(
 def test_async_subscription_is_drained(publisher: nedbus.Publisher, endpoint: str) -> None:
     """`await drain()` lets `async for` read what has been received; `await close()` counts the rest as dropped."""
 
-    async def scenario(count: int) -> Counts:
+    async def scenario(count: int, *, drains: bool) -> Counts:
         async with nedbus.connect_async(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
             await asyncio.to_thread(wait_for_subscriber, publisher)
             await asyncio.to_thread(publish, publisher, *range(2, COUNT + 2))
-            while subscription.waiting < COUNT:
+            while subscription.waiting < count:
                 await asyncio.sleep(0.01)
-            if count:
+            if drains:
                 await subscription.drain()
                 async for _ in subscription:
                     pass
             await subscription.close()
             return subscription.counts
 
-    retained = 1  # of the second run
-    assert asyncio.run(scenario(COUNT)) == Counts(received=COUNT)
-    assert asyncio.run(scenario(0)) == Counts(dropped=COUNT + retained)
+    assert asyncio.run(scenario(COUNT, drains=True)) == Counts(received=COUNT)
+    with_retained = COUNT + 1
+    assert asyncio.run(scenario(with_retained, drains=False)) == Counts(dropped=with_retained)
 
 
 def test_stopped_recorder_writes_all_received_messages(unread: nedbus.Subscription[Any], tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_counters_are_changed_with_the_lock(form: str) -> None:
     put(inbox, [raw(0), raw(3, payload=INVALID), raw(4)])
     zero = inbox._counters.received = Guarded()
     zero.queue = inbox
-    for stream in inbox._streams:
+    for stream in inbox.streams:
         stream.unreported = zero
     if form == "batches":
         while inbox.pop_batch():
