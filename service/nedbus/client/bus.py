@@ -10,6 +10,7 @@ from typing import Any, Unpack, overload
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import AccountReport
+from nedbus.samples import M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked, token_keys
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
@@ -21,7 +22,6 @@ from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver, find_schemas
-from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
 

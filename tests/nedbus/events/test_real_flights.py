@@ -18,7 +18,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
-from nedbus.sources import FileEvents
+from nedbus.flights import FileEvents
 from tests.flights import ulogs
 from tests.flights.ulogs import LOGS
 from tests.nedbus.events import events_table

@@ -19,9 +19,9 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from nedbus import clock
-from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.errors import ArgumentError, ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
+from nedbus.samples import Counts, Mode, Sample
 from nedbus.transport import RawSample, entity_name
 from nedbus_msgs import AddressError, DecodeError, identity_of
 
@@ -29,7 +29,7 @@ from .decoder import WAKE_UP, Arrival, Decoder, KeyState, detach, encoding_of, m
 from .writer_proxy import NUMBERS, LossCounters, WriterProxy
 
 if TYPE_CHECKING:
-    from .batch import Batch
+    from nedbus.samples import Batch
 
 _log = logging.getLogger(__name__)
 

@@ -6,12 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from threading import Condition
-from typing import Any, Final, NamedTuple
+from typing import Final
 
+from nedbus.mavlink import Chunk, Received
 from nedbus.sources.source import LinkLoad, Rejection
-
-from .link import Peer
-from .log_reassembly import Chunk
 
 _MAX_WAITING: Final = 16_384  # messages of all vehicles; beyond it the oldest of the longest queue is dropped
 _MAX_WAIT: Final = 2.0  # s; a message that waited longer is dropped, and
@@ -21,21 +19,6 @@ _MEMORY: Final = 5.0  # s without a late or dropped message until the overload h
 _MAX_READ: Final = 100  # messages per call of `read`
 _MAX_READ_TIME: Final = 0.1  # s per call of `read`
 _MAX_REJECTIONS: Final = 1000  # different ones that wait
-
-
-class Received(NamedTuple):
-    """A message of an autopilot. `time`: arrival, monotonic [s]; `lost`: messages lost before it; `chunk`: ULog data.
-
-    `sequence`: MAVLink's. A late message, which was counted as lost, has `lost` -1.
-    """
-
-    message: Any
-    system: int
-    sequence: int
-    peer: Peer
-    time: float
-    lost: int = 0
-    chunk: Chunk | None = None
 
 
 @dataclass(slots=True)

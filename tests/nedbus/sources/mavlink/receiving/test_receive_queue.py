@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import LinkLoad, Rejection
 from nedbus.sources.mavlink import receive_queue
-from nedbus.sources.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.receive_queue import Received, ReceiveQueue
 from tests.waits import DEADLINE
 
