@@ -98,6 +98,7 @@ bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow
 	$(BIN)/python -m benchmarks.readers.busy
 	$(BIN)/python -m benchmarks.readers.stuck
 	$(BIN)/python -m benchmarks.events
+	$(BIN)/python -m benchmarks.resets
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 	$(BIN)/python -m benchmarks.interrupts --count 10
@@ -106,6 +107,7 @@ bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow
 	$(BIN)/python -m benchmarks.ulog.files
 	$(BIN)/python -m benchmarks.ulog.stream
 	$(BIN)/python -m benchmarks.ulog.service
+	$(BIN)/python -m benchmarks.ulog.memory
 	$(BIN)/python -m benchmarks.metrics
 
 $(READY): pyproject.toml  # dependencies of nedbus

@@ -1,5 +1,6 @@
 """Print an alarm when a vehicle's position is in doubt or nothing arrives for 1 s, and when it is good again."""
 
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -30,6 +31,7 @@ def states(vehicle: str) -> Iterator[str]:
                 yield f"ALARM: {', '.join(doubts).lower()}" if doubts else "good"
 
 
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 if any(argument.startswith("-") for argument in sys.argv[1:]):
     print("usage: alarm.py [VEHICLE]", file=sys.stderr)
     sys.exit(2)

@@ -1,15 +1,21 @@
 """Read the messages of all vehicles as NumPy arrays, and print the mean speed of each."""
 
+import signal
+import sys
 from contextlib import suppress
 
 import numpy as np
 
 import nedbus
 
-with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
-    for batch in subscription.batches():
-        for address in batch.addresses:
-            own = nedbus.mask_invalid(batch.of(address))  # NaN while v_xy_valid is false
-            speeds = np.hypot(own["vx"], own["vy"])
-            if not np.isnan(speeds).all():
-                print(address.vehicle, len(own), f"{np.nanmean(speeds):.2f} m/s", flush=True)
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
+try:
+    with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
+        for batch in subscription.batches():
+            for address in batch.addresses:
+                own = nedbus.mask_invalid(batch.of(address))  # NaN while v_xy_valid is false
+                speeds = np.hypot(own["vx"], own["vy"])
+                if not np.isnan(speeds).all():
+                    print(address.vehicle, len(own), f"{np.nanmean(speeds):.2f} m/s", flush=True)
+except nedbus.ConnectError as exc:
+    sys.exit(str(exc))

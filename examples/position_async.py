@@ -1,6 +1,8 @@
 """Print the position of every vehicle with asyncio, and the message counts once a second."""
 
 import asyncio
+import signal
+import sys
 from contextlib import suppress
 
 import nedbus
@@ -27,5 +29,9 @@ async def main() -> None:
             group.create_task(report(subscription))
 
 
-with suppress(KeyboardInterrupt):
-    asyncio.run(main())
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
+try:
+    with suppress(KeyboardInterrupt):
+        asyncio.run(main())
+except nedbus.ConnectError as exc:
+    sys.exit(str(exc))

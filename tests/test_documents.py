@@ -219,7 +219,20 @@ def test_snippet_that_is_not_run_has_a_reason(block: Block) -> None:
 def test_every_block_has_a_known_language_and_marker() -> None:
     """Every code block has a language and a marker that these tests handle."""
     languages = {block.language for block in BLOCKS} - {"{toctree}"}
-    assert languages <= {"bash", "sh", "python", "toml", "json", "ini", "text", "javascript", "rust", "cpp"}
+    assert languages <= {
+        "bash",
+        "sh",
+        "python",
+        "toml",
+        "json",
+        "ini",
+        "text",
+        "javascript",
+        "rust",
+        "cpp",
+        "go",
+        "java",
+    }
     assert {block.marker for block in BLOCKS} <= {"", "not run", "run by", "continues", "output"}
     assert not [str(block) for block in SHELLS if block.language == "sh" and block.is_run]
     assert sum(text.count("```") for text in TEXTS.values()) == 2 * len(BLOCKS)

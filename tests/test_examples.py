@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -14,7 +18,7 @@ from tests.flights.replays import convert_replay
 from tests.nedbus.cli.commands.test_query import simulation
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
-from tests.waits import wait_for
+from tests.waits import DEADLINE, wait_for
 
 __all__ = ["simulation"]  # a fixture
 
@@ -25,6 +29,7 @@ PRINTS = {
     "fleet.py": "vehicle 1: 12 streams",
     "compare_estimators.py": "estimator 1: ",
     "batches.py": " m/s",
+    "fastest.py": " m/s",
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",
     "health.py": "1/vehicle_local_position: ",
     "alarm.py": "vehicle 1: good",
@@ -55,6 +60,44 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
         process.signal(signal.SIGINT)
     assert process.wait() == 0, process.err
     assert process.err == ""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("name", ["position_async.py", "plain_zenoh.py", "batches.py"])
+def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path: Path, name: str) -> None:
+    """An example whose reader leaves, as in `| head -1`, prints no traceback."""
+    script = tmp_path / name
+    script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", simulation))
+    command, environment = [sys.executable, "-u", str(script)], os.environ | {"NEDBUS_CONNECT": simulation}
+    with subprocess.Popen(command, env=environment, stdout=PIPE, stderr=PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline()
+            process.stdout.close()
+            assert process.wait(DEADLINE) == -signal.SIGPIPE
+            assert process.stderr is not None
+            assert process.stderr.read() == ""
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_examples_name_the_endpoint_that_does_not_answer(start: Start, tmp_path: Path) -> None:
+    """Without a service, each longer example prints one line that names the endpoint, and exits with 1."""
+    endpoint = free_endpoint()
+    names = [*PRINTS.keys() - {"alarm.py", "position.py"}, "publish.py"]
+    for process in [run_example(start, name, endpoint, tmp_path) for name in names]:
+        assert process.wait() == 1, process.err
+        [line] = process.err.splitlines()
+        assert endpoint in line
+
+
+def test_fastest_example_reads_files(start: Start, tmp_path: Path) -> None:
+    """The loop of examples/fastest.py over a bus runs on files unchanged; it needs no router."""
+    convert_replay("sim:?duration=20", tmp_path / "flight.mcap")
+    process = start(str(EXAMPLES / "fastest.py"), str(tmp_path / "flight.mcap"))
+    assert process.wait() == 0, process.err
+    assert process.out.splitlines()[-1].startswith("1: ")
 
 
 def test_publish_example_moves_its_vehicle(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any, Final
 from .errors import ConfigError
 
 EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pki", "web"})
-"""The extras of the nedbus package, as in `pip install ".[mcap]"` in a clone."""
+"""The extras of the nedbus package, as in `pip install -e ".[mcap]"` in a clone."""
 
 
 def import_optional(extra: str, module: str) -> Any:
@@ -20,7 +20,7 @@ def import_optional(extra: str, module: str) -> Any:
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
         # Never suggest installing nedbus by its name alone: on PyPI, this name belongs to another project.
-        hint = f"in a clone of nedbus, run pip install '.[{extra}]'" if extra in EXTRAS else f"run pip install {extra}"
+        hint = f"in a nedbus clone, run pip install -e '.[{extra}]'" if extra in EXTRAS else f"run pip install {extra}"
         raise ConfigError(missing, f"not installed; {hint}") from exc
 
 

@@ -22,6 +22,7 @@ class Timings:
     stale: float = 3.0  # without a message until a stream is stale: it has no rate, and sources stop publishing it
     forgotten: float = 3600.0  # until a vehicle that is gone or silent counts as switched off, and its state is deleted
     source_tick: float = 0.25  # the longest wait of a live source for its next message
+    link_wait: float = 2.0  # for a received MAVLink message to be published; one that waited longer is dropped
     backoff: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # before a failed source is restarted
     log_answer: float = 1.0  # for the first data, and for a COMMAND_ACK, where it doubles with each retry of START
     log_timeout: float = 2.5  # until PX4 gives up on an unacknowledged message; also between STOP and START

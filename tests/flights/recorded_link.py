@@ -25,7 +25,7 @@ from tests.peers.px4_log_stream import datagrams
 _TICK: Final = 0.25  # s of the recording between two checks of the streams
 
 
-class _Receiver(LogReceiver):
+class Receiver(LogReceiver):
     """The receiver of a link without its thread."""
 
     def __init__(self, options: MavlinkOptions) -> None:
@@ -53,7 +53,7 @@ def play(path: Path, options: MavlinkOptions) -> Iterator[tuple[float, SourceMes
     session = _LinkSession(
         cast("Any", SimpleNamespace(send=lambda *_: None, peer=None, baud=None)), options, name="udp"
     )
-    session._receiver = receiver = _Receiver(options)
+    session._receiver = receiver = Receiver(options)
     checked = math.nan
     for when, is_sent, frame in datagrams(path):
         checked = when if math.isnan(checked) else checked

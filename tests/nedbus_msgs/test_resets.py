@@ -6,9 +6,11 @@ import math
 import operator
 from collections import defaultdict
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
+from benchmarks.resets import UNITS, residuals
 
 from nedbus_msgs import Continuous, ResetTracker, VehicleLocalPosition
 from nedbus_msgs.frames import MapProjection
@@ -78,20 +80,81 @@ def test_counter_wrap_counts_as_one_reset() -> None:
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """After two resets between two messages, the delta covers only the last one, so the track restarts."""
+    """After two resets between two messages the delta covers only the last one, so the step is removed."""
     _, second, third = track(
-        at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
+        at(1, z=1.0, vz=2.0),
+        at(2, z=50.0, vz=2.0, z_reset_counter=2, delta_z=3.0),
+        at(3, z=52.0, vz=2.0, z_reset_counter=2, delta_z=3.0),
+    )
+    assert not second.discontinued
+    assert (second.z, third.z) == (3.0, 5.0)
+    assert second.resets["z"] == 2
+
+
+def test_incomplete_delta_after_a_long_pause_restarts_the_track() -> None:
+    """After two resets and a pause, neither the delta nor the step is the jump, so the track restarts."""
+    _, second, third = track(
+        at(1, z=1.0), at(6, z=50.0, z_reset_counter=2, delta_z=3.0), at(7, z=51.0, z_reset_counter=2, delta_z=3.0)
     )
     assert second.discontinued == {"z"}
     assert (second.z, third.z) == (50.0, 51.0)
-    assert second.resets["z"] == 2
     assert not third.discontinued
+
+
+def test_step_is_removed_where_the_delta_contradicts_it() -> None:
+    """A real PX4 announced (5.80, -4.72) m, but its position stepped by (3.57, -2.73) m plus the motion."""
+    _, second = track(
+        at(14.0, x=1.0, vx=1.0, vy=0.5),
+        at(14.02, x=4.59, y=-2.72, vx=1.0, vy=0.5, xy_reset_counter=1, delta_xy=(5.80, -4.72)),
+    )
+    assert (second.x, second.y) == pytest.approx((1.02, 0.01))
+
+
+def test_rows_have_the_same_track_as_models() -> None:
+    """The tracker accepts rows, which have the fields of models as attributes."""
+    messages = at(1), at(1.1, x=5.0, xy_reset_counter=1, delta_xy=(5.0, 0.0))
+    rows = [cast("VehicleLocalPosition", SimpleNamespace(**vars(message))) for message in messages]
+    assert track(*rows) == track(*messages)
+
+
+def test_announced_reset_of_zero_leaves_noise_in_the_track() -> None:
+    """Millimetres of correction are no jump if the delta is zero."""
+    _, second = track(at(1), at(1.02, x=-0.002, xy_reset_counter=1))
+    assert second.x == pytest.approx(-0.002)
+
+
+@pytest.mark.parametrize(("seconds", "kept"), [(0.1, 9.6), (0.02, 10.1)])
+def test_acceleration_between_distant_messages_is_no_contradiction(seconds: float, kept: float) -> None:
+    """A difference of 7 mm from the delta is unknown motion after 100 ms, but not after 20 ms."""
+    _, second = track(at(1), at(1 + seconds, x=kept + 0.007, xy_reset_counter=1, delta_xy=(kept, 0.0)))
+    assert second.x == pytest.approx(0.007 if seconds == 0.1 else 0.0, abs=1e-6)
+
+
+def test_turn_during_a_heading_reset_stays_in_the_track() -> None:
+    """The heading turns on by as much as the gyroscopes' heading, whatever the delta says."""
+    _, second = track(
+        at(1, heading=3.1, unaided_heading=3.1, delta_heading=0.0),
+        at(1.1, heading=-1.0, unaided_heading=-3.083, heading_reset_counter=1, delta_heading=1.5),
+    )
+    assert second.heading == pytest.approx(-3.083, abs=1e-3)
+
+
+def test_height_rate_is_preferred_to_the_vertical_velocity() -> None:
+    """The motion of z is z_deriv, the rate of the published z, and not vz, the velocity of the filter."""
+    _, second = track(at(1, vz=5.0, z_deriv=1.0), at(1.1, z=20.1, vz=5.0, z_deriv=1.0, z_reset_counter=1, delta_z=0.0))
+    assert second.z == pytest.approx(0.1)
 
 
 def test_reset_without_delta_restarts_the_track() -> None:
     """A reset without a delta, as in old layouts and from some sources, restarts the track."""
     _, second = track(at(1), at(2, heading=1.0, heading_reset_counter=1))
     assert second.discontinued == {"heading"}
+
+
+def test_reordered_message_is_no_reboot() -> None:
+    """A message that arrives late by less than a second continues the track."""
+    _, _, late = track(at(10, x=1.0), at(10.1, x=4.0, xy_reset_counter=1, delta_xy=(3.0, 0.0)), at(10.05, x=1.0))
+    assert not late.discontinued & {"z", "heading"}
 
 
 def test_backward_timestamp_restarts_the_track() -> None:
@@ -138,8 +201,8 @@ def test_moved_origin_is_compensated(counted: int) -> None:
 
 
 def test_unexplained_jump_at_a_new_origin_restarts_the_track() -> None:
-    """A jump explained neither by the delta nor by the origins is kept, and restarts the track."""
-    _, second = track(at(1), at(2, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
+    """After a pause, a jump explained neither by the delta nor by the origins is kept, and restarts the track."""
+    _, second = track(at(1), at(6, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
     assert second.discontinued == {"xy"}
     assert second.x == 500.0
 
@@ -168,6 +231,19 @@ def test_track_follows_simulated_ground_truth() -> None:
     assert raw_worst > 1.0
     assert worst < 0.2
     assert not any(smooth.discontinued for _, smooth in estimates)
+
+
+@pytest.mark.logs
+@pytest.mark.slow
+@pytest.mark.parametrize("thinned", [False, True])
+def test_track_is_closer_than_with_deltas_or_steps_alone(thinned: bool) -> None:
+    """At the resets of all logs, at full rate and at 10 Hz, the track is off by less than with either rule alone."""
+    sums: defaultdict[tuple[str, str], float] = defaultdict(float)
+    for quantity, by_rule in residuals(LOGS.parent, thinned=thinned).items():
+        for rule, found in by_rule.items():
+            sums[UNITS[quantity], rule] += sum(found)
+    for unit in set(UNITS.values()):
+        assert sums[unit, "rule"] < min(sums[unit, "delta"], sums[unit, "step"])
 
 
 @pytest.mark.logs

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,25 +12,13 @@ from docs.generator.vectors import VECTORS, definition_of, from_json, to_json
 from nedbus_msgs import BASES, MESSAGES, DecodeError, codec_of, field_type, provenance_of, upgrade_with
 from tests.nedbus_msgs.strategies import DATA
 
-HERE: Final = Path(__file__).parent
+from .programs import run_program
+
 FILE: Final[dict[str, Any]] = json.loads(VECTORS.read_text())
-RUST: Final = """[package]
-name = "vectors"
-version = "0.0.0"
-edition = "2021"
-
-[[bin]]
-name = "vectors"
-path = "vectors.rs"
-
-[dependencies]
-rmpv = "1"
-serde_json = { version = "1", features = ["float_roundtrip"] }
-"""
-COMMANDS: Final = {
-    "node": (["npm", "install", "--no-audit", "--no-fund", "@msgpack/msgpack"], ["node", "vectors.mjs"]),
-    "g++": (["g++", "-std=c++17", "-O0", "vectors.cpp", "-o", "vectors"], ["./vectors"]),
-    "cargo": (["cargo", "build", "--quiet"], ["cargo", "run", "--quiet", "--"]),
+PROGRAMS: Final = {
+    "node": ("vectors.mjs", ["@msgpack/msgpack"]),
+    "g++": ("vectors.cpp", []),
+    "cargo": ("vectors.rs", ['rmpv = "1"', 'serde_json = { version = "1", features = ["float_roundtrip"] }']),
 }
 
 
@@ -83,23 +69,9 @@ def test_golden_payloads_remain_among_the_vectors() -> None:
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.timeout(420)  # packages may be downloaded and compiled
-@pytest.mark.parametrize("tool", COMMANDS)
+@pytest.mark.parametrize("tool", PROGRAMS)
 def test_program_in_another_language_conforms(tool: str, tmp_path: Path) -> None:
     """The program decodes and encodes all vectors; skipped without its tools, or if packages cannot be installed."""
-    for path in HERE.glob("vectors.*"):
-        shutil.copy(path, tmp_path)
-    (tmp_path / "Cargo.toml").write_text(RUST)
-    build, run = COMMANDS[tool]
-    if not all(map(shutil.which, (build[0], tool))):
-        pytest.skip(f"no {tool}")
-    try:
-        done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
-    except subprocess.TimeoutExpired:
-        pytest.skip("cannot be built here in 300 s")
-    if done.returncode and any(each in done.stderr for each in ("network", "registry", "No such file", "ENOTFOUND")):
-        pytest.skip(f"cannot be built here: {done.stderr[-200:]}")
-    assert done.returncode == 0, done.stderr
-    command = [*run, str(VECTORS)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
     counts = [len(FILE[kind]) for kind in ("exact", "decode", "reject")]
-    assert done.stdout.strip() == "{} exact, {} decoded, {} rejected".format(*counts), done.stderr
+    output = run_program(*PROGRAMS[tool], [str(VECTORS)], tmp_path)
+    assert output.strip() == "{} exact, {} decoded, {} rejected".format(*counts)

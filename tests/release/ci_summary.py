@@ -14,11 +14,16 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 _ROOT_ONLY: Final = "tests.nedbus.test_atomic_write::test_folder_without_read_permission_is_not_synced"
-_LANGUAGE: Final = "tests.other_languages.test_vectors::test_program_in_another_language_conforms"
+_LANGUAGES: Final = "tests.other_languages"
+_LANGUAGE: Final = f"{_LANGUAGES}.test_vectors::test_program_in_another_language_conforms"
+_PACKAGES: Final = "needs the tools of a language, and packages from its registry"
 KNOWN: Final = {
     _ROOT_ONLY: "CI runs as root",
     f"{_LANGUAGE}[node]": "needs Node.js, and a package from its registry",
     f"{_LANGUAGE}[cargo]": "needs Rust, and packages from its registry",
+    f"{_LANGUAGES}.test_payloads::test_decoder_of_documentation_returns_every_value": _PACKAGES,
+    f"{_LANGUAGES}.test_readers::test_every_value_of_a_recording_is_read": _PACKAGES,
+    f"{_LANGUAGES}.test_readers::test_every_value_of_a_saved_stream_is_read": _PACKAGES,
 }
 """Tests that CI may skip, and why."""
 NEWEST: Final = {

@@ -36,17 +36,16 @@ def encode_upgraded(definition: Definition[Any], fields: Mapping[str, object]) -
 
 
 def record_encoder(
-    definition: Definition[Any], types: Mapping[str, FieldType], unpack: Callable[[bytes], Values], bool_mask: int
+    definition: Definition[Any], types: Mapping[str, FieldType], unpack: Callable[[bytes], Values]
 ) -> Callable[[bytes], Encoded | None]:
     """Compile a function that encodes records with these fields, of any PX4 release, as messages of a definition.
 
     It applies the model's types and rules, and returns None for a record that it does not accept: pass the fields of
     this record to `encode_upgraded`, which decides and reports the reasons.
     `unpack`: return the values of a record; each element of an array is a value.
-    `bool_mask`: the bits that are 0 because bools are 0 or 1, with the record read as a little-endian integer.
     """
     plan, encode_flat, new = definition.plan(tuple(types)), codec_of(definition).encode_flat, tuple.__new__
-    values_of, provided, missing = _compile(definition, types, bool_mask), plan.provided, plan.missing
+    values_of, provided, missing = _compile(definition, types), plan.provided, plan.missing
     row_class: type[Row | FlatRow] = definition.row if definition.has_text else definition.flat_row
     unflatten = definition.validation.unflatten if definition.has_text else None
 
@@ -64,7 +63,7 @@ def record_encoder(
 
 
 def _compile(
-    definition: Definition[Any], types: Mapping[str, FieldType], bool_mask: int
+    definition: Definition[Any], types: Mapping[str, FieldType]
 ) -> Callable[[bytes, Callable[[bytes], Values]], Values | None]:
     """Compile a function from a record to the valid values of a message; false or an exception if it is not valid."""
     plan, validation, fields = definition.plan(tuple(types)), definition.validation, definition.types
@@ -72,7 +71,7 @@ def _compile(
     if "timestamp" not in plan.provided or any((a.values, a.is_text) != (b.values, b.is_text) for a, b in copied):
         return lambda *_: None
     functions: dict[str, Callable[..., Any]] = {
-        "encode_text": encode_text, "decode_text": decode_text, "from_bytes": int.from_bytes,
+        "encode_text": encode_text, "decode_text": decode_text,
         "flatten": validation.flatten, "unflatten": validation.unflatten, "validate": validation.validate,
     }  # fmt: skip
     text = _conversion(definition, types, functions)
@@ -81,9 +80,8 @@ def _compile(
     else:  # the types of the record prove those of the message
         functions["squared_norm"] = squared_norm
     rules = expression_of(definition.rules, accessors_of(fields))
-    has_bools = f"not from_bytes(record, 'little') & {bool_mask} and " * (bool_mask > 0)
     steps = f"(values := unpack(record)) and (values := {text}) and {rules} and values"
-    return compile_lambda(f"lambda record, unpack: {has_bools}{steps}", **functions)
+    return compile_lambda(f"lambda record, unpack: {steps}", **functions)
 
 
 def _conversion(

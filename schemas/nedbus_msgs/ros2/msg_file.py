@@ -169,6 +169,7 @@ def _range_of(field: MsgField) -> InRange | None:
         return None
     least, greatest, or_ = float(found[2] or "-inf"), float(found[4] or "inf"), float(invalid[1]) if invalid else None
     lowest, highest = (-math.inf, math.inf) if field.type.is_float else field.type.limits
-    if max(least, lowest) > min(greatest, highest):
+    first, last = max(least, lowest), min(greatest, highest)
+    if first > last or (not field.type.is_float and math.ceil(first) > last):
         raise ValueError(f"no number is in the @range of {field.name}, from {least:.9g} to {greatest:.9g}")
     return InRange(field.name, least, greatest, or_=or_, is_array=field.type.is_array)

@@ -16,11 +16,13 @@ from .discovery import (
     ServiceStatus,
     SourceStatus,
     StreamStatus,
+    VehicleDirectory,
     Vehicles,
     find_reports,
     find_services,
     reply_parts,
 )
+from .fleet_tokens import FleetTokens
 from .health import Health, Histogram, Monitor, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry

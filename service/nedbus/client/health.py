@@ -123,9 +123,11 @@ class _Window:
         self.intervals = number + 1, new, squares + (interval - mean) * (interval - new)
 
     def add_latency(self, latency: float) -> None:
-        """Add a latency [s], up to a maximum number."""
+        """Add a latency [s]; beyond the maximum number it replaces the oldest one."""
         if len(self.latencies) < _MAX_MEASURED:
             self.latencies.append(latency)
+        else:
+            self.latencies[(self.messages - 1) % _MAX_MEASURED] = latency
 
     @property
     def mean(self) -> float:
@@ -294,6 +296,7 @@ class Monitor:
     def __init__(self) -> None:
         self.evicted = 0
         self._latest = time.monotonic_ns()  # arrival time of the latest sample [ns]
+        self._to_utc = clock.utc_ns() - self._latest  # from the monotonic to the wall clock [ns]
         self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
@@ -301,8 +304,7 @@ class Monitor:
         if sample.retained:
             return False
         if received is None:  # not the time of reading: a reader that starts or lags would show a higher rate
-            waited = max(0, clock.utc_ns() - sample.received)
-            received = self._latest = max(self._latest, time.monotonic_ns() - waited)  # whatever step the clock makes
+            received = self._latest = self._arrival(sample.received)
         address = sample.address
         stream = self._streams.pop(address, None)
         if stream is None and len(self._streams) >= _MAX_STREAMS:
@@ -315,6 +317,18 @@ class Monitor:
         missing = sample.provenance.missing
         stream.add(sample.message, received=received, latency=sample.latency, lost=sample.lost, missing=missing)
         return True
+
+    def _arrival(self, received: int) -> int:
+        """Return the arrival time on `monotonic_ns` of a sample that arrived at a time of the wall clock [ns].
+
+        Samples are read in the order of arrival. One that seems to have arrived before the last one shows a step of the
+        wall clock, which is the change of the difference between the two clocks.
+        """
+        now, utc, before = time.monotonic_ns(), clock.utc_ns(), self._to_utc
+        self._to_utc, arrival = utc - now, now - max(0, utc - received)
+        if arrival < self._latest:
+            arrival += self._to_utc - before
+        return min(now, max(self._latest, arrival))
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
         """Return the health of each stream, sorted by address, now or at `now` [ns] of the clock used in `add`."""

@@ -72,7 +72,7 @@ class Job:
         """Call the job; only for the I/O thread."""
         self._requested.difference_update([at for at in tuple(self._requested) if at <= now])
         pause = _RETRY_PAUSE
-        with self._errors, self._running:
+        with suppress(SystemExit, KeyboardInterrupt), self._errors, self._running:  # they must not end this thread
             pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
         self._due = now + pause if pause < TICK or pause == math.inf else math.floor((now + pause) / TICK) * TICK
 

@@ -79,11 +79,12 @@ def _check_sources(settings: Settings) -> Iterator[Finding]:
 
 def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[Finding]:
     """Connect to a router, observe its network, and yield the findings of `NETWORK_CHECKS`."""
-    with open_client([router], timeout=TIMINGS.doctor_open, tls=tls) as session:
+    open_session = partial(open_client, [router], timeout=TIMINGS.doctor_open, tls=tls)
+    with open_session() as session:
         if seen.vehicle is not None:
-            with open_client([router], timeout=TIMINGS.doctor_open, tls=tls) as writer:
+            with open_session() as writer:
                 seen.verdict = probe_writes(session, writer, [seen.vehicle], prefix=seen.prefix)[seen.vehicle]
-        seen.observe(session)
+        seen.observe(session, open_session)
     for check in NETWORK_CHECKS:
         yield from limit_findings(check(seen))
 

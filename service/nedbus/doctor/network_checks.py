@@ -25,10 +25,10 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
     if not seen.routers:
         yield Finding("router", "", "ok", "connected; its other sessions are not visible to this client")
     for router in seen.routers:
-        text = f"connected sessions: {router.sessions:,}"
+        is_full, text = False, f"connected sessions: {router.sessions:,}"
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-        is_full = (router.load or 0.0) >= _NEARLY_FULL
+            is_full = router.sessions >= _NEARLY_FULL * router.max_sessions
         advice = "raise max_sessions and the limit of open files, or run a second router (docs/hosts.md)"
         yield Finding("router", router.zid, "warning" if is_full else "ok", text, advice if is_full else "")
 
@@ -141,6 +141,9 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
             advice = f"see the events before it with 'nedbus why --vehicle {name}'"
             text = f"{current.text[:_MAX_TEXT]}{format_since(current.since, now)}"
             yield Finding("vehicle", name, "wrong" if current.severity == "bad" else "warning", text, advice)
+    if not seen.alive.complete:
+        advice = "a vehicle may have over 1,000 publishers: the log names it; otherwise, try again"
+        yield Finding("vehicle", "", "unknown", "not all streams are listed", advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission

@@ -1,9 +1,8 @@
 """Observation of a network for a few seconds: services, tokens, messages and routers, which the checks evaluate."""
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -11,16 +10,16 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus import clock, transport
-from nedbus.client import ServiceStatus, SourceStatus, find_reports, find_services
+from nedbus import client, clock, transport
 from nedbus.events import AccountReport
 from nedbus.timings import TIMINGS
-from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, codec_of
 
 T = TypeVar("T")
 
 _POLL: Final = 0.02  # s; also the error of measured delays
 _QUERY_TIMEOUT: Final = 1.0  # s
+_LIST_TIMEOUT: Final = 4.0  # s for the router to list all streams
 _MAX_SERVICES: Final = 20  # peers may claim to be services
 _MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
@@ -45,11 +44,11 @@ class Observation:
     version: str
     vehicle: str | None
     verdict: transport.Verdict | None = None
-    services: list[ServiceStatus] = field(default_factory=list)
+    services: list[client.ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
-    alive: Counter[Address] = field(default_factory=Counter)
+    alive: client.Publishers = field(default_factory=client.Publishers)
     ages: dict[Address, float | None] = field(default_factory=dict)
     delays: dict[Address, float | None] = field(default_factory=dict)
     errors: dict[Address, str] = field(default_factory=dict)
@@ -59,22 +58,23 @@ class Observation:
     listened: float = 0.0
 
     @property
-    def sources(self) -> list[SourceStatus]:
+    def sources(self) -> list[client.SourceStatus]:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
 
-    def observe(self, session: transport.Session) -> None:
-        """Send the queries, and receive messages for at least 3 s."""
+    def observe(self, session: transport.Session, open_session: Callable[[], transport.Session]) -> None:
+        """Send the queries, and receive messages for at least 3 s; `open_session`: as in FleetTokens."""
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
         self.routers = transport.query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
-        self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
+        self.services = client.find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
-        self.accounts = find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        tokens = transport.token_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
-        self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
+        self.accounts = client.find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
+        follow = partial(client.FleetTokens, open_session, prefix=prefix)
+        with closing(client.VehicleDirectory(follow, prefix=prefix)) as directory:
+            self.alive = directory.publishers(timeout=_LIST_TIMEOUT)
         tokens = transport.token_keys(session, transport.px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(transport.PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges

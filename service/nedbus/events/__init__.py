@@ -9,5 +9,5 @@ from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
-from .times import CLOCKS, Times, format_duration, format_since, format_utc, unit_of
+from .times import Times, format_duration, format_since, format_utc, unit_of
 from .verdict import Verdict, verdict_of

@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
 from typing import Final
 
-from nedbus_msgs import RESET_COUNTERS, Quantity
-from nedbus_msgs.frames import MapProjection, wrap
+from nedbus_msgs import JUMP_FIELDS, RESET_COUNTERS, Quantity, jump_of
+from nedbus_msgs.frames import MapProjection
 
 from .detectors import ChangeDetector, Fields, Finding, detect_flags, read_fields
 from .kinds import Severity, flagged
@@ -19,29 +18,16 @@ _COMPARED: Final = (
 )  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; smaller steps are never jumps
 _MAX_INTERVAL: Final = 0.5  # s between messages; longer intervals are not checked for jumps
-_MAX_MOTION: Final = 3.0  # s for which the rates at both ends determine the motion well enough to find a reset's step
-_SURE_INTERVAL: Final = 0.1  # s; over longer intervals, the rates at both ends do not determine the motion accurately
-# By quantity with a reset counter: its fields, rates of change of each field, names in the event's `numbers`, text.
-_Quantity = tuple[tuple[str, ...], tuple[tuple[str, ...], ...], tuple[str, ...], str]
-_RESETS: Final[Mapping[Quantity, _Quantity]] = {
-    "xy": (
-        ("x", "y"), (("vx",), ("vy",)), ("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)",
-    ),
-    "z": (("z",), (("z_deriv", "vz"),), ("up",), "height by {up:z.1f} m"),
-    "vxy": (("vx", "vy"), (("ax",), ("ay",)), ("v_north", "v_east"), "vxy by {size:.1f} m/s"),
-    "vz": (("vz",), (("az",),), ("v_up",), "vz by {v_up:z.1f} m/s"),
-    "heading": (("heading",), ((),), ("heading",), "heading by {degrees:z.0f} deg"),
-}  # fmt: skip
+# By quantity with a reset counter: names of its values in the event's `numbers`, and text.
+_RESETS: Final[Mapping[Quantity, tuple[tuple[str, ...], str]]] = {
+    "xy": (("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)"),
+    "z": (("up",), "height by {up:z.1f} m"),
+    "vxy": (("v_north", "v_east"), "vxy by {size:.1f} m/s"),
+    "vz": (("v_up",), "vz by {v_up:z.1f} m/s"),
+    "heading": (("heading",), "heading by {degrees:z.0f} deg"),
+}
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-# Fields read when a compared field changes, with their defaults.
-_CONTEXT: Final = dict.fromkeys(
-    (
-        *(f"delta_{name}" for name in _RESETS),
-        *chain(*(chain(each[0], *each[1]) for each in _RESETS.values())),
-        *_ORIGIN,
-    ),
-    math.nan,
-)
+_CONTEXT: Final = dict.fromkeys(JUMP_FIELDS, math.nan)  # read when a compared field changes, with their defaults
 
 Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
@@ -119,44 +105,16 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
     numbers: dict[str, float] = {}
     known, unknown = [], []
     for name in quantities:
-        if (size := _size_of_reset(name, before, after)) is None:
+        if (size := jump_of(name, before, after)) is None:
             unknown.append(f"{name} by an unknown amount")
             continue
-        *_, names, text = _RESETS[name]
+        names, text = _RESETS[name]
         values = dict(zip(names, (-each if name in ("z", "vz") else each for each in size), strict=True))
         numbers |= values
         known.append(text.format(**values, size=math.hypot(*size), degrees=math.degrees(size[0])))
     is_small = not unknown and all(abs(each) < SMALL_RESET for name, each in numbers.items() if name != "heading")
     text = f"reset of {', '.join(known + unknown)}"
     return Finding("reset", "once", text, tuple(quantities), numbers, severity="info" if is_small else None)
-
-
-def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:
-    """Return the size of a reset between two messages, None if unknown.
-
-    This is the message's delta if the data confirms it, else the step between the samples minus the motion in between.
-    """
-    values, rates, *_ = _RESETS[name]
-    seconds = (after["timestamp"] - before["timestamp"]) / 1e6
-    observed = [after[value] - before[value] for value in values]
-    observed = observed if name != "heading" else [*map(wrap, observed)]
-    count = (after[RESET_COUNTERS[name]] - before[RESET_COUNTERS[name]]) % 256
-    delta = after[f"delta_{name}"]
-    reported = delta if isinstance(delta, tuple) else (delta,)
-    is_reported = count == 1 and all(map(math.isfinite, reported))
-    if not all(map(math.isfinite, observed)):
-        return reported if is_reported else None
-    # The velocity changed at an unknown time in between, and vz need not be the rate of z: allow for every rate.
-    known = [[rate for of in names for rate in (before[of], after[of]) if math.isfinite(rate)] for names in rates]
-    motions = [[rate * seconds for rate in each] or [0.0] for each in known]
-    margin = SMALL_RESET * max(1.0, seconds / _SURE_INTERVAL)
-    if is_reported and all(
-        min(0.0, *motion) - margin <= step - size <= max(0.0, *motion) + margin
-        for step, size, motion in zip(observed, reported, motions, strict=True)
-    ):
-        return reported
-    steps = tuple(step - sum(motion[:2]) / len(motion[:2]) for step, motion in zip(observed, motions, strict=True))
-    return steps if is_reported or 0 < seconds <= (_MAX_MOTION if all(known) else _MAX_INTERVAL) else None
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Final
@@ -13,11 +13,11 @@ from .event import Event
 
 _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?")
 
-CLOCKS: Final[Mapping[str, str]] = {
+# Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles.
+_CLOCKS: Final[Mapping[str, str]] = {
     "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
-    "boot": "seconds since boot, because no message contains UTC", "start": "seconds since the start of the recording",
+    "boot": "seconds since boot", "start": "seconds since the start of the recording",
 }  # fmt: skip
-"""Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +26,21 @@ class Times:
 
     `is_live`: event times are on a clock of this host; `ahead`: Unix time minus that clock [s].
     `offsets`: Unix time minus time since boot [s], for each vehicle whose messages contain it.
+    `remarks`: for each vehicle of a file, why its UTC is unknown, or that it was corrected in flight.
     """
 
     is_live: bool = False
     offsets: Mapping[str, float] = field(default_factory=dict)
     ahead: float = 0.0
+    remarks: Mapping[str, str] = field(default_factory=dict)
+
+    def describe(self, clocks: Collection[str]) -> str:
+        """Describe clocks, by the keys that `clock` returns, with the remarks on UTC."""
+        reasons = {each for name, each in self.remarks.items() if name not in self.offsets}
+        notes = {each for name, each in self.remarks.items() if name in self.offsets}
+        boot = f", because {' and '.join(sorted(reasons) or ['no message contains UTC'])}"
+        more = {"boot": boot, "vehicle": "".join(f"; {note}" for note in sorted(notes))}
+        return "; ".join(_CLOCKS[each] + more.get(each, "") for each in sorted(clocks))
 
     def utc(self, event: Event) -> float | None:
         """Return the Unix time of an event [s], None if unknown."""
@@ -44,7 +54,7 @@ class Times:
         return utc if is_unix_time(utc * 1e6) else None
 
     def clock(self, event: Event) -> str:
-        """Return the key in CLOCKS of the clock used for an event."""
+        """Return the clock used for an event: host, vehicle, boot or start."""
         if self.is_live or self.utc(event) is not None:
             return "host" if self.is_live else "vehicle"
         return "start" if event.boot is None else "boot"
@@ -77,7 +87,7 @@ class Times:
         if found := _CLOCK.fullmatch(text):
             utc = self.utc(near)
             if utc is None:
-                raise ValueError("no message of this vehicle has UTC")
+                raise ValueError(self.remarks.get(near.vehicle, "no message of this vehicle has UTC"))
             midnight = datetime.fromtimestamp(utc, UTC).replace(hour=0, minute=0, second=0, microsecond=0)
             since = timedelta(hours=int(found[1]), minutes=int(found[2]), seconds=float(found[3] or 0))
             step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200  # closest, also across midnight
@@ -99,7 +109,7 @@ class Times:
 
 def unit_of(clock: str) -> str:
     """Return the unit of a clock's times: "UTC", or seconds with their epoch, such as "s since boot"."""
-    return CLOCKS[clock].partition(",")[0].replace("seconds", "s")
+    return _CLOCKS[clock].partition(",")[0].replace("seconds", "s")
 
 
 def format_utc(utc: float) -> str:

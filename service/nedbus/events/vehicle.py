@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median
@@ -67,6 +67,7 @@ class Vehicle:
         self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use, by group
         self._main_time = math.inf  # time of the last position
         self._rebooted = -math.inf
+        self._suspect: _Suspect | None = None
         self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}  # by condition, and by kind
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
         self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
@@ -101,19 +102,12 @@ class Vehicle:
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
-        # If the message before the previous one is close in time, only the previous one was damaged.
         # PX4's log messages are queued, and a log may begin with old ones, so their timestamps reveal no reboot.
-        is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
-        if is_earlier and not 0 < earlier <= stamp + _REBOOT:
-            self._reboot(before, time)
-            found = detector.add(message, missing)
-        for each in found or ():
-            if each.kind in ("armed", "disarmed"):
-                self.armed = each.kind == "armed"
-                self._armed_at = time if self.armed else math.inf
-            self.emit(each, address.topic, time - each.age)
-            if each.kind == "ekf_changed":
-                self._use_ekf(int(each.numbers["to"]))
+        is_dated = type(detector) is not detectors.TextDetector
+        if is_dated and (stamp < before - _REBOOT or self._suspect is not None):
+            known = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
+            found = detector.add(message, missing) if known is None else iter(known)
+        self._emit_all(found or (), address, time)
 
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
@@ -341,6 +335,37 @@ class Vehicle:
             text = f"{each.text}: superseded by {new.stream}"
             self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
 
+    def _emit_all(self, found: Iterable[Finding], address: Address, time: float) -> None:
+        for each in found:
+            if each.kind in ("armed", "disarmed"):
+                self.armed = each.kind == "armed"
+                self._armed_at = time if self.armed else math.inf
+            self.emit(each, address.topic, time - each.age)
+            if each.kind == "ekf_changed":
+                self._use_ekf(int(each.numbers["to"]))
+
+    def _check_reboot(self, new: _Suspect, stamp: int, earlier: int, time: float) -> list[Finding] | None:
+        """Return the findings to report now; None after a reboot, which a second message must confirm."""
+        # Only the previous message was damaged unless another one before it, or of another stream, is later as well.
+        others = (each for at, each in self._detectors.items() if each is not None and at != new.address)
+        support = earlier or max((max(each.stamp, each.earlier) for each in others), default=0)
+        is_earlier = min(new.before, support) > stamp + _REBOOT
+        if (old := self._suspect) is None:
+            self._suspect = new if is_earlier else None
+            return [] if is_earlier else new.found
+        is_back = stamp >= old.before - _REBOOT
+        if is_back and new.address == old.address:  # only the previous time was damaged
+            self._suspect = None
+            return old.found + new.found
+        if is_back or not (is_earlier or new.address == old.address):
+            return new.found
+        self._suspect = None
+        suspected = self._detectors.get(old.address)
+        initial = [] if suspected is None or new.address == old.address else [*suspected.again({})]
+        self._reboot(old.before, time)
+        self._emit_all(initial, old.address, time)
+        return None
+
     def _reboot(self, before: int, time: float) -> None:
         """Reset the state; report the reboot once, even if delayed messages from before it follow."""
         for detector in filter(None, self._detectors.values()):
@@ -374,6 +399,15 @@ class Vehicle:
                 self._suppressed[key] += 1
                 return True
         return False
+
+
+@dataclass(frozen=True, slots=True)
+class _Suspect:
+    """A message whose time went back: its address, the time before it [us], and its findings."""
+
+    address: Address
+    before: int
+    found: list[Finding]
 
 
 @dataclass(slots=True)

@@ -46,8 +46,17 @@ def read_file_events(*paths: Path) -> FileEvents:
 
 
 def times_of(flights: MergedFlights) -> Times:
-    """Return the clocks of the vehicles of flights; reads the files."""
-    return Times(offsets={name: utc.offset_us / 1e6 for name, utc in flights.utc.items()})
+    """Return the clocks of the vehicles of flights, with remarks on them; reads the files."""
+    offsets, remarks = dict[str, float](), dict[str, str]()
+    for name, utc in flights.utc.items():
+        remark = utc
+        if not isinstance(utc, str):
+            offsets[name] = utc.offset_us / 1e6
+            seconds = utc.corrected_us / 1e6
+            remark = f"{utc.source} corrected its UTC by {seconds:+.1f} s in flight" if seconds else ""
+        if remark:
+            remarks[name] = str(remark)
+    return Times(offsets=offsets, remarks=remarks)
 
 
 def follow(

@@ -175,7 +175,7 @@ class Flight(AbstractContextManager["Flight"]):
     @cached_property
     def _utc(self) -> dict[str, UtcOffset]:
         with self._open(_ALL.topics) as flights:
-            return dict(flights.utc)
+            return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
 
     @cached_property
     def _index(self) -> _Index:

@@ -49,21 +49,19 @@ class FlightFile:
         return self._replay.warnings
 
     @cached_property
-    def utc(self) -> Mapping[str, UtcOffset]:
-        """The UTC offset of each vehicle for which it is known, by its own name; reads the file."""
+    def utc(self) -> Mapping[str, UtcOffset | str]:
+        """The UTC offset of each vehicle, by its own name, or why it is unknown; reads the file."""
         with open_reader(self.path, replace(self.options, topics=ReadOptions().topics)) as reader:
             estimates = estimate_utc(reader)
-            found = {name: each.result(reader.boot_utc) for name, each in estimates.items()}
-        return {name: utc for name, utc in found.items() if utc is not None}
+            return {name: each.result(reader.boot_utc) for name, each in estimates.items()}
 
     def start(self) -> float:
         """Return the Unix time of the first message [s]; raise SourceError if it is unknown."""
         known = ((each, each.timestamp) for each in self.ahead if not each.error)
         offsets = ((self.utc.get(each.address.vehicle), each, time) for each, time in known if time is not None)
-        found = [int(utc.unix_us(time)) / 1e6 - each.due for utc, each, time in offsets if utc is not None]
+        found = [int(utc.unix_us(time)) / 1e6 - each.due for utc, each, time in offsets if isinstance(utc, UtcOffset)]
         if not found:
-            reason = "no message provides UTC, which reading several files requires; read it alone"
-            raise SourceError(str(self.path), reason)
+            raise no_utc(self.path, next((utc for utc in self.utc.values() if isinstance(utc, str)), ""))
         return median(found)
 
 
@@ -108,8 +106,8 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
         return found
 
     @cached_property
-    def utc(self) -> Mapping[str, UtcOffset]:
-        """The UTC offset of each vehicle for which it is known; reads the files."""
+    def utc(self) -> Mapping[str, UtcOffset | str]:
+        """The UTC offset of each vehicle, or why it is unknown; reads the files."""
         return {file.names.get(own, own): utc for file in self.files for own, utc in file.utc.items()}
 
     def messages(self) -> Iterator[SourceMessage]:
@@ -139,6 +137,12 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
             each.due, each.address = each.due + start - first, renamed(each.address, file.names)
             yield each
         self.ended.update(file.names.values())
+
+
+def no_utc(path: Path, reason: str) -> SourceError:
+    """Return the error for one of several files without UTC."""
+    text = reason or "no message contains UTC"
+    return SourceError(str(path), f"{text}, which merging several files requires; read it alone")
 
 
 def require_files(paths: Sequence[Path]) -> Sequence[Path]:

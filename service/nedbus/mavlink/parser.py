@@ -25,6 +25,7 @@ class Received(NamedTuple):
     """A message of an autopilot. `time`: arrival, monotonic [s]; `lost`: messages lost before it; `chunk`: ULog data.
 
     `sequence`: MAVLink's. A late message, which was counted as lost, has `lost` -1.
+    `parts`: number of messages whose ULog data was joined.
     """
 
     message: Any
@@ -34,12 +35,25 @@ class Received(NamedTuple):
     time: float
     lost: int = 0
     chunk: Chunk | None = None
+    parts: int = 1
+
+    def continues(self, before: "Received") -> bool:
+        """Return whether this message has ULog data that directly follows the data of an earlier one.
+
+        Acknowledged data is never joined, because it may wait longer.
+        """
+        one, two = before.chunk, self.chunk
+        if one is None or two is None or two.begins or two.lost or self.lost or self.peer != before.peer:
+            return False
+        if not one.verdict == two.verdict == "delivered":
+            return False
+        return {before.message.get_type(), self.message.get_type()} == {"LOGGING_DATA"}
 
 
 def parse(parser: Any, data: bytes, name: str, peer: Any, now: float) -> Iterator[Received | Rejection]:
     """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival."""
     for message in parser.parse_buffer(data) or []:
-        raw = bytes(message.get_msgbuf())
+        raw = message.get_msgbuf()
         if message.get_type() == "BAD_DATA":
             yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue

@@ -129,11 +129,14 @@ class Vehicle:
         if counted is not None:
             self._certain = self.lost
 
+    @property
+    def has_news(self) -> bool:
+        """Whether losses or a reboot were not reported yet."""
+        return bool(self.lost or self._rebooted)
+
     def report(self, message: SourceMessage, log: StreamedTopics | None = None) -> SourceMessage:
         """Add the losses and the reboot that were not reported yet; during a ULog stream only losses of others."""
-        lost = self.lost
-        if lost and log is not None and log.is_streaming:
-            lost = min(lost, self._certain)
+        lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
         if not (lost or self._rebooted):
             return message
         rebooted, self._rebooted, self.lost, self._certain = self._rebooted, False, self.lost - lost, 0
@@ -182,12 +185,13 @@ class Vehicle:
             timestamp = self.clock.newest
         if topic not in self._topics or is_redundant or timestamp is None:
             return None
-        fields = {name: value for name, value in fields_of(message).items() if value is not None}
-        if not fields:
-            return None
         instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
         address = Address(self._name, topic, instance)
-        if log is not None and log.delivers(address):
+        is_delivered = log is not None and log.delivers(address)
+        if is_delivered and kind in CONVERSIONS:
+            return None
+        fields = {name: value for name, value in fields_of(message).items() if value is not None}
+        if not fields or is_delivered:  # a text is discarded
             return None
         if timestamp < (last := self._last.get(address, 0)):
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"

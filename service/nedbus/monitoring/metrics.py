@@ -89,6 +89,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_log_stream_lost": (_COUNTER, _LOG_STREAM, "Lost LOGGING_DATA messages of a vehicle's ULog stream"),
     "nedbus_log_stream_messages_lost": (_COUNTER, _LOG_STREAM, "Estimated number of ULog messages lost in gaps"),
     "nedbus_log_stream_undecodable": (_COUNTER, _LOG_STREAM, "ULog messages without a usable definition"),
+    "nedbus_log_stream_unsaved_bytes": (_COUNTER, _LOG_STREAM, "Bytes that could not be saved, although save= is set"),
     "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of ULog messages when published"),
     "nedbus_log_stream_header_seconds":
         (_GAUGE, _LOG_STREAM, "Transfer time of the last ULog header; the vehicle's own log has a gap of this length"),
@@ -236,7 +237,7 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
 
 def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any, ...]]]:
     streams = [((each.vehicle, label), each) for label, status in of.items() for each in status.log_streams]
-    columns = {"bytes": "received", "messages_lost": "lost_messages"} | {
+    columns = {"bytes": "received", "messages_lost": "lost_messages", "unsaved_bytes": "unsaved"} | {
         each: each for each in ("gaps", "lost", "undecodable")
     }
     seconds = {"delay_seconds": "delay", "header_seconds": "header_time"}

@@ -93,10 +93,19 @@ class Observer:
         self.event_log.update(now, states, link=link, dropped=dropped, is_behind=is_behind, present=present)
         if settled:
             silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
-            for age, address in silent:
-                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.event_log.vehicles):
-                    del healths[address]
-                    with self._lock:
-                        self.monitor.forget(address)
+            self._forget(healths, [
+                address
+                for age, address in silent
+                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.event_log.vehicles)
+            ])  # fmt: skip
         behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped" if self.event_log.overload else ""
         return Snapshot(now, healths, alive, rejected, link, behind)
+
+    def _forget(self, healths: dict[Address, Health], addresses: Sequence[Address]) -> None:
+        """Forget streams without a sample since this snapshot was taken."""
+        with self._lock:
+            newest = self.monitor.snapshot() if addresses else {}
+            for address in addresses:
+                if address in newest and newest[address].messages == healths[address].messages:
+                    del healths[address]
+                    self.monitor.forget(address)

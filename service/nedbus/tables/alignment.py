@@ -215,6 +215,13 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
     return stamps
 
 
+def _without_wild(times: _Ints) -> _Ints:
+    low, high = np.quantile(times, [0.25, 0.75])
+    margin = _STALE + 10 * (high - low)
+    near: _Ints = times[(times >= low - margin) & (times <= high + margin)]
+    return near
+
+
 def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start: int) -> _Ints:
     """Return the given times, or times at the given rate from the first to the last message [us].
 
@@ -225,7 +232,8 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
         raise ArgumentError("on", on, "a stream, a rate above 0 [Hz], or times [us]")
     if given.ndim:
         return given.astype(np.int64)
-    valid = {name: times[times > 0] for name, times in stamps.items() if times.any()}  # a timestamp of 0 is unset
+    # A timestamp of 0 is unset, and a few wild ones do not determine the period.
+    valid = {name: _without_wild(times[times > 0]) for name, times in stamps.items() if times.any()}
     firsts, lasts = ({name: int(end(each)) for name, each in valid.items()} for end in (np.min, np.max))
     rate, first, last = float(given), min(firsts.values(), default=2**62), max(lasts.values(), default=0)
     first = start if first + _STALE < start <= last else first

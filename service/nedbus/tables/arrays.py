@@ -86,13 +86,11 @@ class FlightArrays:
         """
         return {address: self._read(address) for address in addresses}
 
-    def utc(self, vehicle: str) -> UtcOffset | None:
-        """Return the UTC offset of a vehicle; None if it is unknown."""
-        own = [address for address in self.addresses if address.vehicle == vehicle]
-        sources = [each for each in own if not self.definitions[each].types.keys().isdisjoint(FIELDS)]
+    def utc(self, vehicle: str) -> UtcOffset | str:
+        """Return the UTC offset of a vehicle, or why it is unknown."""
         estimate = UtcEstimate()
-        for address in sources or own[:1]:
-            with suppress(SourceError):
+        for address in self.addresses:
+            if address.vehicle == vehicle and self._buffers_of(address):
                 add_array(estimate, address.stream, self._decode(address).valid_messages)
         return estimate.result(self.boot_utc)
 
@@ -229,10 +227,9 @@ def _decode_table(stream: FileStream, table: npt.NDArray[np.void], definition: D
         if messages[name].dtype.kind in "iu" and messages[name].dtype != columns[old].dtype:
             is_same = messages[name] == columns[old]  # not beyond the range of the field
             valid &= is_same.reshape(len(messages), -1).all(axis=1)
-    for name, column in columns.items():
-        if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
-            invalid = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
-            valid[invalid.reshape(len(messages), -1).any(axis=1)] = False
+    for name in stream.strict_bools & columns.keys():
+        invalid = columns[name].astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
+        valid[invalid.reshape(len(messages), -1).any(axis=1)] = False
     return decoded
 
 

@@ -16,6 +16,7 @@ from nedbus.flights import (
     UtcOffset,
     distinct_names,
     matching,
+    no_utc,
     renamed,
     require_files,
     require_one_vehicle,
@@ -159,9 +160,8 @@ class Positions:
 
 
 def _utc_of(flight: FlightArrays, vehicle: str) -> UtcOffset:
-    if (utc := flight.utc(vehicle)) is None:
-        reason = "no message provides UTC, which reading several files requires; read it alone"
-        raise SourceError(str(flight.path), reason)
+    if isinstance(utc := flight.utc(vehicle), str):
+        raise no_utc(flight.path, utc)
     return utc
 
 
@@ -189,7 +189,8 @@ def _read_one(
     require_one_vehicle(path, chosen, selections[0].vehicle)
     streams = {address.stream: found for address, found in flight.read(chosen).items()}
     _log_warnings(flight)
-    return ReadStreams(streams, flight.start, flight.utc(next(iter(chosen)).vehicle) if utc else None)
+    found = flight.utc(next(iter(chosen)).vehicle) if utc else None
+    return ReadStreams(streams, flight.start, found if isinstance(found, UtcOffset) else None)
 
 
 def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: str, layout: str | None) -> ReadStreams:

@@ -199,11 +199,6 @@ class RouterState:
     sessions: int
     max_sessions: int | None
 
-    @property
-    def load(self) -> float | None:
-        """Open sessions divided by the limit; None if the limit is unknown."""
-        return None if self.max_sessions is None else self.sessions / self.max_sessions
-
 
 def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     """Return the state of each router that replies within `timeout` seconds, sorted by id.

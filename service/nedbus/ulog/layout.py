@@ -17,6 +17,8 @@ BASIC_TYPES: Final[Mapping[str, FieldType]] = {
 """ULog's basic types, by their C names."""
 FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
 """One field of a format definition."""
+UNSET_BOOLS: Final = "bools of {} whose byte is neither 0 nor 1 are read as true"
+"""Warning for a topic with bools that PX4 did not initialize."""
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
 _MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
@@ -24,7 +26,6 @@ _MAX_ALL_FIELDS: Final = 8192  # fields of all messages, even rejected ones: eac
 _MAX_FIELDS: Final = 1000  # fields of one message, including nested fields and padding; a real message has 100
 _MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
-_BOOLS: Final = (False, True, *range(2, 256))  # a byte other than 0 and 1 is left for the model to reject
 
 
 class PayloadField(NamedTuple):
@@ -39,7 +40,7 @@ class PayloadLayout:
     """The fields of a logged message; `size`: bytes without trailing padding, which PX4 does not log.
 
     `unpack`: return the values in a payload of at least `size` bytes; each element of an array is a value.
-    `bool_mask`: the bits that are 0 because bools are 0 or 1, with the payload read as a little-endian integer.
+    `bool_mask`: the bits that are 0 if bools are 0 or 1, with the payload read as a little-endian integer.
     """
 
     def __init__(self, fields: tuple[PayloadField, ...], size: int, padding: int) -> None:
@@ -58,14 +59,15 @@ class PayloadLayout:
         """Decode a payload of at least `size` bytes; values are int, float, bool, str, or tuples of numbers."""
         values = self.unpack(payload)
         fields: dict[str, Any] = {name: values[index] for name, index in self._indices}
-        has_wrong_bool = int.from_bytes(payload, "little") & self.bool_mask
-        for name, kind, offset in self.fields:
+        for name, kind, _ in self.fields:
             if kind.is_text:
                 fields[name] = decode_text(fields[name])
-            elif has_wrong_bool and kind.base == "bool":
-                bools = tuple(map(_BOOLS.__getitem__, payload[offset : offset + kind.values]))
-                fields[name] = bools if kind.is_array else bools[0]
         return fields
+
+    def count_unset_bools(self, payload: bytes) -> int:
+        """Return the number of bools whose byte is neither 0 nor 1, because PX4 did not initialize it."""
+        wrong = int.from_bytes(payload, "little") & self.bool_mask
+        return len(payload) - wrong.to_bytes(len(payload), "little").count(0) if wrong else 0
 
     @property
     def dtype(self) -> Any:

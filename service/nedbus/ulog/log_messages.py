@@ -39,7 +39,7 @@ _MAX_UNPACKED: Final = 2**21  # bytes; PX4's take 170,000
 _MAX_MEMORY: Final = 2**27  # bytes for the xz dictionary
 _MAX_PARTS: Final = 64  # components, event groups, enums, mode groups, and modes per group; PX4 has 30
 _MAX_EVENTS: Final = 5000  # of all components; PX4 has 400
-_MAX_ARGUMENTS: Final = 25  # of an event; PX4's have up to 6, in 25 bytes
+_TOO_MANY_ARGUMENTS: Final = 26  # of an event, which has 25 bytes for them; PX4's have up to 6
 _MAX_SEPARATOR: Final = 10  # characters between the names of a bit field
 _MAX_TEXT: Final = 200  # characters of a template, or of an argument; PX4's longest template has 120
 _CHECKS: Final = ("arming_check", "health")
@@ -137,9 +137,7 @@ class _EventMetadata:
         self, event: Mapping[str, Any], group: str, namespace: str, states: Mapping[Any, int]
     ) -> Callable[[bytes], _Event]:
         """Return the function that decodes the arguments of an event."""
-        names = [each["type"] for each in event.get("arguments", [])[: _MAX_ARGUMENTS + 1]]
-        if len(names) > _MAX_ARGUMENTS:
-            raise ValueError
+        names = [each["type"] for each in event.get("arguments", [])[:_TOO_MANY_ARGUMENTS]]
         types = [self._types.get(name) or self._types[f"{namespace}::{name}"] for name in names]
         unpack = struct.Struct("<" + "".join(each.code for each in types)).unpack_from
         masks = [index for index, name in enumerate(names) if "navigation_mode_group_t" in name and group in _CHECKS]

@@ -215,7 +215,8 @@ class LoggedStream:
         """Return the timestamp of a message [us], or None if it has none, in a tuple."""
         if at is not None:
             self.timestamp = struct.Struct(f"<{at}xQ").unpack_from
-        self.lacking, self.head = frozenset[str](), b""
+        self.lacking = self.strict_bools = frozenset[str]()
+        self.head = b""
         self.omitted: dict[str, str] = {}
         """Warnings for fields left out because a value does not fit the target type, by field name."""
 
@@ -224,7 +225,7 @@ class LoggedStream:
         """A function that validates and encodes a message; it returns None for an invalid one."""
         layout = self.subscription.layout
         types = {name: kind for name, kind, _ in layout.fields}
-        return record_encoder(self.definition, types, layout.unpack, layout.bool_mask)
+        return record_encoder(self.definition, types, layout.unpack)
 
     @property
     def dtype(self) -> Any:

@@ -224,7 +224,7 @@ class _Tornado(BokehTornado):
         if not refusal:
             return super().find_handler(request, **kwargs)
         page = Page.text(f"{refusal}; add other names with --origin", status=403)
-        return self.get_handler_delegate(request, _TextHandler, {"render": lambda: page})
+        return self.get_handler_delegate(request, _Refusal, {"render": lambda: page})
 
 
 class _TokenCheck(NullAuth):
@@ -254,3 +254,7 @@ class _TextHandler(RequestHandler):
         self.set_header("Content-Type", page.content_type)
         self.set_header("X-Content-Type-Options", "nosniff")
         self.finish(page.content)
+
+
+class _Refusal(_TextHandler):
+    head = post = put = patch = delete = options = _TextHandler.get

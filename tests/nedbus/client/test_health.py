@@ -73,6 +73,16 @@ def test_concurrent_add_does_not_break_a_snapshot() -> None:
     assert window.intervals[0] == 3
 
 
+def test_latency_of_a_fast_stream_is_that_of_its_newest_messages() -> None:
+    """Of more than 1,000 messages in a second, the latency is the median of the newest 1,000."""
+    stream = StreamHealth("vehicle_attitude")
+    for number in range(1800):
+        latency = 0.1 if number < 800 else 0.01
+        stream.add({"timestamp": number + 1}, received=number * SECOND // 2000, latency=latency)
+    health = stream.snapshot(SECOND)
+    assert (health.latency, health.latency_max) == (0.01, 0.01)
+
+
 def test_silent_stream_has_age_but_no_rate() -> None:
     """A stream that stopped has an age but no rate; before the first message it has neither."""
     health = stream_at(1.0, 1.01, 1.02).snapshot(10 * SECOND)

@@ -124,6 +124,26 @@ def test_end_waits_for_a_running_job() -> None:
     wait_for(lambda: itself not in io_thread._jobs, what="the job to end itself")
 
 
+@pytest.mark.parametrize("error", [SystemExit, KeyboardInterrupt])
+def test_exit_in_a_job_does_not_end_the_thread(error: type[BaseException]) -> None:
+    """A job that raises SystemExit or KeyboardInterrupt is called again, and other jobs keep being called."""
+    calls = list[float]()
+
+    def leave(now: float) -> float:
+        calls.append(now)
+        raise error
+
+    def succeed(now: float) -> float:
+        others.append(now)
+        return 0.01
+
+    others = list[float]()
+    jobs = [Job(leave), Job(succeed)]
+    wait_for(lambda: len(calls) > 1 and len(others) > 5, what="calls of both jobs")
+    for job in jobs:
+        job.end()
+
+
 def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
     """A job that raises is logged once and called again, and does not delay other jobs."""
     calls: list[float] = []

@@ -36,6 +36,9 @@ from tests.peers.px4_log_stream import (
 )
 from tests.waits import DEADLINE, wait_for
 
+SLOW = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE, link_wait=DEADLINE)
+"""Timings that tolerate a busy host."""
+
 
 def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
     """Return the status of the only log stream; None before it exists."""
@@ -48,8 +51,7 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
     link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), HttpClient(free_port())
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
-    slow = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # tolerates a busy host
-    service = start_with_timings(start, slow, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
+    service = start_with_timings(start, SLOW, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,
@@ -68,6 +70,7 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
         wait_for(lambda: pages.values("nedbus_log_stream_bytes_total", vehicle="1") == [total], what="the metrics")
         assert pages.values("nedbus_log_stream_active", vehicle="1") == [1]
         assert pages.values("nedbus_log_stream_messages_lost_total", vehicle="1") == [0]
+        assert pages.values("nedbus_log_stream_unsaved_bytes_total", vehicle="1") == [0]
         sample = next(each for each in positions if each.source == "mavlink-ulog")
         assert sample.missing == frozenset()
         assert sample.message.delta_heading is not None
@@ -116,10 +119,8 @@ class Flight1:
 
     def serve(self) -> Process:
         """Start a service that receives the stream."""
-        slow = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # tolerates a busy host
-        return start_with_timings(
-            self._start, slow, "serve", "--connect", self._endpoint, "--source", self._source
-        )  # fmt: skip
+        options = "--connect", self._endpoint, "--source", self._source
+        return start_with_timings(self._start, SLOW, "serve", *options)
 
     def kill_service_in_flight(self, positions: Iterable[nedbus.Sample[Any]]) -> None:
         """Start a service, and kill it once the stream has begun and the vehicle is armed."""
@@ -160,7 +161,10 @@ class TestRestartInFlight:
     def test_stream_continues(
         self, start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path, number: signal.Signals
     ) -> None:
-        """The next process continues the stream, and counts the gap; every message equals one that PX4 sent."""
+        """The next process continues the stream, and counts the gap; every message equals one that PX4 sent.
+
+        The first message was sent at most 3 s after the process began to listen, by the vehicle's clock.
+        """
         flight = Flight1(start, endpoint, f"log=1&save={tmp_path}/saved")
         with bus.subscribe(vehicle="1", mode="every") as positions, flight.peer:
             service = flight.serve()
@@ -172,6 +176,8 @@ class TestRestartInFlight:
             service.wait()
             restart = max(flight.positions())
             service = flight.serve()
+            wait_for(lambda: ": listening" in service.err, what="the restarted service")
+            ready = max(flight.positions())
             while (last := sum(each.message.timestamp <= restart for each in received)) > len(received) - 200:
                 received.append(next(streamed))
             wait_for(lambda: (log := log_stream(bus)) and log.gaps, what=f"the status: {service.err}")
@@ -189,6 +195,7 @@ class TestRestartInFlight:
         assert times == sorted(times)
         for part in (times[:last], times[last:]):
             assert part == [each for each in sorted(sent) if part[0] <= each <= part[-1]]
+        assert times[last] - ready <= 3_000_000
         missing = sum(times[last - 1] < each < times[last] for each in sent)
         assert 0 < missing <= status.lost_messages
         assert (status.state, status.gaps, status.undecodable) == ("streaming", 1, 0)

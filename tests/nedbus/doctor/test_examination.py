@@ -22,7 +22,7 @@ import zenoh
 from pymavlink.dialects.v20 import common as mavlink
 
 import nedbus
-from nedbus.client import QueryServer
+from nedbus.client import QueryServer, fleet_tokens
 from nedbus.doctor import Finding, State, examine
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
@@ -183,6 +183,20 @@ def test_two_publishers_of_one_address_are_reported(bus: nedbus.Bus, endpoint: s
         for each in (bus, other):
             each.publisher(VLP, vehicle="1").publish(message(1))
         find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
+
+
+def test_truncated_list_of_streams_is_reported(
+    bus: nedbus.Bus, endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vehicle with too many liveliness tokens is left out with a finding; the others are examined."""
+    monkeypatch.setattr(fleet_tokens, "_MAX_TOKENS", 20)
+    keys = [f"nedbus/flood/@alive/{each:x}/{VLP}" for each in range(21)]
+    tokens = [zenoh_session.liveliness().declare_token(key) for key in keys]
+    with publishing(bus, "drone-7"):
+        findings = diagnose(endpoint)
+    find(findings, "vehicle", "unknown", "not all streams are listed")
+    assert not any("publishers of this address" in each.seen for each in findings)
+    assert len(tokens) == 21  # declared until now
 
 
 def test_undecodable_payload_is_reported(zenoh_session: Session, endpoint: str) -> None:

@@ -4,7 +4,7 @@
 
 It was written from PX4's message definitions by an author who had not seen `nedbus.events`. Each row is a difference
 between two consecutive messages of a topic (instance 0); the first message has none. Down is positive. A reset has the
-deltas of the message or, if the two samples contradict them, the step between the samples minus the motion by velocity;
+step between the samples minus the motion by their rates or, if the deltas agree with that, the deltas of the message;
 it has no size for a position whose origin changed at the same time.
 """
 
@@ -38,11 +38,7 @@ VALID: Final = {
 JUMP_STEP: Final = 1.0  # m beyond velocity * dt in one step
 JUMP_DT: Final = 0.5  # s; longest step, and longest pause within one slide
 ORIGIN_MIN: Final = 0.01  # m
-DELTA_DT: Final = 0.1  # s; longest step for which DELTA_MARGIN applies
-DELTA_MARGIN: Final = 0.5  # m, m/s, rad
-RATES: Final = {
-    "x": ("vx",), "y": ("vy",), "z": ("z_deriv", "vz"), "vx": ("ax",), "vy": ("ay",), "vz": ("az",), "heading": (),
-}  # fmt: skip
+RATES: Final = {"x": "vx", "y": "vy", "z": "z_deriv", "vx": "ax", "vy": "ay", "vz": "az"}
 EARTH: Final = 6_371_000.0  # m
 
 Row = dict[str, Any]
@@ -213,20 +209,21 @@ def add_reset(table: Table, position: Topic, index: int, *, origin_changed: bool
 
 
 def step_of(position: Topic, quantity: str, deltas: Sequence[str], index: int) -> list[float]:
-    """Return the deltas of a reset, or the steps minus motion if a delta exceeds what the rates allow."""
-    margin = DELTA_MARGIN * max(1.0, position.step(index) / DELTA_DT)
-    deltas_found, steps, fits = [], [], True
-    values = {"xy": ("x", "y"), "vxy": ("vx", "vy")}.get(quantity, (quantity,))
-    for delta, value in zip(deltas, values, strict=True):
-        step = position[value][index] - position[value][index - 1]
-        if value == "heading":
-            step = (step + math.pi) % math.tau - math.pi
-        moved = [position[rate][each] * position.step(index) for rate in RATES[value] for each in (index - 1, index)]
-        allowed = [step, *(step - each for each in moved)]
-        fits = fits and min(allowed) - margin <= position[delta][index] <= max(allowed) + margin
-        deltas_found.append(rounded(position[delta][index]))
-        steps.append(rounded(step - (sum(moved[:2]) / 2 if moved else 0.0)))
-    return deltas_found if fits else steps
+    """Return the steps minus motion of a reset, or its deltas if they agree within what the motion leaves unknown."""
+    seconds, values = position.step(index), {"xy": ("x", "y"), "vxy": ("vx", "vy")}.get(quantity, (quantity,))
+    margin = 0.003 + 10 * seconds**3
+    steps = [position[value][index] - position[value][index - 1] for value in values]
+    if quantity != "heading":
+        rates = [(position[RATES[value]][index] + position[RATES[value]][index - 1]) / 2 for value in values]
+        steps = [step - rate * seconds for step, rate in zip(steps, rates, strict=True)]
+    elif "unaided_heading" in position:
+        steps[0] -= position["unaided_heading"][index] - position["unaided_heading"][index - 1]
+    else:
+        margin = 5 * seconds
+    if quantity == "heading":
+        steps = [(steps[0] + math.pi) % math.tau - math.pi]
+    announced = [position[delta][index] for delta in deltas]
+    return [rounded(each) for each in (announced if math.dist(announced, steps) <= margin else steps)]
 
 
 def add_gps(table: Table, gps: Topic) -> None:

@@ -75,9 +75,10 @@ def test_reboot_is_reported_once(flight: Flight) -> None:
     flight.wait(0.1).gps(satellites_used=3)
     assert {"xy_invalid", "few_satellites", "failsafe"} <= set(flight.kinds)
     flight.booted = flight.now
-    reported = flight.wait(1.0).send()
+    assert flight.wait(1.0).send() == []
+    reported = flight.wait(0.1).send()
     assert brief(reported) == [("reboot", "once", "bad")]
-    assert reported[0].text == "reboot: time since boot is 1.0 s, was 10.1 s"
+    assert reported[0].text == "reboot: time since boot is 1.1 s, was 10.1 s"
     assert flight.kinds == ["reboot"]
     assert flight.wait(1.0).gps() == []  # neither a second reboot nor the end of few_satellites
     flight.fly(20)
@@ -106,7 +107,7 @@ def test_delayed_message_from_before_reboot_is_not_a_reboot(flight: Flight) -> N
     """A delayed message of another stream, from before a reboot, is not a reboot: streams have no common order."""
     flight.gps()
     flight.booted, before = flight.now, flight.booted
-    assert brief(flight.wait(0.1).send()) == [("reboot", "once", "bad")]
+    assert brief([*flight.wait(0.1).send(), *flight.wait(0.1).send()]) == [("reboot", "once", "bad")]
     flight.booted, after = before, flight.booted
     assert flight.wait(0.1).gps() == []
     flight.booted = after
@@ -529,8 +530,8 @@ def test_single_wild_position_is_no_jump(flight: Flight) -> None:
         (
             0.1,
             {"z": -12.0, "vz": -20.0, "z_reset_counter": 1, "delta_z": -10.2},
-            "height by 10.2 m",
-        ),  # delta plus motion
+            "height by 11.0 m",
+        ),  # minus the motion at the mean velocity
         (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
         (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),

@@ -124,3 +124,19 @@ def test_unpublished_stream_of_present_vehicle_is_forgotten_after_an_hour(monkey
         assert world.reader.measure().keys() == known
         assert {*world.output.addresses, *world.output.stale} == known
         assert world.fleet.streams.keys() == known
+
+
+def test_stream_that_returns_during_a_poll_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream is not forgotten for its age in a snapshot if a sample arrives before the publishers are listed."""
+    world, address = World(monkeypatch), Address("7", VLP)
+
+    def publishers(**_: object) -> Counter[Address]:
+        world.receive(address)
+        return Counter()
+
+    world.receive(address)
+    world.poll(address)
+    world.now += TIMINGS.forgotten + 1.0
+    monkeypatch.setattr(world.reader._bus, "publishers", publishers)
+    world.reader.poll()
+    assert [health.messages for health, _ in world.reader.measure().values()] == [2]

@@ -17,9 +17,13 @@ from typing import Final
 import pytest
 from pyulog import ULog
 
-from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
+from nedbus.events import Event, EventLog, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
 from nedbus.flights import FileEvents
+from nedbus_msgs import ResetTracker
+from nedbus_msgs.frames import wrap
 from tests.flights import ulogs
+from tests.flights.local_position import upgrade
+from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
 from tests.nedbus.events import events_table
 from tests.nedbus.events.events_table import Row
@@ -29,6 +33,9 @@ TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").re
 NAMES: Final = [name for name in TABLE if name != "from"]
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
 FLAPPING: Final = 4, 10.0, 5.0  # changes per window, window [s], pause until the last one is reported [s]
+TRACKED: Final = {
+    "x": "north", "y": "east", "z": "up", "vx": "v_north", "vy": "v_east", "vz": "v_up", "heading": "heading",
+}  # fmt: skip
 NOT_IN_TABLE: Final = (
     "dropout", "text", "ekf_changed", "other_ekf", "height_contradicted", "position_contradicted", "no_messages",
 )  # fmt: skip
@@ -117,6 +124,34 @@ def test_events_equal_the_independent_table(name: str) -> None:
             elif number not in ("flags", "quantities", "origin"):  # without sizes if the origin changed
                 assert sizes[number] == pytest.approx(value, abs=2e-4), (number, row)
     assert [(time_of(event), event.kind, event.text) for event in left] == []
+
+
+@pytest.mark.parametrize("thinned", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_events_and_track_agree_in_every_reset(name: str, thinned: bool) -> None:
+    """A reset event has the sizes that ResetTracker removes from the track, at full rate and at 10 Hz."""
+    event_log, tracker, last = EventLog(), ResetTracker(), -math.inf
+    removed, found = dict[int, dict[str, float]](), dict[int, Mapping[str, float]]()
+    offsets = dict.fromkeys(TRACKED, 0.0)
+    for sent in open_replay(f"ulog:{path_of(name)}?topics=vehicle_local_position").messages:
+        message = upgrade(sent.fields)
+        if thinned and message.timestamp < last + 9e4:
+            continue
+        last = message.timestamp
+        track = tracker.add(message)
+        event_log.add(sent.address, message, last / 1e6)
+        before, offsets = offsets, {name: getattr(message, name) - getattr(track, name) for name in TRACKED}
+        if track.reset - {"dist_bottom"}:
+            assert not track.discontinued
+            removed[last] = {TRACKED[name]: offsets[name] - before[name] for name in TRACKED}
+        for event in event_log.events_since(0)[0]:
+            if event.kind == "reset" and event.boot == last / 1e6:
+                found[last] = event.numbers
+    assert found.keys() == removed.keys()
+    for time, sizes in found.items():
+        for number, size in sizes.items():
+            sign = -1 if number in ("up", "v_up") else 1
+            assert wrap(sign * size - removed[time][number]) == pytest.approx(0.0, abs=1e-4), (time, number)
 
 
 def test_table_is_generated_by_its_script() -> None:

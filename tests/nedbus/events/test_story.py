@@ -70,6 +70,7 @@ def test_reboot_ends_a_story() -> None:
     flight.wait(1.0).send(xy_valid=False)
     flight.booted = flight.wait(1.0).now - 0.01
     flight.send()
+    flight.send()
     stories = why(flight)
     assert [(each.what.partition(":")[0], each.until) for each in stories] == [
         ("xy not valid", flight.now), ("reboot", flight.now),

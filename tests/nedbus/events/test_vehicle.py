@@ -106,11 +106,44 @@ def test_damaged_timestamp_is_not_a_reboot(vehicle: SimpleVehicle) -> None:
     assert Times(offsets={"1": 1e9}).text(event) == "9000000000000.000"
 
 
+@pytest.mark.parametrize("stamp", [0, 1, 20_000_000])
+def test_single_low_timestamp_is_not_a_reboot(vehicle: SimpleVehicle, stamp: int) -> None:
+    """A reboot needs two messages: after a single one far back in time, the stream continues as before."""
+    for second in range(5):
+        vehicle.send(float(second), timestamp=(100 + second) * 10**6, xy_valid=second < 3)
+    vehicle.send(5.0, timestamp=stamp, xy_valid=False, z_valid=False)
+    vehicle.send(6.0, timestamp=106 * 10**6, xy_valid=False, z_valid=False)
+    vehicle.send(7.0, timestamp=107 * 10**6, xy_valid=False)
+    assert vehicle.reported == [("xy_invalid", "begin"), ("z_invalid", "begin"), ("z_invalid", "end")]
+    assert vehicle.state(7.0) == "bad"
+
+
+def test_wild_first_timestamp_is_not_a_reboot(vehicle: SimpleVehicle) -> None:
+    """If only the first message of the only stream was later, that time was wrong, and the vehicle did not reboot."""
+    vehicle.send(0.0, timestamp=10**11)
+    for second in range(1, 5):
+        vehicle.send(float(second))
+    assert vehicle.reported == []
+
+
+def test_second_stream_confirms_a_reboot(vehicle: SimpleVehicle) -> None:
+    """Two streams whose time went back show a reboot, and the first one keeps what it reported."""
+    status = {"arming_state": 2, "nav_state": 4, "failsafe": False}
+    vehicle.send(0.0, timestamp=100_000_000)
+    vehicle.send(0.0, "vehicle_status", timestamp=100_000_000, **status)
+    vehicle.send(1.0, "vehicle_status", timestamp=1_000_000, **status)
+    assert ("reboot", "once") not in vehicle.reported
+    vehicle.send(2.0, timestamp=2_000_000)
+    assert vehicle.reported == [("reboot", "once")]
+    assert vehicle.event_log.vehicles["1"].armed is True
+
+
 def test_reboot_ends_initial_condition(vehicle: SimpleVehicle) -> None:
     """A vehicle that is invalid in the first message and valid after a reboot has no active condition."""
     for second in range(3):
         vehicle.send(float(second), xy_valid=False)
     vehicle.send(10.0, timestamp=1_000_000)
+    vehicle.send(10.1, timestamp=1_100_000)
     assert ("reboot", "once") in vehicle.reported
     assert all(until is not None for what, until in vehicle.stories() if "xy" in what)
 
@@ -159,7 +192,9 @@ def test_worse_warning_ends_the_previous_one(vehicle: SimpleVehicle) -> None:
 def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
     """Two faults within a minute have one story each; an end event belongs to the story of its begin event."""
     vehicle.send(0.0)
+    vehicle.send(0.1)
     vehicle.send(1.0, timestamp=1_000_000, xy_reset_counter=0)
+    vehicle.send(1.05, timestamp=1_050_000, xy_reset_counter=0)
     vehicle.send(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)
     vehicle.send(2.0, timestamp=2_000_000, xy_reset_counter=1, x=3.0, y=4.0, xy_valid=False)
     vehicle.send(3.0, timestamp=3_000_000, xy_reset_counter=1, x=3.0, y=4.0)

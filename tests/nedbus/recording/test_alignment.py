@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
 from pathlib import Path
@@ -14,7 +14,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ConfigError
-from nedbus.flights import RecordingWriter
+from nedbus.flights import RecordingWriter, find_utc
 from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message
@@ -268,6 +268,16 @@ def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
         nedbus.utc_of(tmp_path / "two.mcap")
 
 
+@pytest.mark.parametrize("wild", [10**11, 9 * 10**18])
+@pytest.mark.parametrize("index", [0, 20, 40])
+def test_single_wild_timestamp_does_not_extend_a_table(wild: int, index: int) -> None:
+    """At a rate, the rows span the messages without a few wild timestamps."""
+    positions = np.repeat(POSITIONS, 10)[:41]
+    positions["timestamp"] = 1_000_000 + 100_000 * np.arange(41)
+    positions["timestamp"][index] = wild
+    assert 40 <= len(nedbus.align({VLP: positions}, on=10.0)) <= 41
+
+
 def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     """Values before the first message are null, arrays have a column per element, and `utc` has a time zone."""
     pytest.importorskip("pandas")
@@ -328,14 +338,57 @@ def test_utc_comes_from_gnss_then_companion_clock() -> None:
     assert nedbus.utc_of({"sensor_gnss_relative": gnss[without]}) is not None
 
 
-@pytest.mark.parametrize(("off", "is_known"), [(1, True), (2, False)])
-def test_utc_requires_that_nine_of_ten_messages_agree(off: int, is_known: bool) -> None:
-    """UTC is unknown if over 10 % of the messages are more than a second off their median."""
-    times = range(1_000_000, 11_000_000, 1_000_000)
-    gnss = array_of("sensor_gps", *({"timestamp": t, "time_utc_usec": BOOT + t} for t in times))
-    gnss["time_utc_usec"][:off] -= 1_000_001
-    found = nedbus.utc_of({"sensor_gps/0": gnss})
-    assert found == (nedbus.UtcOffset("sensor_gps/0", BOOT, 10 - off, 0) if is_known else None)
+def gnss_with(offsets: Sequence[int], times: Sequence[int] = ()) -> MessageArray:
+    """Return messages of a receiver each second, with these errors of UTC [us]."""
+    stamps = times or [1_000_000 * number for number in range(1, len(offsets) + 1)]
+    pairs = zip(stamps, offsets, strict=True)
+    return array_of("sensor_gps", *({"timestamp": t, "time_utc_usec": BOOT + t + off} for t, off in pairs))
+
+
+_OFF = 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("offsets", "corrected"),
+    [
+        ([_OFF] + [0] * 9, 0),  # over 90 % agree
+        ([_OFF] * 2 + [0] * 8, -_OFF),
+        ([-18_000_000] * 30 + [_OFF] * 10 + [0] * 30, -_OFF),
+        ([_OFF] * 20 + [0] * 20 + [10**13] + [0] * 19, -_OFF),  # one wild value
+        ([0] * 8 + [_OFF] * 3 + [0], None),
+        ([-(10**11)] + [_OFF] * 20 + [0] * 20, -_OFF),  # a wild first value
+        ([_OFF, 0] * 10, None),  # two receivers in one stream
+        ([300_000 * number for number in range(40)], None),  # a drift
+        ([30_000_000] * 20 + [0] * 20, None),  # another boot
+    ],
+)
+def test_utc_after_a_correction_holds(offsets: Sequence[int], corrected: int | None) -> None:
+    """A receiver that corrects its UTC by up to 20 s has the later one; drifting or mixed times have none."""
+    found = find_utc({"sensor_gps/0": gnss_with(offsets)})
+    if corrected is None:
+        assert isinstance(found, str)
+        assert found.startswith("the UTC of sensor_gps/0 varies by ")
+    else:
+        assert isinstance(found, nedbus.UtcOffset)
+        assert (found.source, found.offset_us, found.corrected_us) == ("sensor_gps/0", BOOT, corrected)
+
+
+def test_utc_of_two_boots_is_unknown() -> None:
+    """Timestamps that start anew are another boot, whose offset does not correct that of the first."""
+    times = [*range(1_000_000, 11_000_000, 1_000_000)] * 2
+    assert isinstance(find_utc({"sensor_gps/0": gnss_with([0] * 10 + [15_000_000] * 10, times)}), str)
+
+
+@pytest.mark.parametrize(("shift", "is_used"), [(0, True), (9_000_000, True), (5_000_000_000, False)])
+def test_utc_of_a_source_on_another_clock_is_not_used(shift: int, is_used: bool) -> None:
+    """A receiver whose timestamps do not overlap those of the other messages cannot date them."""
+    gnss, positions = gnss_with([0] * 10), np.repeat(POSITIONS, 2)
+    positions["timestamp"] = np.linspace(1e6, 10e6, len(positions)) + shift
+    positions["timestamp"][3] = 2**62  # one wild value
+    found = find_utc({"sensor_gps/0": gnss, VLP: positions})
+    assert isinstance(found, nedbus.UtcOffset) == is_used
+    if isinstance(found, str):
+        assert found == "the timestamps of sensor_gps/0, which has UTC, are not on the clock of the other messages"
 
 
 def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:

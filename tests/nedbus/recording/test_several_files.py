@@ -102,8 +102,8 @@ def test_file_without_utc_among_several_raises(tmp_path: Path, swarm: list[str])
     path = write_flight(tmp_path / "d.ulg", boot=0, start=60, utc=False)
     ended = run_command("events", *swarm, str(path))
     assert ended.exit_code == 1
-    assert f"nedbus: {path}: no message provides UTC" in ended.err
-    with pytest.raises(SourceError, match=r"d\.ulg: no message provides UTC"):
+    assert f"nedbus: {path}: no message contains UTC" in ended.err
+    with pytest.raises(SourceError, match=r"d\.ulg: no message contains UTC"):
         nedbus.read([*swarm, path], [VLP])
     assert run_command("events", str(path)).exit_code == 0
 

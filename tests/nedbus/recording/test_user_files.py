@@ -13,7 +13,7 @@ from nedbus.errors import SourceError
 from nedbus.flights import FileEvents, read_file_events
 from nedbus.sources import parse_source
 from tests.flights.messages import VLP
-from tests.flights.replays import open_replay
+from tests.flights.replays import convert_replay, open_replay
 from tests.peers.command_line import run_command
 
 CASES: Final = Path(__file__).parents[4] / "shared/cases"
@@ -51,6 +51,7 @@ def account(name: str) -> FileEvents:
 EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
     (utc, "08_boot_time_utc_us.ulg", "2025-09-08 13:31:04"),
     (utc, "28_uxrce_timesync_unix.mcap", "2025-10-09 08:53:19"),  # 19.997 s, truncated
+    (utc, "turn5/48_gps_utc_corrected_by_2s.ulg", "2025-10-09 08:53:30"),
     (count, "15_logging_dropout_5s.ulg", {VLP: 500}),
     (count, "16_home_position_50s_old.ulg", {VLP: 500, "home_position": 1}),
     (count, "31_fmu_in_topics.mcap", {
@@ -70,6 +71,30 @@ EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
 def test_value_matches_independent_tools(value: Callable[[str], object], name: str, expected: object) -> None:
     """The expected values come from pyulog, from rosbags, and from the raw records of the files."""
     assert value(name) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "clock"),
+    [
+        (
+            "48_gps_utc_corrected_by_2s.ulg",
+            "times: UTC, from the vehicle's messages; vehicle_gps_position corrected its UTC by -2.0 s in flight",
+        ),
+        (
+            "55_gps_on_another_clock.ulg",
+            "times: seconds since boot, because the timestamps of vehicle_gps_position, which has UTC, are not on",
+        ),
+    ],
+)
+def test_events_say_what_is_known_of_utc(name: str, clock: str, tmp_path: Path) -> None:
+    """`nedbus events` names a correction of UTC, or why it is unknown, for a log and for its conversion."""
+    convert_replay(f"ulog:{CASES / 'turn5' / name}", converted := tmp_path / "a.mcap")
+    for path in (CASES / "turn5" / name, converted):
+        result = run_command("events", str(path))
+        assert result.exit_code == 0
+        assert clock in result.err
+        assert run_command("why", str(path)).exit_code == 0
+        assert (nedbus.utc_of(path) is None) == name.startswith("55")
 
 
 def test_log_without_release_is_converted_without_warning(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pyulog import ULog
 import nedbus
 from nedbus.errors import SourceError
 from nedbus.sources import ReplayRun
-from nedbus_msgs import DEFAULT, VehicleLocalPosition
+from nedbus_msgs import DEFAULT, VehicleLocalPosition, upgrade_with
 from tests.flights.local_position import LAYOUTS, upgrade
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import convert_replay, open_replay
@@ -159,16 +159,43 @@ def test_old_first_message_does_not_delay_replay(tmp_path: Path, age: int) -> No
     assert run.warnings == ()
 
 
-def test_bool_other_than_0_or_1_is_rejected(tmp_path: Path) -> None:
-    """A damaged flag is rejected, not read as true."""
-    writer = UlogWriter()
-    writer.define([VLP])
-    writer.add(VLP, message(1), z_valid=2)
-    writer.add(VLP, message(2))
-    first, second = open_log(writer.write(tmp_path / "a.ulg")).messages
-    with pytest.raises(ValueError, match="z_valid"):
-        upgrade(first.fields)
-    assert upgrade(second.fields).timestamp == 2
+def test_bool_whose_byte_is_not_0_is_true(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """PX4 logs bools that it did not initialize: any byte but 0 is true; their number is logged once per topic."""
+    topics = {
+        "rtl_status": ("uint64_t timestamp;bool[3] flags;bool ok;", "Q4B"),
+        "battery_status": ("uint64_t timestamp;bool connected;int32_t cell_count;", "QBi"),  # is converted
+    }
+    rows = [("rtl_status", (time, 194, 0, 1, time % 3)) for time in range(3000)]
+    path = write_raw_log(tmp_path / "a.ulg", topics, [*rows, ("battery_status", (3000, 94, 6))])
+    run = open_log(path, "?topics=*")
+    assert not run.warnings
+    *messages, battery = run.messages
+    assert battery.fields == {"timestamp": 3000, "connected": True, "cell_count": 6}
+    assert [tuple(upgrade_with(each.definition or DEFAULT, each.fields).__dict__.values()) for each in messages] == [
+        (time, (True, False, True), time % 3 > 0) for time in range(3000)
+    ]
+    assert [each.encode().payload[-5:] for each in messages[:2]] == [b"\x93\xc3\xc2\xc3\xc2", b"\x93\xc3\xc2\xc3\xc3"]
+    warnings = [
+        f"bools of {topic} whose byte is neither 0 nor 1 are read as true ({count})"
+        for topic, count in (("rtl_status", 4000), ("battery_status", 1))
+    ]
+    assert run.warnings[:2] == (*warnings,)
+    read = nedbus.read(path, ["rtl_status", "battery_status"])
+    assert read["rtl_status"]["flags"].tobytes() == bytes([1, 0, 1]) * 3000
+    assert read["rtl_status"]["ok"].tobytes() == bytes([0, 1, 1]) * 1000
+    assert read["battery_status/0"]["connected"].tobytes() == b"\1"
+    assert [text for text in warnings if text in caplog.text] == warnings
+
+
+@pytest.mark.logs
+@pytest.mark.parametrize(("name", "count"), [("cuav_1.16_gps_interference.ulg", 31), ("nxp_v0_ekf_failure.ulg", 39)])
+def test_topic_of_real_flight_with_uninitialized_bools_is_read(name: str, count: int) -> None:
+    path = LOGS / name
+    if not path.exists():
+        pytest.skip(f"real log not found: {path}")
+    run = open_log(path, "?topics=rtl_status")
+    assert len([each.encode() for each in run.messages]) == len(nedbus.read(path, "rtl_status")) == count
+    assert run.warnings == (f"bools of rtl_status whose byte is neither 0 nor 1 are read as true ({count})",)
 
 
 def test_topic_that_is_subscribed_again_is_one_stream(tmp_path: Path) -> None:
@@ -317,6 +344,6 @@ def test_event_before_the_first_timestamp_has_a_time_since_boot(tmp_path: Path) 
     writer = UlogWriter()
     writer.define([VLP])
     for time in (0, 0, *range(100_000_000, 108_000_000, 100_000)):
-        writer.add(VLP, message(time, **VALID), **({} if time else {"z_valid": 2}))
+        writer.add(VLP, message(time, **VALID), z=-5.0 if time else math.nan)
     lines = run_command("events", str(writer.write(tmp_path / "a.ulg"))).out.splitlines()
     assert [line.split()[0] for line in lines] == ["100.000", "100.000"]

@@ -100,7 +100,7 @@ def test_every_router_of_a_mesh_reports_its_state(endpoint: str) -> None:
 
 def test_embedded_router_reports_its_actual_limit(limited: str) -> None:
     """The reported limit is max_sessions, even if `metadata` in the file differs; other metadata is kept."""
-    assert [(state.max_sessions, state.load) for state in router_states(limited)] == [(10, 0.1)]
+    assert [(state.sessions, state.max_sessions) for state in router_states(limited)] == [(1, 10)]
     with open_client([limited], timeout=5.0) as session:
         (answer,) = (reply.ok for reply in session.get("@/*/router", timeout=5.0) if reply.ok)
     assert json.loads(answer.payload.to_bytes())["metadata"] == {"max_sessions": 10, "name": "base"}
@@ -197,7 +197,7 @@ def test_doctor_does_not_warn_about_unknown_session_limit(tmp_path: Path) -> Non
     where = free_endpoint()
     for metadata in (["a", "list"], "mine"):
         with open_router(config_file=write_config(tmp_path, where, metadata=metadata)):
-            assert [(state.max_sessions, state.load) for state in router_states(where)] == [(None, None)]
+            assert [state.max_sessions for state in router_states(where)] == [None]
             assert router_finding(where, "connected sessions: 1").state == "ok"
     with open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False})):
         assert router_finding(where, "connected; its other sessions are not visible to this client").state == "ok"

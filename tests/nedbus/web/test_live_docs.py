@@ -39,7 +39,7 @@ def arguments_of(command: str, **others: str) -> list[str]:
 def test_every_command_has_a_test() -> None:
     """The tests below run every command on the page except the installation."""
     others = set(COMMANDS) - {*SERVES, *ROS2}
-    assert others == {"nedbus echo vehicle_local_position", 'pip install ".[mavlink]"'}
+    assert others == {"nedbus echo vehicle_local_position", 'pip install -e ".[mavlink]"'}
     assert (len(SERVES), len(ROS2)) == (6, 6)
 
 

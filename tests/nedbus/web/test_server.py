@@ -96,6 +96,7 @@ def test_write_methods_and_large_bodies_are_refused(url: str) -> None:
     """Only GET is answered; a body of 100 MB is refused before it is sent, whatever the Host header."""
     for path, method in product(PATHS, ("POST", "PUT", "DELETE")):
         assert status_of(url + path, method=method) in {403, 405}
+        assert status_of(url + path, method=method, Host="evil.example") == 403
     bodies = ("Content-Length: 100000000\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\n5f5e100\r\n")
     for body, host, method in product(bodies, (url.removeprefix("http://"), "evil.example"), ("POST", "PUT", "GET")):
         with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE) as client:

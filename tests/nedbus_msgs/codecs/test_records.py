@@ -38,22 +38,15 @@ class Records:
     def __init__(self, definition: Definition[Any], types: Mapping[str, FieldType]) -> None:
         self.definition, self.types = definition, types
         self._struct = struct.Struct("<" + "".join(kind.form for kind in types.values()))
-        mask, offset = 0, 0
-        for kind in types.values():
-            if kind.base == "bool":
-                mask |= int.from_bytes(b"\xfe" * kind.values) << 8 * offset
-            offset += kind.size * kind.values
-        self.size = offset
-        self.encode = record_encoder(definition, types, self._struct.unpack, mask)
+        self.size = self._struct.size
+        self.encode = record_encoder(definition, types, self._struct.unpack)
 
     def fields(self, record: bytes) -> dict[str, object]:
-        """Return the fields of a record by name; a byte that is neither 0 nor 1 is no bool."""
+        """Return the fields of a record by name."""
         fields, offset = dict[str, object](), 0
         for name, kind in self.types.items():
-            form = "<" + kind.form.replace("?", "B")
+            form = f"<{kind.form}"
             values: tuple[Any, ...] = struct.unpack_from(form, record, offset)
-            if kind.base == "bool":
-                values = tuple(bool(value) if value < 2 else value for value in values)
             offset += struct.calcsize(form)
             fields[name] = values if kind.is_array else decode_text(values[0]) if kind.is_text else values[0]
         return fields

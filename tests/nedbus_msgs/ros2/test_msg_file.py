@@ -139,12 +139,23 @@ def test_empty_range_raises(annotation: str, limits: str) -> None:
     assert define_msg("Right", "uint64 timestamp\nfloat32 x  # @range 1, 1\n").rules
 
 
-@pytest.mark.parametrize("field", ["uint8 x  # @range 256,300", "uint8[2] x  # @range -5,-1", "int8 x  # @range 128,"])
+@pytest.mark.parametrize(
+    "field",
+    [
+        "uint8 x  # @range 256,300",
+        "uint8[2] x  # @range -5,-1",
+        "int8 x  # @range 128,",
+        "uint8 x  # @range 1.2,1.8",
+        "int8[2] x  # @range -0.9,-0.1",
+        "uint8 x  # @range 254.5,254.9",
+    ],
+)
 def test_range_outside_the_type_raises(field: str) -> None:
     """A range without any number of the field's type would reject every message, too; one that overlaps does not."""
     with pytest.raises(MsgError, match="line 2, column 1: no number is in the @range of x, from"):
         define_msg("Wrong", f"uint64 timestamp\n{field}\n")
-    assert define_msg("Right", "uint64 timestamp\nuint8 x  # @range 255, 300\n").rules
+    for limits in ("255, 300", "1.2, 2.8", "-0.5, 0.5"):
+        assert define_msg("Right", f"uint64 timestamp\nuint8 x  # @range {limits}\n").rules
 
 
 @pytest.mark.parametrize("length", ["[x]", "[0]", "[-1]", "[1_0]", "[", "[2000]", "[<=3]"])

@@ -25,7 +25,6 @@ from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import (
-    CLOCKS,
     SEVERITIES,
     WINDOW,
     Event,
@@ -80,11 +79,11 @@ def events(
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
     form = (lambda *each: json.dumps(_to_fields(*each))) if json_output else _to_csv if csv_output else to_line
 
-    def begin(clocks: set[str]) -> None:
+    def begin(times: Times, clocks: set[str]) -> None:
         if csv_output:
             write(csv_line(_HEAD))
         elif clocks and not json_output:
-            write_stderr(f"times: {'; '.join(CLOCKS[each] for each in sorted(clocks))}")
+            write_stderr(f"times: {times.describe(clocks)}")
 
     def select(found: Iterable[Event]) -> list[Event]:
         chosen = [event for event in found if event.severity in severities and origin in (ANY, event.origin)]
@@ -95,9 +94,8 @@ def events(
             write(form(event, times))
 
     if not files:
-        begin({"host"})
+        begin(times := Times(is_live=True), {"host"})
         with open_bus() as bus:
-            times = Times(is_live=True)
             if within is not None:
                 show(_in_order(each for report in bus.accounts(within=within) for each in report.events), times)
             _follow(bus, Selection(ANY, vehicle), lambda found: show(found, times), duration)
@@ -107,7 +105,8 @@ def events(
     read, found = _read(files)
     _require_vehicle(_name(files), read.event_log.vehicles, vehicle)
     found = select(found)
-    begin({read.times.clock(event) for event in found})
+    unknown = {"boot"} if read.times.remarks.keys() - read.times.offsets.keys() else set()
+    begin(read.times, {read.times.clock(event) for event in found} or unknown)
     show(found, read.times)
     vehicles = sorted(each for each in read.event_log.vehicles.items() if vehicle in (ANY, each[0]))
     if texts := [f"{name}: {held}, throughout the file" for name, each in vehicles if (held := each.held_from_start)]:

@@ -60,19 +60,21 @@ class Publisher(AbstractContextManager["Publisher"]):
         topic = get_topic(address.topic)
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
-        self._listener = None
-        if lossless and not registry.is_client:
-            self._listener = MatchingListener(heartbeats.session, self.key)
-        self._flow_control = FlowControl(
-            self._writer, registry.window, needs_router=registry.is_client, listener=self._listener
-        )
-        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
+        self._listener: MatchingListener | None = None
         try:
+            if lossless and not registry.is_client:
+                self._listener = MatchingListener(heartbeats.session, self.key)
+            self._flow_control = FlowControl(
+                self._writer, registry.window, needs_router=registry.is_client, listener=self._listener
+            )
+            self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
             with translate_zenoh_errors():  # last: readers may use all of the above once they see the token
                 token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
                 self._token = heartbeats.session.liveliness().declare_token(token)
         except BaseException:
             self._writer.close()
+            if self._listener is not None:
+                self._listener.close()
             raise
 
     @property
@@ -176,9 +178,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         require_unforked()
         encoding = self._encoding
         if len(provided) != len(self._all):
-            if (
-                provided is not self._partial[0] and provided != self._partial[0]
-            ):  # rare: usually the same fields are missing
+            known = self._partial[0]
+            if provided is not known and provided != known:  # rare: usually the same fields are missing
                 self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
         writer, downsampler = self._writer, self._downsampler

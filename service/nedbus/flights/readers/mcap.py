@@ -54,6 +54,7 @@ class RecordedStream:
     ) -> None:
         self.ros2_topic, self.address, self.definition, self.layout = ros2_topic, address, definition, layout
         self.lacking = missing  # by the metadata of the channel
+        self.strict_bools = frozenset(name for name, kind in layout.types.items() if kind.base == "bool")
         self.cdr = cdr_layout(layout)
 
     @cached_property
@@ -94,8 +95,8 @@ class RecordedStream:
         """A function that validates and encodes a message that passes `check`; it returns None for an invalid one."""
         if self.lacking:
             return lambda _: None
-        unpack, cdr = self.cdr.body.unpack_from, self.cdr
-        return record_encoder(self.definition, self.layout.types, lambda record: unpack(record, 4), cdr.bool_mask)
+        unpack = self.cdr.body.unpack_from
+        return record_encoder(self.definition, self.layout.types, lambda record: unpack(record, 4))
 
 
 class McapReader(FlightReader):

@@ -16,12 +16,14 @@ class FileStream(RecordStream, Protocol):
 
     `dtype`: argument of `numpy.dtype` for a record; None if payloads are fields by name.
     `converted`: the type of each field that `decode` converts. `head`: the first bytes of each record.
+    `strict_bools`: the fields whose bytes must be 0 or 1.
     """
 
     address: Address
     definition: Definition[Any]
     lacking: frozenset[str]
     head: bytes
+    strict_bools: frozenset[str]
 
     @property
     def dtype(self) -> Any:

@@ -26,7 +26,7 @@ class _ConvertedStream:
     """A stream of messages that were converted from MAVLink; their payloads are fields by name."""
 
     dtype = None
-    head = b""
+    head, strict_bools = b"", frozenset[str]()
     lacking: frozenset[str] = frozenset()
     converted: Mapping[str, Any] = {"timestamp": None}  # decoded at once
 

@@ -34,7 +34,8 @@ class UlogReader(FlightReader):
         self._texts = ulog.LogMessageBuilder()
         needed = None if options.topics is None else {*options.topics, *self._texts.TOPICS}
         self._parser = ulog.UlogParser(verify=True, topics=needed)
-        self._damages = 0
+        self._damages, self._is_read = 0, False
+        self._unset_bools: Counter[str] = Counter()  # by topic
         self._dropout = 0.0  # s lost by the logger before the next message
         self._warnings: list[str] = []
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
@@ -44,15 +45,16 @@ class UlogReader(FlightReader):
 
     @property
     def warnings(self) -> list[str]:
-        """Damage found, and parts and fields skipped so far."""
+        """Damage found, and parts and fields skipped so far; counts are listed once the log has been read."""
         streams = [each for each in self._streams.values() if each is not None]
         warnings = self._warnings + [reason for stream in streams for reason in stream.omitted.values()]
-        if self._damages > _MAX_NAMED:
-            warnings.append(f"further damaged locations ({self._damages - _MAX_NAMED})")
-        if self._parser.undecodable:
-            warnings.append(f"skipped messages without a definition ({self._parser.undecodable})")
-        if self._texts.limit.omitted:
-            warnings.append(f"left out log messages above 100 per second ({self._texts.limit.omitted})")
+        counts = {
+            "further damaged locations": self._damages - _MAX_NAMED,
+            "skipped messages without a definition": self._parser.undecodable,
+            "left out log messages above 100 per second": self._texts.limit.omitted,
+            **{ulog.UNSET_BOOLS.format(topic): count for topic, count in self._unset_bools.items()},
+        }
+        warnings += [f"{text} ({count})" for text, count in counts.items() if count > 0 and self._is_read]
         warnings += [text for each in self._repeated.values() for text in each.warnings]
         for stream in self._firsts.values():
             unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
@@ -63,6 +65,7 @@ class UlogReader(FlightReader):
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
         streams, repeated, data, make = self._streams, self._repeated, ulog.Data, tuple.__new__
+        to_int = int.from_bytes
         for records in self._read():
             for record in self._texts.merge(records):
                 if not isinstance(record, data):
@@ -75,6 +78,8 @@ class UlogReader(FlightReader):
                     stream = streams[subscription] = self._open(subscription)
                 if stream is None or (repeated and self._is_repeated(stream, payload)):
                     continue
+                if (mask := subscription.layout.bool_mask) and to_int(payload, "little") & mask:
+                    self._unset_bools[subscription.name] += subscription.layout.count_unset_bools(payload)
                 yield make(Record, (stream, payload, None, None))
         self.damaged |= any(each.warnings and each.is_loss for each in repeated.values())
         if not self.definitions:
@@ -103,6 +108,7 @@ class UlogReader(FlightReader):
                     self.position += len(chunk)
                     yield self._parser.feed(chunk)
             yield self._parser.close()
+            self._is_read = True
             self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
         except ulog.UlogError as exc:
             raise SourceError(str(self.path), f"not a readable ULog file ({exc})") from exc

@@ -26,10 +26,8 @@ _MAX_READ: Final = 65535  # bytes
 _MAX_UNSENT: Final = 4096  # bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
 _RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
 _CONNECT_TIMEOUT: Final = 3.0  # s
-_TIMESTAMPS, _DROPS = (
-    35,
-    40,
-)  # Linux's SO_TIMESTAMPNS and SO_RXQ_OVFL: arrival of a datagram, and drops before it
+_TIMESTAMPS: Final = 35  # Linux's SO_TIMESTAMPNS: the arrival of a datagram
+_DROPS: Final = 40  # Linux's SO_RXQ_OVFL: the number of datagrams dropped before it
 _TIME: Final = struct.Struct("qq")  # s and ns since the epoch
 _MAX_CONTROL: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")

@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -34,6 +35,7 @@ _RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
 _DROPOUT: Final = struct.Struct("<HBH")  # a record of type O: duration [ms]
 _MAX_DROPOUT: Final = 2**16 - 1  # ms
 _MAX_SAME_NAME: Final = 100
+_MAX_REASONS: Final = 100  # different ones for damaged records of a stream
 _FILE_INTERVAL: Final = 5.0  # s between two files of a vehicle
 _MAX_PENDING: Final = 2**22  # bytes of a stream that wait for its file
 
@@ -75,7 +77,7 @@ class LogStream:
         self._has_data = False
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
-        self._damages: set[str] = set()
+        self._damages: set[str] = set()  # reasons for rejected records
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
         self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
         self._new_header = True  # not yet logged
@@ -121,19 +123,20 @@ class LogStream:
                     yield from self._open_stream(record.subscription)
                 stream = self._streams[record.subscription]
                 if stream is not None:
-                    reported = len(stream.omitted)
-                    message = self._message(stream, record.payload, now)
-                    for name, reason in [*stream.omitted.items()][reported:]:
-                        yield Rejection(f"{self._name} {name}", reason, count=0)
-                    yield message
+                    yield from self._convert(stream, record.payload, now)
             elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
-            elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
-                self._damages.add(record.reason)
-                yield Rejection(f"{self._name} ULog stream", record.reason)
+            elif isinstance(record, ulog.Damage):
+                yield self._reject(record.reason)
         count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
         yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
         yield from [Rejection(where, self._texts.problem, count=0)] * (self._texts.problem != problem)
+
+    def _reject(self, reason: str) -> Rejection:
+        """Return the rejection of a damaged record; all beyond the first 100 reasons have the same one."""
+        if len(self._damages) < _MAX_REASONS:
+            self._damages.add(reason)
+        return Rejection(f"{self._name} ULog stream", reason if reason in self._damages else "further damage")
 
     def _check_definitions(self, *, is_first: bool) -> Iterator[Rejection]:
         """Report messages without a definition once; reject a continued stream if a definition does not match."""
@@ -238,11 +241,18 @@ class LogStream:
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
         self._streams[subscription] = stream
 
-    def _message(self, stream: ulog.LoggedStream, payload: bytes, now: float) -> SourceMessage:
+    def _convert(self, stream: ulog.LoggedStream, payload: bytes, now: float) -> Iterator[SourceMessage | Rejection]:
+        """Yield a message, after any new warnings about its fields."""
         self._streamed.add(stream.address)
+        topic, reported = stream.subscription.name, len(stream.omitted)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
         given, definition = stream.decode(payload) if stream.converted else None, stream.definition
-        return SourceMessage(
+        for name, reason in islice(stream.omitted.items(), reported, None):
+            yield Rejection(f"{self._name} {topic}.{name}", reason, count=0)
+        if count := stream.subscription.layout.count_unset_bools(payload):
+            reason = f"{ulog.UNSET_BOOLS.format(topic)} ({count} in the first such message)"
+            yield Rejection(f"{self._name} {topic}", reason, count=0)
+        yield SourceMessage(
             now, stream.address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload
         )
 

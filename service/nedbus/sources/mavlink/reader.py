@@ -14,7 +14,7 @@ from nedbus.sources.source import LinkLoad, Rejection
 
 from .link import Link, Peer
 from .log_client import COMMANDS, Command, LogStreamClient
-from .receive_queue import ReceiveQueue
+from .receive_queue import ReceiveQueue, join_data
 from .saved_stream import read_stream, state_path
 
 # Ids of a companion computer: its loss, unlike that of a ground station, triggers no failsafe.
@@ -23,6 +23,7 @@ COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 _MAX_VEHICLES: Final = 100  # per link
 _TICK: Final = 0.05  # s, the longest wait of the thread
+_PAUSE: Final = 0.01  # s between two reads during a stream: several messages at once need less processor time
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
@@ -96,8 +97,15 @@ class LogReceiver:
             self._waiting.fail(exc)
 
     def _step(self) -> None:
-        for item in self._reader.read(_TICK):
-            self._waiting.put(self._process(item) if isinstance(item, Received) else item)
+        if any(vehicle.client.status.state == "streaming" for vehicle in self.vehicles.values()):
+            self._stop.wait(_PAUSE)
+        items = list[Received | Rejection]()
+        try:
+            for item in self._reader.read(_TICK):
+                items.append(self._process(item) if isinstance(item, Received) else item)
+        finally:  # the link may break
+            if items:
+                self._waiting.put(*join_data(items))
         for vehicle in self.vehicles.values():
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
@@ -147,17 +155,15 @@ class LogReceiver:
         if not vehicle.client.accepts(*target):
             if not is_ours:
                 return received
-            where, reason = (
-                f"{self._reader.name} system {received.system}",
-                f"{kind} of a stream that was not requested",
-            )
-            if vehicle.refusal:
-                where, reason = f"{where}, ULog stream", "the ULog stream of an earlier process cannot be continued"
-                reason += f", because {vehicle.refusal}; it restarts after disarming, or at once with log=armed"
-            return Rejection(where, reason)
+            where = f"{self._reader.name} system {received.system}"
+            if not vehicle.refusal:
+                return Rejection(where, f"{kind} of a stream that was not requested")
+            reason = f"the ULog stream of an earlier process cannot be continued, because {vehicle.refusal}"
+            remedy = "it restarts after disarming, or at once with log=armed"
+            return Rejection(f"{where}, ULog stream", f"{reason}; {remedy}")
         fields = message.sequence, message.length, message.first_message_offset, message.data
         chunk = vehicle.reassembly.add(*fields, now)
-        received = received._replace(chunk=chunk)
+        received = Received(*received[:-2], chunk)  # takes a third of the time of `_replace`
         if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
             vehicle.clock.confirm()
         is_acked = kind == "LOGGING_DATA_ACKED"

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from threading import Condition
@@ -10,15 +10,43 @@ from typing import Final
 
 from nedbus.mavlink import Chunk, Received
 from nedbus.sources.source import LinkLoad, Rejection
+from nedbus.timings import TIMINGS
 
 _MAX_WAITING: Final = 16_384  # messages of all vehicles; beyond it the oldest of the longest queue is dropped
-_MAX_WAIT: Final = 2.0  # s; a message that waited longer is dropped, and
-_FRESH: Final = 0.2  # s; so are those behind it that waited longer than this, so that the next ones are fresh
+_FRESH: Final = 0.2  # s; of the messages behind one that waited too long, those that waited longer are dropped, too
 _LATE: Final = 0.5  # s; a longer wait means that the host is overloaded
 _MEMORY: Final = 5.0  # s without a late or dropped message until the overload has ended
 _MAX_READ: Final = 100  # messages per call of `read`
 _MAX_READ_TIME: Final = 0.1  # s per call of `read`
 _MAX_REJECTIONS: Final = 1000  # different ones that wait
+
+
+def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:
+    """Join the ULog data of each vehicle as far as it is contiguous; it may overtake other messages."""
+    found, runs = list[Received | Rejection | list[Received]](), dict[int, list[Received]]()  # last run by vehicle
+    for item in items:
+        if isinstance(item, Rejection) or item.chunk is None:
+            found.append(item)
+        elif item.system in runs and item.continues(runs[item.system][-1]):
+            runs[item.system].append(item)
+        else:
+            found.append(run := [item])
+            runs[item.system] = run
+    return [_joined(each) if isinstance(each, list) else each for each in found]
+
+
+def _joined(run: list[Received]) -> Received:
+    """Return one message with the ULog data of all."""
+    first, chunks = run[0], [each.chunk for each in run if each.chunk is not None]
+    if len(run) == 1:
+        return first
+    offset = begin = 0
+    for chunk in chunks:
+        offset, begin = begin + chunk.offset, begin + len(chunk.data)
+        if offset < begin:  # a record begins in this one
+            break
+    data = b"".join(chunk.data for chunk in chunks)
+    return first._replace(message=run[-1].message, chunk=chunks[0]._replace(data=data, offset=offset), parts=len(run))
 
 
 @dataclass(slots=True)
@@ -35,9 +63,9 @@ class _VehicleQueue:
     def drop(self, received: Received) -> None:
         """Count a removed message as lost."""
         chunk = received.chunk
-        self.lost += received.lost + 1
+        self.lost += received.lost + received.parts
         if chunk is not None:
-            self.lost_chunks += chunk.lost + (chunk.verdict in ("delivered", "unsynchronised"))
+            self.lost_chunks += chunk.lost + received.parts * (chunk.verdict in ("delivered", "unsynchronised"))
             self.is_cut, self.is_undefined = True, self.is_undefined or chunk.begins
 
     def resume(self, received: Received) -> Received:
@@ -76,19 +104,20 @@ class ReceiveQueue:
         self._turn = 0.0  # `used` of the vehicle that is served
         self._load, self._overload_end, self._longest_wait = LinkLoad(), 0.0, 0.0
 
-    def put(self, item: Received | Rejection) -> None:
-        """Add a message; drop the oldest one of the longest queue if there are too many."""
+    def put(self, *items: Received | Rejection) -> None:
+        """Add messages; drop the oldest ones of the longest queue while there are too many."""
         with self._changed:
-            if isinstance(item, Rejection):
-                is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
-                self._rejections[item if is_known else next(iter(self._rejections))] += item.count
-            else:
+            for item in items:
+                if isinstance(item, Rejection):
+                    is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
+                    self._rejections[item if is_known else next(iter(self._rejections))] += item.count
+                    continue
                 vehicle = self._vehicles.setdefault(item.system, _VehicleQueue())
                 if not vehicle.waiting:  # time in which it had no messages is not owed to it
                     vehicle.used = max(vehicle.used, self._turn)
                 vehicle.waiting.append(item)
-                self._count += 1
-                if self._count > _MAX_WAITING:
+                self._count += item.parts
+                while self._count > _MAX_WAITING:
                     longest = max(self._vehicles.values(), key=lambda each: len(each.waiting))
                     self._drop(longest, longest.waiting.popleft())
             self._changed.notify()
@@ -130,12 +159,12 @@ class ReceiveQueue:
         """Remove the next message of the vehicle that has used the least time; drop those that waited too long."""
         with self._changed:
             while ready := [each for each in self._vehicles.values() if each.waiting]:
-                vehicle, limit = min(ready, key=attrgetter("used")), _MAX_WAIT
+                vehicle, limit = min(ready, key=attrgetter("used")), TIMINGS.link_wait
                 self._turn = vehicle.used
                 while vehicle.waiting:
                     received = vehicle.waiting.popleft()
                     if now - received.time <= limit or received.message.get_type() == "LOGGING_DATA_ACKED":
-                        self._count -= 1
+                        self._count -= received.parts
                         return vehicle, vehicle.resume(received)
                     limit = _FRESH
                     self._drop(vehicle, received)
@@ -143,7 +172,7 @@ class ReceiveQueue:
 
     def _drop(self, vehicle: _VehicleQueue, received: Received) -> None:
         vehicle.drop(received)
-        self._count, self._dropped = self._count - 1, self._dropped + 1
+        self._count, self._dropped = self._count - received.parts, self._dropped + received.parts
 
     def _measure(self, wait: float, lost_by_host: int, now: float) -> LinkLoad:
         """Return the load of the host, given the wait of the next message."""

@@ -1,6 +1,7 @@
 """State file of a running ULog stream: its definitions and progress, from which a restarted process continues it."""
 
 import logging
+import os
 import struct
 import zlib
 from hashlib import sha256
@@ -108,8 +109,7 @@ class StreamFile:
             return
         self._progress = _PROGRESS.pack(now, vehicle_time, sequence)
         try:
-            self._file.seek(_HEAD.size)
-            self._file.write(self._progress)
+            os.pwrite(self._file.fileno(), self._progress, _HEAD.size)
         except OSError as exc:
             self._give_up(self._path, exc)
 

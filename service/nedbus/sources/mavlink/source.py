@@ -3,9 +3,8 @@
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
-from itertools import chain
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
@@ -122,13 +121,16 @@ class _LinkSession:
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
             log.add_timesync(message.tc1, message.ts1, now)
-        converted = vehicle.handle(message, now, log) if chunk is None else None
-        streamed = log.add(chunk, now) if log and chunk else ()
-        for each in chain([converted] if converted else [], streamed):
+        if chunk is None:
+            converted = vehicle.handle(message, now, log)
+            items: Iterable[SourceMessage | Rejection] = () if converted is None else (converted,)
+        else:
+            items = log.add(chunk, now) if log is not None else ()
+        for each in items:
             if not isinstance(each, SourceMessage):
                 yield each
                 continue
-            item = vehicle.report(each, log)
+            item = vehicle.report(each, log) if vehicle.has_news else each
             if log is not None and item.source:
                 log.add_delay(item.timestamp, time.monotonic())
             if item.rebooted:

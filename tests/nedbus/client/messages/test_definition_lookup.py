@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import gc
 import json
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import pytest
+import zenoh
 
 import nedbus
-from nedbus.transport import Session
+from nedbus.client.receiving import layout_lookup
+from nedbus.transport import Replies, Session
 from nedbus_msgs import Definition, define_msg, field_type, short_hash
 from tests.nedbus_msgs.messages.test_messages import write_wheels
 from tests.peers.processes import Start
@@ -135,3 +138,23 @@ def test_encoding_without_name_and_hash_is_invalid(
 
         wait_for(is_counted, what="the count of the invalid message")
     assert "the encoding 'text/plain' has no message name and hash" in caplog.text
+
+
+def test_definitions_of_many_topics_are_queried_together(
+    client: nedbus.Bus, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For the last messages of 80 topics that are not built in, a reader waits up to four times for definitions."""
+    definitions = [define_msg(f"Custom{number}", f"uint64 timestamp\nuint8 a{number}\n") for number in range(80)]
+    publishers = [bus.publisher(f"custom_{n}", vehicle="7", definition=each) for n, each in enumerate(definitions)]
+    for number, each in enumerate(publishers):
+        each.publish({"timestamp": 1, f"a{number}": number})
+    waits, wait_for_definitions = list[int](), layout_lookup.wait_for_replies
+
+    def count(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:
+        waits.append(len(queries))
+        return wait_for_definitions(queries)
+
+    monkeypatch.setattr(layout_lookup, "wait_for_replies", count)
+    assert len(client.latest("*", vehicle="7", timeout=DEADLINE)) == 80
+    assert sum(waits) == 80
+    assert len(waits) <= 4

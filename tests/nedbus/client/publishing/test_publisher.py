@@ -64,7 +64,7 @@ class FailingSession:
 
     def __init__(self, session: Session, fails_at: int) -> None:
         self.session, self.left = session, fails_at
-        self.declared = 0
+        self.declared = self.probes = 0
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self.session, name)
@@ -81,33 +81,40 @@ class FailingSession:
                 raise zenoh.ZError("out of resources")
             result = declare(*(self.session if each is self else each for each in arguments), **options)
             if isinstance(result, zenoh.Publisher):  # a probe, which declares a matching listener
+                self.probes += 1
                 return SimpleNamespace(
                     declare_matching_listener=self.counted(result.declare_matching_listener),
-                    undeclare=result.undeclare,
+                    undeclare=lambda: self.undeclare(result),
                 )
             return result
 
         return call
 
+    def undeclare(self, probe: zenoh.Publisher) -> None:
+        self.probes -= 1
+        probe.undeclare()
 
-@pytest.mark.parametrize("step", [*range(1, 9)])
+
+@pytest.mark.parametrize("step", [*range(1, 11)])
+@pytest.mark.parametrize("declarations", [7, 9], ids=["client", "lossless-in-router"])
 def test_failed_declaration_leaves_nothing_behind(
-    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, step: int
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, step: int, declarations: int
 ) -> None:
     """If any declaration of a publisher fails, nothing stays open, and the address is free for the next one."""
+    is_router = declarations == 9
     session = cast("Any", FailingSession(bus._session, step))
     monkeypatch.setattr("zenoh.ext.declare_advanced_publisher", session.counted(zenoh.ext.declare_advanced_publisher))
     queries = QueryServer(session)
-    registry, address = PublisherRegistry(session, queries, prefix="nedbus", is_client=True), Address("1", VLP)
-    if step < 8:
+    registry, address = PublisherRegistry(session, queries, prefix="nedbus", is_client=not is_router), Address("1", VLP)
+    if step <= declarations:
         with pytest.raises(nedbus.NedbusError, match="out of resources"):
-            registry.publisher(address)
-        assert session.declared == step
+            registry.publisher(address, lossless=is_router)
+        assert (session.declared, session.probes) == (step, 0)
         assert_nothing_is_open(registry, zenoh_session)
-    publisher = registry.publisher(address)
+    publisher = registry.publisher(address, lossless=is_router)
     publisher.publish(message(5))
     wait_for(lambda: len(open_tokens(zenoh_session)) == 2, what="the tokens")
-    assert step < 8 or session.declared == 7, "each declaration is tested"
+    assert step <= declarations or session.declared == declarations, "each declaration is tested"
     publisher.close()
     queries.close()
     registry.heartbeats.close()

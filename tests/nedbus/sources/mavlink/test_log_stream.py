@@ -53,8 +53,8 @@ def recorded_flight(test: Any) -> Any:
 def long_timeouts(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Lengthen queues and timeouts, because a flight is sent as fast as it is read."""
     timings.log_answer, timings.log_link, timings.log_header = DEADLINE, DEADLINE, 10 * DEADLINE
+    timings.link_wait = DEADLINE
     monkeypatch.setattr(receive_queue, "_MAX_WAITING", 1_000_000)
-    monkeypatch.setattr(receive_queue, "_MAX_WAIT", DEADLINE)
 
 
 Attack = Callable[[bytes, int], None]
@@ -523,3 +523,14 @@ def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
     [rejection] = [each for each in found if isinstance(each, Rejection)]
     assert rejection.reason == "battery_status.cell_count is left out where its value does not fit uint8, such as 300"
     assert rejection.count == 0
+
+
+def test_uninitialized_bools_of_stream_are_true(tmp_path: Path) -> None:
+    """As in a file, a bool whose byte is not 0 is true; the reason is the same for each message, and logged once."""
+    fields = "uint64_t timestamp;bool[2] flags;"
+    path = write_raw_log(tmp_path / "a.ulg", {"rtl_status": (fields, "Q2B")}, [("rtl_status", (1, 194, 94))] * 2)
+    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"}), topics=("rtl_status",)), cast("Any", None))
+    found = [*stream.add(Chunk("delivered", path.read_bytes(), begins=True), 0.0)]
+    assert [each.encode().payload[-3:] for each in found if isinstance(each, SourceMessage)] == [b"\x92\xc3\xc3"] * 2
+    reason = "bools of rtl_status whose byte is neither 0 nor 1 are read as true (2 in the first such message)"
+    assert [each for each in found if isinstance(each, Rejection)] == [Rejection("1 rtl_status", reason, count=0)] * 2

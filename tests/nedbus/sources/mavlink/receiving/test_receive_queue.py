@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from itertools import islice
+from itertools import groupby, islice
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink import Received
 from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import LinkLoad, Rejection
 from nedbus.sources.mavlink import receive_queue
-from nedbus.sources.mavlink.receive_queue import Received, ReceiveQueue
+from nedbus.sources.mavlink.receive_queue import ReceiveQueue, join_data
 from tests.waits import DEADLINE
 
 HEARTBEAT: Any = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3)
+DATA: Any = dialect.MAVLink_logging_data_message(245, 191, 0, 1, 0, [0] * 249)
 ACKED: Any = dialect.MAVLink_logging_data_acked_message(245, 191, 0, 1, 0, [0] * 249)
 
 
@@ -108,6 +110,50 @@ def test_messages_that_wait_are_limited(monkeypatch: pytest.MonkeyPatch, host: H
     assert [(each.sequence, each.lost) for each in read if each.system == 2] == [(0, 0)]
 
 
+def received(data: bytes, *, system: int = 1, message: Any = DATA, lost: int = 0, **chunk: Any) -> Received:
+    return Received(message, system, 7, None, 100.0, lost, Chunk("delivered", data, **chunk))
+
+
+def test_contiguous_data_is_joined() -> None:
+    """Plain ULog data of a vehicle without a gap becomes one message; a gap, a new stream and acked data separate."""
+    heartbeat = Received(HEARTBEAT, 1, 8, None, 100.0)
+    items = [
+        received(b"ab", lost=2), heartbeat, received(b"cd"), received(b"x", system=2), received(b"ef", offset=255),
+        received(b"gap", lost=1), received(b"h"), received(b"acked", message=ACKED), received(b"i"),
+        received(b"new", begins=True), received(b"j"), Received(DATA, 1, 9, None, 1.0, 0, Chunk("duplicate")),
+        received(b"k"),
+    ]  # fmt: skip
+    found = [each for each in join_data(items) if isinstance(each, Received)]
+    data = [(each.chunk.data, each.parts, each.lost) for each in found if each.chunk]
+    assert data == [
+        (b"abcdef", 3, 2), (b"x", 1, 0), (b"gaph", 2, 1), (b"acked", 1, 0), (b"i", 1, 0), (b"newj", 2, 0), (b"", 1, 0),
+        (b"k", 1, 0),
+    ]  # fmt: skip
+    assert found[1] is heartbeat
+    lost_data = [received(b"ab"), received(b"cd")]
+    lost_data[1] = lost_data[1]._replace(chunk=Chunk("delivered", b"cd", lost=1))
+    assert join_data(lost_data) == lost_data
+
+
+@pytest.mark.parametrize(("offsets", "offset"), [((0, 1), 0), ((255, 1), 4), ((255, 255), 258), ((2, 255), 2)])
+def test_joined_data_has_the_offset_of_its_first_record(offsets: tuple[int, int], offset: int) -> None:
+    """The first record that begins in joined data is that of the first part, or else that of the second."""
+    (joined,) = join_data([received(b"abc", offset=offsets[0]), received(b"de", offset=offsets[1])])
+    assert isinstance(joined, Received)
+    assert joined.chunk == Chunk("delivered", b"abcde", offset=offset)
+
+
+def test_joined_data_counts_as_its_parts(host: Host) -> None:
+    """Dropped joined data counts as lost with each of its messages."""
+    (joined,) = join_data([received(b"abc"), received(b"de"), received(b"f")])
+    host.queue.put(joined)
+    host.time += 3
+    host.put(9, Chunk("delivered", b"next", offset=0))
+    (last,) = host.read()
+    assert (last.lost, last.chunk) == (3, Chunk("delivered", b"next", lost=3))
+    assert host.loads[0].dropped == 3
+
+
 def test_stream_resumes_at_a_record_after_dropped_data(host: Host) -> None:
     """After dropped LOGGING_DATA, data begins with a record, and all dropped ones count as lost; acked ones stay."""
     host.put(0, Chunk("delivered", b"header", begins=True), message=ACKED)
@@ -159,6 +205,24 @@ def test_vehicles_share_the_time_of_the_source(host: Host) -> None:
     assert read[2] == 400
     assert 4 <= read[1] <= 15
     assert wait < 0.25
+
+
+def test_silent_vehicle_saves_no_time(host: Host) -> None:
+    """A vehicle that was silent while another one was served gets no more than its share when it returns."""
+    for number in range(20):
+        host.put(number, system=2)
+        for _ in host.queue.read(0.0, lost_by_host=0):
+            host.time += 0.1
+    for number in range(5):
+        host.put(number, system=1)
+        host.put(number, system=2)
+    systems = list[int]()
+    while len(systems) < 10:
+        for each in host.queue.read(0.0, lost_by_host=0):
+            if isinstance(each, Received):
+                systems.append(each.system)
+                host.time += 0.1
+    assert max(len(list(run)) for _, run in groupby(systems)) <= 2, systems
 
 
 def test_rejections_are_counted_together(host: Host) -> None:
