@@ -57,18 +57,28 @@ class FlightArrays:
 
     def __init__(self, path: Path, options: ReadOptions, selects: Callable[[Address], bool]) -> None:
         self.path = path
-        self._buffers = dict[FileStream, _Buffer | None]()
+        self._buffers = dict[FileStream, _Buffer]()
+        usual = dict[FileStream, tuple[bytearray, int]]()  # data and record size of the only streams of their addresses
         self._invalid: list[str] = []
         buffers = self._buffers
         with open_reader(path, options) as reader:
             for number, (stream, payload, time, error) in enumerate(reader.records()):
                 try:
-                    buffer = buffers[stream]
+                    data, size = usual[stream]
+                    if time is None and len(payload) == size:
+                        data += payload  # as `add` does, for a record of a log
+                        continue
                 except KeyError:
-                    is_used = selects(stream.address) or not stream.definition.types.keys().isdisjoint(FIELDS)
-                    buffer = buffers[stream] = _Buffer(stream) if is_used else None
-                if buffer is not None:
-                    buffer.add({} if error else payload, number, time)
+                    usual[stream] = bytearray(), -1
+                    if selects(stream.address) or not stream.definition.types.keys().isdisjoint(FIELDS):
+                        buffers[stream] = buffer = _Buffer(stream)
+                        usual[stream] = buffer.data, buffer.size
+                    if len(same := self._buffers_of(stream.address)) > 1:
+                        for each in same:
+                            each.begin_order()
+                            usual[each.stream] = bytearray(), -1
+                if stream in buffers:
+                    buffers[stream].add({} if error else payload, number, time)
             self._warnings, self.damaged, self.boot_utc = reader.warnings, reader.damaged, reader.boot_utc
             self.definitions = reader.definitions
         self.start = reader.start or self._find_start(selects)
@@ -95,7 +105,7 @@ class FlightArrays:
         return estimate.result(self.boot_utc)
 
     def _buffers_of(self, address: Address) -> list[_Buffer]:
-        return [each for each in self._buffers.values() if each is not None and each.stream.address == address]
+        return [each for each in self._buffers.values() if each.stream.address == address]
 
     def _decode(self, address: Address) -> _Decoded:
         buffers = self._buffers_of(address)
@@ -104,7 +114,7 @@ class FlightArrays:
         ]
         if len(parts) == 1:
             return parts[0]
-        order = np.argsort(np.concatenate([each.numbers for each in buffers]), kind="stable")
+        order = np.argsort(np.concatenate([each.numbers or array("q") for each in buffers]), kind="stable")
         return _Decoded(*(np.concatenate(columns)[order] for columns in zip(*parts, strict=True)))
 
     def _read(self, address: Address) -> tuple[MessageArray, Absent]:
@@ -128,7 +138,7 @@ class FlightArrays:
         """Return the first log time on the clock of the timestamps [us]; 0 without log times."""
         firsts, ages = list[int](), list[npt.NDArray[np.float64]]()
         for buffer in self._buffers.values():
-            if buffer is not None and buffer.times and selects(buffer.stream.address):
+            if buffer.times and selects(buffer.stream.address):
                 firsts.append(min(buffer.times))
                 ages.append(
                     np.array(buffer.times, float)
@@ -140,40 +150,50 @@ class FlightArrays:
 class _Buffer:
     """The records of one stream, or the fields of its messages, in file order.
 
-    `numbers`: position of each in the file; `times`: its log time [us]. `reason`: why the first unusable one is.
+    `numbers`: position of each in the file, None while the stream is the only one of its address; `times`: its log time
+    [us]. `reason`: why the first unusable one is. `data`, `size`: the records, and the bytes of one.
     """
 
     def __init__(self, stream: FileStream) -> None:
         self.stream, self.reason = stream, ""
-        self.numbers, self.times = array("q"), array("q")
-        self._data, self._fields, self._unusable = bytearray(), list[Mapping[str, Any]](), list[int]()
-        self._size = 0 if stream.dtype is None else np.dtype(stream.dtype).itemsize
+        self.numbers: array[int] | None = None
+        self.times, self.data = array("q"), bytearray()
+        self._fields, self._unusable = list[Mapping[str, Any]](), list[int]()
+        self.size = 0 if stream.dtype is None else np.dtype(stream.dtype).itemsize
         self._decoded: _Decoded | None = None
-        self._head = stream.head
+
+    def __len__(self) -> int:
+        return len(self.data) // self.size if self.size else len(self._fields)
+
+    def begin_order(self) -> None:
+        """Store positions from now on, because another stream has the same address; all earlier ones are before."""
+        if self.numbers is None:
+            self.numbers = array("q", bytes(8 * len(self)))
 
     def add(self, payload: Any, number: int, time: int | None) -> None:
         """Add a record."""
-        if not self._size:
-            self._fields.append(payload)
-        elif len(payload) == self._size and payload.startswith(self._head):
-            self._data += payload
-        elif reason := self.stream.check(payload):
-            self.reason = self.reason or reason
-            self._unusable.append(len(self.numbers))
-            self._data += bytes(self._size)
-        else:
-            self._data += payload[: self._size]  # PX4 appends bytes
-        self.numbers.append(number)
+        if self.numbers is not None:
+            self.numbers.append(number)
         if time is not None:
             self.times.append(min(time, _MAX_TIME))
+        if not self.size:
+            self._fields.append(payload)
+        elif len(payload) == self.size and payload.startswith(self.stream.head):
+            self.data += payload
+        elif reason := self.stream.check(payload):
+            self.reason = self.reason or reason
+            self._unusable.append(len(self))
+            self.data += bytes(self.size)
+        else:
+            self.data += payload[: self.size]  # PX4 appends bytes
 
     def decode(self, definition: Definition[Any]) -> _Decoded:
         """Return the messages as those of a definition, once decoded."""
         if self._decoded is None:
             rows = self._fields
             stream = self.stream
-            if self._size:
-                table: npt.NDArray[np.void] = np.frombuffer(self._data, np.dtype(stream.dtype))
+            if self.size:
+                table: npt.NDArray[np.void] = np.frombuffer(self.data, np.dtype(stream.dtype))
                 decoded = _decode_table(stream, table, definition)
                 decoded.valid[self._unusable] = False
             else:

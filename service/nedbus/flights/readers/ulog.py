@@ -40,7 +40,10 @@ class UlogReader(FlightReader):
         self._warnings: list[str] = []
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
-        self._repeated: dict[Address, _Repetitions] = {}  # of topics with several subscriptions
+        self._subscribers: Counter[tuple[str, int]] = Counter()  # subscriptions of each topic and instance
+        self._plain: dict[ulog.Subscription, tuple[ulog.LoggedStream, int]] = {}
+        """The stream and the bool mask of subscriptions whose messages need no further checks."""
+        self._repeated: dict[ulog.LoggedStream, _Repetitions] = {}  # of addresses with several subscriptions
         self._firsts: dict[Address, ulog.LoggedStream] = {}
 
     @property
@@ -55,7 +58,7 @@ class UlogReader(FlightReader):
             **{ulog.UNSET_BOOLS.format(topic): count for topic, count in self._unset_bools.items()},
         }
         warnings += [f"{text} ({count})" for text, count in counts.items() if count > 0 and self._is_read]
-        warnings += [text for each in self._repeated.values() for text in each.warnings]
+        warnings += [text for each in set(self._repeated.values()) for text in each.warnings]
         for stream in self._firsts.values():
             unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
             if unknown and _is_newer(stream):
@@ -64,24 +67,21 @@ class UlogReader(FlightReader):
 
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
-        streams, repeated, data, make = self._streams, self._repeated, ulog.Data, tuple.__new__
-        to_int = int.from_bytes
+        plain, merge, data, make, to_int = self._plain, self._texts.merge, ulog.Data, tuple.__new__, int.from_bytes
         for records in self._read():
-            for record in self._texts.merge(records):
-                if not isinstance(record, data):
-                    self._process(record)
+            for record in records:
+                if isinstance(record, data) and record[0] in plain:
+                    stream, mask = plain[record[0]]
+                    if mask and to_int(record[1], "little") & mask:
+                        self._count_unset_bools(record)
+                    yield make(Record, (stream, record[1], None, None))
                     continue
-                subscription, payload = record
-                try:
-                    stream = streams[subscription]
-                except KeyError:
-                    stream = streams[subscription] = self._open(subscription)
-                if stream is None or (repeated and self._is_repeated(stream, payload)):
-                    continue
-                if (mask := subscription.layout.bool_mask) and to_int(payload, "little") & mask:
-                    self._unset_bools[subscription.name] += subscription.layout.count_unset_bools(payload)
-                yield make(Record, (stream, payload, None, None))
-        self.damaged |= any(each.warnings and each.is_loss for each in repeated.values())
+                for each in merge((record,)):
+                    if not isinstance(each, data):
+                        self._process(each)
+                    elif (found := self._accept(each)) is not None:
+                        yield make(Record, (found, each.payload, None, None))
+        self.damaged |= any(each.warnings and each.is_loss for each in self._repeated.values())
         if not self.definitions:
             topics = self.options.topics
             what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
@@ -115,6 +115,24 @@ class UlogReader(FlightReader):
         except OSError as exc:
             raise SourceError(str(self.path), (exc.strerror or str(exc)).lower()) from exc
 
+    def _accept(self, record: ulog.Data) -> ulog.LoggedStream | None:
+        """Return the stream of a data message, None if the message is not selected or a duplicate."""
+        subscription, payload = record
+        if subscription not in self._streams:
+            self._streams[subscription] = self._open(subscription)
+        stream = self._streams[subscription]
+        if stream is None or (stream in self._repeated and self._repeated[stream].add(stream, payload)):
+            return None
+        self._count_unset_bools(record)
+        if stream not in self._repeated and subscription.name not in (*self._texts.TOPICS, ulog.LOG_MESSAGE.name):
+            self._plain[subscription] = stream, subscription.layout.bool_mask
+        return stream
+
+    def _count_unset_bools(self, record: ulog.Data) -> None:
+        layout = record.subscription.layout
+        if layout.bool_mask & int.from_bytes(record.payload, "little"):
+            self._unset_bools[record.subscription.name] += layout.count_unset_bools(record.payload)
+
     def _process(self, record: ulog.Record) -> None:
         if isinstance(record, ulog.Header):
             self.start = record.timestamp
@@ -127,6 +145,7 @@ class UlogReader(FlightReader):
             self._system_id = str(record.value)
         elif isinstance(record, ulog.Subscription):
             self._subscribed[record.name] += 1
+            self._subscribers[_instance_of(record)] += 1
         elif isinstance(record, ulog.Damage):
             self._damages += not record.is_end
             self.damaged |= not record.is_end
@@ -151,14 +170,10 @@ class UlogReader(FlightReader):
             return None
         self.definitions.setdefault(stream.address, stream.definition)
         first = self._firsts.setdefault(stream.address, stream)
-        if first is not stream or self._subscribed[topic] > 1:
-            self._repeated.setdefault(stream.address, _Repetitions())
+        if first is not stream or self._subscribers[_instance_of(subscription)] > 1:
+            self._repeated[stream] = self._repeated.setdefault(first, _Repetitions(first))
+            self._plain.pop(first.subscription, None)
         return stream
-
-    def _is_repeated(self, stream: ulog.LoggedStream, payload: bytes) -> bool:
-        """Return whether a message is left out: a duplicate, or one of another instance with the same address."""
-        found = self._repeated.get(stream.address)
-        return found is not None and found.add(stream, self._firsts[stream.address], payload)
 
 
 class _Repetitions:
@@ -167,13 +182,14 @@ class _Repetitions:
     `warnings`: of the messages left out; `is_loss`: True if they are of a topic that has instances.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: ulog.LoggedStream) -> None:
+        self._first = first
         self._recent: dict[bytes, ulog.Subscription] = {}
         self._others: set[ulog.Subscription] = set()
         self.warnings: list[str] = []
         self.is_loss = False
 
-    def add(self, stream: ulog.LoggedStream, first: ulog.LoggedStream, payload: bytes) -> bool:
+    def add(self, stream: ulog.LoggedStream, payload: bytes) -> bool:
         """Return whether another subscription had this message, or is another instance with the same address."""
         subscription, recent = stream.subscription, self._recent
         known = recent.get(payload, subscription)
@@ -183,7 +199,7 @@ class _Repetitions:
             recent[payload] = subscription
         if known is not subscription:
             return True
-        if subscription.multi_id == first.subscription.multi_id:
+        if subscription.multi_id == self._first.subscription.multi_id:
             return False
         if subscription not in self._others:
             self._others.add(subscription)
@@ -191,6 +207,12 @@ class _Repetitions:
             self.warnings.append(f"skipped a duplicate {topic} [{number}] with different messages")
             self.is_loss |= stream.address.instance is not None or number == 0
         return True
+
+
+def _instance_of(subscription: ulog.Subscription) -> tuple[str, int]:
+    """Return topic and instance; all instances of a topic that has none in PX4 share one address."""
+    topic = subscription.name
+    return topic, subscription.multi_id if topic not in TOPICS or TOPICS[topic].instances else 0
 
 
 def _layout_name(stream: ulog.LoggedStream) -> str:
