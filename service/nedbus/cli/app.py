@@ -22,7 +22,7 @@ _COMMANDS: Final[Mapping[str, str]] = {
 
 
 def make_app(arguments: Sequence[str] = ()) -> typer.Typer:
-    """Return the application; import only the command in `arguments`, or all commands if there is none."""
+    """Return the application; import only the commands in `arguments`, or all if there are none."""
     app = typer.Typer(
         name="nedbus",
         help="PX4's messages, validated, on every host of a Zenoh network.",
@@ -31,9 +31,9 @@ def make_app(arguments: Sequence[str] = ()) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_set_up)
-    given = next((each for each in arguments if each in _COMMANDS), None)
+    given = {each for each in arguments if each in _COMMANDS} or _COMMANDS.keys()  # or values of options, such as info
     for name, module in _COMMANDS.items():
-        if given in (None, name):
+        if name in given:
             function = getattr(commands := import_module(f"{__package__}.commands.{module}"), name, None)
             if isinstance(function, typer.Typer):
                 app.add_typer(function, name=name)
