@@ -19,12 +19,13 @@ ADD: Final = """
 import sys, time
 from pathlib import Path
 from nedbus.events import EventLog
-from nedbus.sources import parse_source, source_text_of_file
+from nedbus.flights import format_of
+from nedbus.sources import parse_source
 from nedbus.errors import InvalidMessageError
 from nedbus_msgs import BY_TOPIC, upgrade_fields
 
 def read():
-    source = parse_source(source_text_of_file(Path(sys.argv[1]), topics="*"))
+    source = parse_source(f"{format_of(sys.argv[1])}:{sys.argv[1]}?topics=*")
     for message in source.open_source(vehicle="1").open().messages:
         try:
             fields = upgrade_fields(message.definition or BY_TOPIC[message.address.topic], message.fields)

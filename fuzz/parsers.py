@@ -8,6 +8,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
+from pathlib import Path
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -16,14 +17,15 @@ from pymavlink.generator.mavcrc import x25crc
 
 from nedbus import ulog
 from nedbus.errors import SourceError
-from nedbus.recording import RecordingReader
+from nedbus.flights.readers import ReadOptions
+from nedbus.flights.readers.mcap import McapReader
+from nedbus.mavlink.fields import CONVERSIONS
+from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import SourceMessage
-from nedbus.sources.mavlink.fields import CONVERSIONS
 from nedbus.sources.mavlink.link import Packet
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.mavlink.reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from nedbus.sources.mavlink.receive_queue import Received
-from nedbus.sources.mavlink.vehicle import Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import (
     BY_TOPIC,
@@ -86,12 +88,10 @@ def parse_mcap(data: bytes) -> int:
     count = 0
     try:
         os.write(descriptor, data)
-        with suppress(SourceError), RecordingReader(f"/proc/self/fd/{descriptor}", vehicle="1") as reader:
-            reader.check()
-            for count, message in enumerate(reader.messages(), 1):  # noqa: B007 - counts
-                stream = message.stream
+        with suppress(SourceError), McapReader(Path(f"/proc/self/fd/{descriptor}"), ReadOptions(topics=None)) as reader:
+            for count, record in enumerate(reader.records(), 1):  # noqa: B007 - counts
                 with suppress(DecodeError):
-                    _validate(stream.definition, decode_with(stream.definition, message.payload, stream.layout))
+                    _validate(record.stream.definition, record.stream.decode(record.payload))
     finally:
         os.close(descriptor)
         define_msg.cache_clear()
@@ -190,7 +190,7 @@ def parse_mavlink(data: bytes) -> int:
                 if not isinstance(item, Received):
                     continue
                 now, system = item.time, item.system
-                vehicle = vehicles.setdefault(system, Vehicle(str(system), options))
+                vehicle = vehicles.setdefault(system, Vehicle(str(system), options.chosen_topics))
                 vehicle.count_lost(item.lost, now, counted=item.chunk.lost if item.chunk else 0)
                 found = [vehicle.handle(item.message, now)]
                 if item.chunk is not None:

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from pymavlink.dialects.v20 import common as dialect
 from tests.peers.px4_log_stream import SHORT, datagrams, stream_message, unpack
 
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
 from nedbus_msgs import (
     MESSAGES,
     Address,

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import typer
 
-from nedbus.cli.app import app
+from nedbus.cli.app import make_app
 
 ROOT: Final = Path(__file__).parents[1]
 PAGES: Final = [
@@ -83,7 +83,7 @@ BLOCKS: Final = [block for page in PAGES for block in blocks_of(page)]
 
 def check_options(command: str) -> None:
     """Assert that a command named in a sentence exists and has the options named with it."""
-    group: Any = typer.main.get_command(app)
+    group: Any = typer.main.get_command(make_app())
     options = {name for option in group.params for name in option.opts}
     for word in shlex.split(command)[1:]:
         if word.startswith("-"):
@@ -96,7 +96,7 @@ def check_options(command: str) -> None:
 
 def parse_command(command: str) -> None:
     """Parse a nedbus command line with Typer, which raises for an unknown command, option or value."""
-    group: Any = typer.main.get_command(app)
+    group: Any = typer.main.get_command(make_app())
     arguments = [each for each in shlex.split(command)[1:] if each != "..."]
     context = group.make_context("nedbus", arguments, resilient_parsing=False)
     while hasattr(group, "commands"):

@@ -29,6 +29,7 @@ PRINTS = {
     "fleet.py": "vehicle 1: 12 streams",
     "compare_estimators.py": "estimator 1: ",
     "batches.py": " m/s",
+    "fastest.py": " m/s",
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",
     "health.py": "1/vehicle_local_position: ",
     "alarm.py": "vehicle 1: good",
@@ -89,6 +90,14 @@ def test_examples_name_the_endpoint_that_does_not_answer(start: Start, tmp_path:
         assert process.wait() == 1, process.err
         [line] = process.err.splitlines()
         assert endpoint in line
+
+
+def test_fastest_example_reads_files(start: Start, tmp_path: Path) -> None:
+    """The loop of examples/fastest.py over a bus runs on files unchanged; it needs no router."""
+    convert_replay("sim:?duration=20", tmp_path / "flight.mcap")
+    process = start(str(EXAMPLES / "fastest.py"), str(tmp_path / "flight.mcap"))
+    assert process.wait() == 0, process.err
+    assert process.out.splitlines()[-1].startswith("1: ")
 
 
 def test_publish_example_moves_its_vehicle(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ import nedbus_msgs
 from .markdown import cell, code, docstring, page, section, table
 
 _SECTIONS: Final = {  # by title: the packages of the names
-    "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.transport"),
-    "Files": ("nedbus.recording",),
+    "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.samples", "nedbus.transport"),
+    "Files": ("nedbus.flights", "nedbus.tables"),
     "Events": ("nedbus.events",),
     "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
     "Messages, arrays, frames and resets": ("nedbus_msgs",),

@@ -7,14 +7,14 @@ from typing import Any
 
 import typer
 
-from nedbus.cli.app import app
+from nedbus.cli.app import make_app
 
 from .markdown import cell, code, page, plain, section, table
 
 
 def commands() -> Iterator[tuple[str, Any]]:
     """Yield each command with its name, such as `nedbus pki ca`; the first one is `nedbus` itself."""
-    root = typer.main.get_command(app)
+    root = typer.main.get_command(make_app())
     yield "nedbus", root
     yield from _below("nedbus", root)
 

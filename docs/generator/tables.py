@@ -22,9 +22,9 @@ from .markdown import cell, code, page, section, table
 
 _LIMIT_SECTIONS: Final = {  # by title: the packages of the constants
     "Readers and publishers": ("client",),
-    "Services and sources": ("daemon", "sources"),
+    "Services and sources": ("daemon", "sources", "mavlink"),
     "Events": ("events",),
-    "Recordings": ("recording",),
+    "Recordings": ("flights", "tables"),
     "Metrics, the log and the page": ("monitoring", "cli", "web"),
     "Zenoh, certificates and ROS 2": ("transport", "bridges"),
     "Messages": ("nedbus_msgs",),

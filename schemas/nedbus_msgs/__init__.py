@@ -1,6 +1,6 @@
 """The contract of nedbus: messages, layouts, topics and wire format; no I/O, no Zenoh."""
 
-from .codecs.cdr import decode_with, encode_with
+from .codecs.cdr import CdrLayout, cdr_layout, decode_with, encode_with, fitting_layout
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
 from .codecs.records import Encoded, encode_upgraded, record_encoder
 from .definitions import DEFAULT, define, definition_of
@@ -48,14 +48,14 @@ from .topics import (
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "JUMP_FIELDS",
     "MESSAGES", "PAYLOAD_LIMIT", "RATE", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address",
-    "AddressError", "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "Encoded",
-    "FieldReader", "FieldType", "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError", "NedbusError",
-    "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion", "UnknownLayoutError",
-    "VehicleLocalPosition", "ack_key", "address_of_alive_key", "bases_of_msg", "check_prefix", "check_vehicle",
-    "codec_of", "dds_type", "decode_text", "decode_with", "define", "define_msg", "definition_of", "definition_text",
-    "describe", "describe_flags", "encode_upgraded", "encode_with", "encoding_of", "field_type", "get_topic",
-    "has_char_hash", "hash_of", "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input", "jump_of",
-    "message_doubts", "message_of_type_hash", "provenance_of", "read_msg", "record_encoder", "ros2_topic_of",
-    "ros2_type", "ros2_types", "schema_key", "short_hash", "split_ros2_topic", "status_key", "topic_of",
-    "upgrade_fields", "upgrade_with", "vehicle_name",
+    "AddressError", "ArgumentError", "CdrLayout", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError",
+    "Encoded", "FieldReader", "FieldType", "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError",
+    "NedbusError", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion",
+    "UnknownLayoutError", "VehicleLocalPosition", "ack_key", "address_of_alive_key", "bases_of_msg", "cdr_layout",
+    "check_prefix", "check_vehicle", "codec_of", "dds_type", "decode_text", "decode_with", "define", "define_msg",
+    "definition_of", "definition_text", "describe", "describe_flags", "encode_upgraded", "encode_with", "encoding_of",
+    "field_type", "fitting_layout", "get_topic", "has_char_hash", "hash_of", "hash_of_msg", "identity_of",
+    "is_unix_time", "is_vehicle_input", "jump_of", "message_doubts", "message_of_type_hash", "provenance_of",
+    "read_msg", "record_encoder", "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "short_hash",
+    "split_ros2_topic", "status_key", "topic_of", "upgrade_fields", "upgrade_with", "vehicle_name",
 ]  # fmt: skip

@@ -38,12 +38,8 @@ if TYPE_CHECKING:
         AsyncBus,
         AsyncPublisher,
         AsyncSubscription,
-        Batch,
         Bus,
-        Counts,
-        Mode,
         Publisher,
-        Sample,
         Subscription,
         connect,
         connect_async,
@@ -60,22 +56,81 @@ if TYPE_CHECKING:
         ReceiveError,
         SourceError,
     )
-    from .recording import UtcOffset, addresses_of, align, missing_of, read, utc_of
+    from .flights import Flight, FlightSamples, UtcOffset, utc_of
+    from .flights import open_flight as open  # noqa: A004 - as in nedbus.open(path)
+    from .samples import Batch, Counts, Mode, Sample
+    from .tables import addresses_of, align, missing_of, read
     from .transport import Session, Tls
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "ANY", "DTYPE", "TOPICS", "Address", "AddressError", "ArgumentError", "AsyncBus", "AsyncPublisher",
-    "AsyncSubscription", "Batch", "Bus", "ClosedError", "ConfigError", "ConnectError", "Continuous", "Counts",
-    "InvalidMessageError", "Message", "MessageArray", "Mode", "NedbusError", "NoDataError", "Provenance", "Publisher",
-    "Quantity", "ReceiveError", "ResetTracker", "Row", "Sample", "Selection", "Session", "SourceError", "Subscription",
-    "Tls", "Topic", "UtcOffset", "VehicleLocalPosition", "addresses_of", "align", "connect", "connect_async",
-    "define_msg", "dtype_of", "mask_invalid", "missing_of", "read", "to_array", "to_message", "utc_of",
+    "ANY",
+    "DTYPE",
+    "TOPICS",
+    "Address",
+    "AddressError",
+    "ArgumentError",
+    "AsyncBus",
+    "AsyncPublisher",
+    "AsyncSubscription",
+    "Batch",
+    "Bus",
+    "ClosedError",
+    "ConfigError",
+    "ConnectError",
+    "Continuous",
+    "Counts",
+    "Flight",
+    "FlightSamples",
+    "InvalidMessageError",
+    "Message",
+    "MessageArray",
+    "Mode",
+    "NedbusError",
+    "NoDataError",
+    "Provenance",
+    "Publisher",
+    "Quantity",
+    "ReceiveError",
+    "ResetTracker",
+    "Row",
+    "Sample",
+    "Selection",
+    "Session",
+    "SourceError",
+    "Subscription",
+    "Tls",
+    "Topic",
+    "UtcOffset",
+    "VehicleLocalPosition",
+    "addresses_of",
+    "align",
+    "connect",
+    "connect_async",
+    "define_msg",
+    "dtype_of",
+    "mask_invalid",
+    "missing_of",
+    "open",
+    "read",
+    "to_array",
+    "to_message",
+    "utc_of",
 ]  # fmt: skip
 
-# Imported in this order on first use of a name, for a fast start; only the last two load NumPy.
-_MODULES = "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client", "nedbus_msgs.arrays", "nedbus.recording"
+# By module; a module is imported on first use of one of its names: those for files load no Zenoh, and few load NumPy.
+_MODULES = {
+    "nedbus.samples": "Batch Counts Mode Sample",
+    "nedbus.client": "AsyncBus AsyncPublisher AsyncSubscription Bus Publisher Subscription connect connect_async",
+    "nedbus.flights": "Flight FlightSamples UtcOffset open utc_of",
+    "nedbus.tables": "addresses_of align missing_of read",
+    "nedbus.transport": "Session Tls",
+    "nedbus_msgs": "ANY TOPICS Address Continuous Message Provenance Quantity ResetTracker Row Selection Topic"
+    " VehicleLocalPosition define_msg",
+    "nedbus_msgs.arrays": "DTYPE MessageArray dtype_of mask_invalid to_array to_message",
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
 _SUBMODULES = "errors", "frames", "health"
 
 
@@ -90,8 +145,8 @@ if not TYPE_CHECKING:  # otherwise type checkers would accept any name
     def __getattr__(name: str) -> object:
         """Import a public name on first use."""
         if name in __all__:
-            module = next(each for each in map(_import_module, _MODULES) if hasattr(each, name))
-            return globals().setdefault(name, getattr(module, name))
+            home = _import_module(_HOMES.get(name, "nedbus.errors"))
+            return globals().setdefault(name, getattr(home, "open_flight" if name == "open" else name))
         if name in _SUBMODULES:
             return _import_module(f"{__name__}.{name}")
         if name in _import_module("nedbus_msgs").MESSAGES:

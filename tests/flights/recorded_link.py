@@ -14,8 +14,9 @@ from nedbus import clock
 from nedbus.client import Health, PublisherRegistry, stream_state
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import Event, EventLog, Times, Verdict, report_of, verdict_of
+from nedbus.mavlink.parser import Received, new_parser, parse
 from nedbus.sources import Rejection, SourceMessage
-from nedbus.sources.mavlink.reader import LogReceiver, Received, new_parser, parse
+from nedbus.sources.mavlink.reader import LogReceiver
 from nedbus.sources.mavlink.source import _LinkSession
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import BY_TOPIC, Address

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from nedbus.sources import LiveSource, ReplayRun, convert, parse_source
+from nedbus.flights import ReadOptions, convert
+from nedbus.flights.readers.mcap import McapReader
+from nedbus.sources import LiveSource, ReplayRun, parse_source
 
 
 def open_replay(text: str) -> ReplayRun:
@@ -16,4 +19,11 @@ def open_replay(text: str) -> ReplayRun:
 
 def convert_replay(text: str, path: Path) -> str:
     """Convert a replay source to a recording, as `nedbus convert` does; return its summary."""
-    return convert(open_replay(text), path, source=text.partition(":")[0], on_progress=lambda _: None)
+    run = open_replay(text)
+    source = text.partition(":")[0]
+    return convert(run.messages, path, source=source, boot_utc=run.boot_utc, on_progress=lambda _: None)
+
+
+def open_recording(path: str | Path, **options: Any) -> McapReader:
+    """Open the reader of a recording, with the messages of all topics."""
+    return McapReader(Path(path), ReadOptions(topics=None, **options))

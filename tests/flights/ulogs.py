@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from nedbus.sources import FileEvents, read_file_events
+from nedbus.flights import FileEvents, read_file_events
 from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.local_position import FIELD_TYPES, LAYOUTS, downgrade

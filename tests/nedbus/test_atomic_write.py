@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nedbus.atomic_write import atomic_write
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
 from tests.flights.messages import message
 from tests.nedbus.recording.test_recorder import write
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from tests.flights.ulogs import write_log
 from tests.peers.processes import Start
 
 
@@ -26,6 +29,34 @@ assert rlcompleter.Completer(globals()).complete("nedbus.connect_", 0).startswit
 absent("numpy typer rich cryptography")
 import nedbus.cli.app
 absent("numpy rich.progress cryptography")
+"""
+    process = start("-c", program, fresh=True)
+    assert process.wait() == 0, process.err
+
+
+def test_files_are_read_without_zenoh(start: Start, tmp_path: Path) -> None:
+    """Reading files, in a script or with a command, loads neither Zenoh nor the client."""
+    log = write_log(tmp_path / "flight.ulg", [1_000_000 * second for second in range(1, 20)])
+    program = f"""
+import sys
+def absent():
+    assert not [each for each in ("zenoh", "nedbus.client", "nedbus.transport") if each in sys.modules]
+import nedbus
+path = {str(log)!r}
+with nedbus.open(path) as flight:
+    assert len(list(flight())) == 19 and len(list(flight("*").batches())) == 1
+    flight.addresses, flight.utc, flight.duration
+absent()
+nedbus.read(path), nedbus.align(path), nedbus.utc_of(path), nedbus.addresses_of(path)
+absent()
+from nedbus.cli import main
+for arguments in ("convert", path, path + ".mcap"), ("plot", path), ("events", path), ("why", path):
+    sys.argv = ["nedbus", *arguments]
+    try:
+        main()
+    except SystemExit as exc:
+        assert not exc.code, arguments
+    absent()
 """
     process = start("-c", program, fresh=True)
     assert process.wait() == 0, process.err

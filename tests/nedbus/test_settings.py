@@ -10,12 +10,12 @@ import pytest
 
 import nedbus
 from nedbus import Tls
+from nedbus.endpoints import resolution_error
 from nedbus.errors import ConfigError, ConnectError, ListenError
 from nedbus.pki import make_authority, make_certificate
 from nedbus.settings import is_loopback, load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
-from nedbus.transport.endpoints import resolution_error
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.waits import wait_for

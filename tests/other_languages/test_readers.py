@@ -16,9 +16,9 @@ from pyulog import ULog
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from docs.generator.vectors import definition_of, from_json
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
+from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import TOPICS, Address, Provenance

@@ -23,7 +23,7 @@ from unittest.mock import patch
 
 import typer
 
-from nedbus.cli.app import app
+from nedbus.cli.app import make_app
 from nedbus.cli.output.logs import RateLimit
 
 from .processes import ForkedProcess, ForkServer, without_coverage
@@ -69,7 +69,7 @@ def fork_command(
 @cache
 def _commands() -> Any:
     """Return the click command of the app; cached, because it takes 0.1 s to build."""
-    return typer.main.get_command(app)
+    return typer.main.get_command(make_app())
 
 
 @contextmanager

@@ -127,6 +127,23 @@ async def read_and_publish() -> None:
         assert_type(await bus.latest("home_position"), list[nedbus.Sample[nedbus.Message]])
 
 
+def open_files(any_topic: str) -> None:
+    """A flight is called as a bus is subscribed to, and yields the same types."""
+    with nedbus.open(["a.ulg", "b.mcap"], vehicle=7) as flight:
+        for sample in flight(nedbus.VehicleAttitude, start=1.0):
+            assert_type(sample, nedbus.Sample[nedbus.VehicleAttitude])
+            sample.message.x  # type: ignore[attr-defined] # VehicleAttitude has no x
+        for row in flight(rows=True).rows():
+            assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
+        assert_type(flight("*"), nedbus.FlightSamples[nedbus.Message])
+        assert_type(flight(any_topic), nedbus.FlightSamples[nedbus.Message])
+        assert_type(flight(nedbus.VehicleAttitude, "home_position"), nedbus.FlightSamples[nedbus.Message])
+        for batch in flight(nedbus.SensorGps, topic="vehicle_gps_position").batches():
+            assert_type(batch, nedbus.Batch)
+        assert_type(flight.utc, nedbus.UtcOffset | None)
+        flight(mode="every")  # type: ignore[call-overload] # a file has no slow readers
+
+
 def read() -> None:
     """Files are read as arrays, or as data frames of the given library."""
     assert_type(nedbus.read("flight.ulg", vehicle=7), nedbus.MessageArray)

@@ -5,16 +5,20 @@ Converts between payloads and fields by name; the model validates the fields.
 
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, Final
 
 from pydantic import ValidationError
 
-from nedbus_msgs.errors import DecodeError, EncodeError
-from nedbus_msgs.model.declaration import Layout, cached_on_owner
+from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError
+from nedbus_msgs.model.declaration import RELEASES, Layout, cached_on_owner
 from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.validation import Validation
 
+from .records import encode_upgraded
+
 HEADER: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
+_ALIGNMENT: Final = 4  # bytes to which writers may pad a payload
 _PX4_TRAILER: Final = 24  # PX4 sends 4 + sizeof(struct) + 24 bytes, and its struct may be longer than the CDR body
 
 
@@ -39,7 +43,23 @@ class CdrLayout:
         px4_struct = unpadded + -unpadded % 8
         self.limit = len(HEADER) + max(size, px4_struct + _PX4_TRAILER)
         self.body, self.zeros = struct.Struct(body), HEADER + bytes(size)
+        self.size, self.name = len(self.zeros), layout.name
         self.validation = Validation(layout.types, ())
+
+    def check(self, payload: bytes) -> str | None:
+        """Return why a payload does not have this form, None if it has."""
+        size = self.size
+        if payload[:2] != HEADER[:2]:
+            start = f"starts with {payload[:2].hex(' ')}" if payload else "empty"
+            return f"the payload is not little-endian CDR ({start})"
+        if not size <= len(payload) <= self.limit:
+            sizes = f"{size}" if self.limit == size else f"{size} to {self.limit}"
+            return f"{len(payload)} bytes, expected {sizes} for layout {self.name}"
+        if wrong := int.from_bytes(payload[:size], "little") & self.bool_mask:
+            offset = ((wrong & -wrong).bit_length() - 1) // 8
+            name = next(name for name, first in reversed([*self.offsets.items()]) if first <= offset)
+            return f"{name} is {payload[offset]}, not a bool (0 or 1)"
+        return None
 
 
 def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> dict[str, object]:
@@ -51,18 +71,32 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     neither 0 nor 1.
     """
     cdr = cdr_layout(layout)
-    min_size = len(cdr.zeros)
-    if payload[:2] != HEADER[:2]:
-        start = f"starts with {payload[:2].hex(' ')}" if payload else "empty"
-        raise DecodeError(f"the payload is not little-endian CDR ({start})", definition.name)
-    if not min_size <= len(payload) <= cdr.limit:
-        sizes = f"{min_size}" if cdr.limit == min_size else f"{min_size} to {cdr.limit}"
-        raise DecodeError(f"{len(payload)} bytes, expected {sizes} for layout {layout.name}", definition.name)
-    if wrong := int.from_bytes(payload[:min_size], "little") & cdr.bool_mask:
-        offset = ((wrong & -wrong).bit_length() - 1) // 8
-        name = next(name for name, first in reversed([*cdr.offsets.items()]) if first <= offset)
-        raise DecodeError(f"{name} is {payload[offset]}, not a bool (0 or 1)", definition.name)
+    if reason := cdr.check(payload):
+        raise DecodeError(f"{reason}{_explain_size(definition, payload, layout)}", definition.name)
     return cdr.validation.by_name(cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER))))
+
+
+def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None:
+    """Return the only layout of a message whose exact size and rules a payload fits; None without one."""
+    found = list[Layout]()
+    for layout in definition.layouts.values():
+        cdr = cdr_layout(layout)
+        if len(payload) - cdr.size in range(_ALIGNMENT) and not cdr.check(payload):
+            with suppress(InvalidMessageError):
+                encode_upgraded(definition, decode_with(definition, payload, layout))
+                found.append(layout)
+    return found[0] if len(found) == 1 else None
+
+
+def _explain_size(definition: Definition[Any], payload: bytes, layout: Layout) -> str:
+    """Return what a payload of the wrong size is, and the remedy; "" if it fits no other layout."""
+    fits = fitting_layout(definition, payload)
+    if fits is None or fits is layout:
+        return ""
+    is_release = fits.name in RELEASES
+    remedy = f"rebuild px4_msgs at release/{fits.name}" if is_release else "rebuild px4_msgs at the vehicle's version"
+    which = f"PX4 {fits.name}" if is_release else f"{fits.name}, a development version of PX4"
+    return f"; they fit the layout of {which}: the vehicle's px4_msgs differ, {remedy}"
 
 
 def encode_with(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> bytes:

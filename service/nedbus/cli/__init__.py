@@ -25,8 +25,9 @@ def main() -> None:
     sys.unraisablehook = _repeat_interrupt
     atexit.register(_discard_broken_stderr)
     gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
-    from .app import app
+    from .app import make_app
 
+    app = make_app(sys.argv[1:])
     gc.enable()
     app()
 

@@ -1,37 +1,45 @@
-"""The Typer application: commands and global options."""
+"""The Typer application: commands, imported on first use, and global options."""
 
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from typing import Annotated, Final
 
 import typer
 
 from nedbus import __version__
 
-from .commands.bridges import export, foxglove, ros2, web
-from .commands.checks import check, doctor, health
-from .commands.echo import echo
-from .commands.events import events, why
-from .commands.hz import hz
-from .commands.pki import pki
-from .commands.query import get, info, list_, schema
-from .commands.recordings import convert, plot, record
-from .commands.serve import router, serve
 from .options import command
 from .output.logs import LogFormat, LogLevel, log_to_stderr
 from .output.streams import write
 
-app = typer.Typer(
-    name="nedbus",
-    help="PX4's messages, validated, on every host of a Zenoh network.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-for _command in (
-    serve, router, list_, echo, hz, get, info, events, why, health, doctor, check, export, schema, ros2, foxglove, web,
-    record, convert, plot,
-):  # fmt: skip
-    app.command(_command.__name__.rstrip("_"))(_command)
-app.add_typer(pki, name="pki")
+_COMMANDS: Final[Mapping[str, str]] = {
+    "serve": "serve", "router": "serve", "list": "query", "echo": "echo", "hz": "hz", "get": "query", "info": "query",
+    "events": "events", "why": "events", "health": "checks", "doctor": "checks", "check": "checks",
+    "export": "bridges", "schema": "query", "ros2": "bridges", "foxglove": "bridges", "web": "bridges",
+    "record": "recordings", "convert": "files", "plot": "files", "pki": "pki",
+}  # fmt: skip
+"""The module in `commands` of each command, in the order of the help."""
+
+
+def make_app(arguments: Sequence[str] = ()) -> typer.Typer:
+    """Return the application; import only the commands in `arguments`, or all if there are none."""
+    app = typer.Typer(
+        name="nedbus",
+        help="PX4's messages, validated, on every host of a Zenoh network.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(_set_up)
+    given = {each for each in arguments if each in _COMMANDS} or _COMMANDS.keys()  # or values of options, such as info
+    for name, module in _COMMANDS.items():
+        if name in given:
+            function = getattr(commands := import_module(f"{__package__}.commands.{module}"), name, None)
+            if isinstance(function, typer.Typer):
+                app.add_typer(function, name=name)
+            else:
+                app.command(name)(function or getattr(commands, f"{name}_"))
+    return app
 
 
 @command
@@ -46,7 +54,6 @@ LevelOption = Annotated[LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG
 FormatOption = Annotated[LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="Format of the log")]
 
 
-@app.callback()
 @command
 def _set_up(
     *,

@@ -7,20 +7,25 @@ import logging
 import re
 import signal
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from nedbus.client import Bus
+from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import Settings, load_settings
-from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
 
 from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
+
+if TYPE_CHECKING:
+    from nedbus.client import Bus
+
+    OpenBus = Callable[[], Bus]
+else:
+    OpenBus = Callable[[], Any]  # evaluated by `command`; the client loads Zenoh, which commands for files do not need
 
 _log = logging.getLogger("nedbus")
 
@@ -126,12 +131,16 @@ def _read_settings(
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
     config: ConfigOption = None,
-) -> Settings:
+) -> Any:
+    from nedbus.settings import load_settings
+
     tls = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
     return load_settings(config, connect=connect, prefix=prefix, **tls)
 
 
-def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> Bus:
+def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> AbstractContextManager[Any]:
+    from nedbus.client import Bus
+
     settings = _read_settings(**settings_options)
     try:
         return Bus(settings, timeout=1.0)

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from nedbus.events import format_duration
 from nedbus.extras import lazy_exports
+from nedbus.samples import Counts, Mode, Sample
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect
@@ -28,11 +29,10 @@ from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .publishing.writer import HEARTBEAT
 from .rate_gate import check_max_rate
-from .sample import Counts, Mode, Sample
 from .subscription import AsyncSubscription, Subscription
 
 if TYPE_CHECKING:
-    from .receiving.batch import Batch
+    from .recorder import Recorder
 else:
-    # Lazy: importing NumPy takes longer than all other imports together.
-    __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})
+    # Lazy: it needs an extra, and NumPy, whose import takes longer than all others together.
+    __getattr__ = lazy_exports(__name__, {"Recorder": ("mcap", "recorder")})

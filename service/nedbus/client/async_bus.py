@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar, Unpack, cast, overload
 
 from nedbus.errors import ClosedError
+from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
 from nedbus_msgs import Definition, Message, Selection
 
 from .bus import Bus
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
-from .sample import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
 
 _P = ParamSpec("_P")

@@ -10,6 +10,7 @@ from typing import Any, Unpack, overload
 
 from nedbus.errors import ArgumentError, ClosedError, NedbusError
 from nedbus.events import AccountReport
+from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked, token_keys
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
@@ -22,7 +23,6 @@ from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiver, Receiver, find_schemas
-from .sample import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
 

@@ -17,6 +17,7 @@ from typing import Final, Literal, get_args
 from nedbus import clock
 from nedbus.events import format_duration
 from nedbus.log_event import about
+from nedbus.samples import Sample
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     DEFAULT,
@@ -29,8 +30,6 @@ from nedbus_msgs import (
     describe_flags,
     get_topic,
 )
-
-from .sample import Sample
 
 StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"]  # worst first
 

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Generic, Self
 from typing_extensions import TypeVar
 
 from nedbus.errors import ClosedError, NoDataError
+from nedbus.samples import Counts, M_co, Sample
 from nedbus.transport import require_unforked
 
 from .closing import Finalizer
 from .receiving import Inbox, Receiver, check_count
-from .sample import Counts, M_co, Sample
 
 if TYPE_CHECKING:
-    from .receiving.batch import Batch
+    from nedbus.samples import Batch
 
 _T = TypeVar("_T")
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Final, cast
 from urllib.parse import parse_qsl, quote, unquote, urlencode
 
@@ -12,10 +12,10 @@ from pydantic import ValidationError
 
 from nedbus.errors import AddressError, ConfigError
 from nedbus.extras import import_optional
-from nedbus.recording import find_format, format_of
+from nedbus.flights import find_format
 from nedbus.transport import Tls
 
-from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, SimulatorOptions
+from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, RecordingOptions, SimulatorOptions
 from .source import LiveSource, ReplaySource, Source
 
 
@@ -40,9 +40,9 @@ class SourceKind:
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "open_simulator"),
-    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "open_ulog"),
-    "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "open_mcap", "mcap"),
-    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "open_tlog", "mavlink"),
+    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.replay", "open_replay"),
+    "mcap": SourceKind(RecordingOptions, "FILE", "nedbus.sources.replay", "open_replay", "mcap"),
+    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.replay", "open_replay", "mavlink"),
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
@@ -111,11 +111,6 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
     if kind.target == "FILE":
         target = re.sub("%(3F|25)", lambda found: unquote(found[0]), target, flags=re.IGNORECASE)
     return SourceSpec(text, kind_name, target, options)
-
-
-def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
-    """Return the source text of a file, such as `ulog:flight.ulg?vehicle=7`; raise ConfigError for other suffixes."""
-    return _join(format_of(path), str(path), {key: value for key, value in options.items() if value})
 
 
 def _text_of_table(table: Mapping[str, object]) -> str:

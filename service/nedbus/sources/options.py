@@ -1,12 +1,13 @@
 """The options of each kind of source, as Pydantic models."""
 
 import re
-from collections.abc import Collection, Mapping, Set
+from collections.abc import Collection, Mapping
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
-from nedbus_msgs import ANY, DEFAULT, MESSAGES, RELEASES, TOPICS, check_vehicle, get_topic
+from nedbus.flights import parse_topics, topics_of
+from nedbus_msgs import DEFAULT, RELEASES, check_vehicle
 
 
 def _parse_vehicles(text: str) -> Mapping[str, str]:
@@ -29,18 +30,7 @@ def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _parse_topics(text: object) -> object:
-    """Parse `TOPIC,TOPIC`; a message name selects all of its topics."""
-    if not isinstance(text, str):
-        return text
-    names = tuple(part.strip() for part in text.split(","))
-    for name in names:
-        if name not in (ANY, *MESSAGES):
-            get_topic(name)
-    return names
-
-
-def _topics_of(name: str) -> Set[str]:
-    return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
+    return parse_topics(text) if isinstance(text, str) else text
 
 
 _Origin = tuple[
@@ -64,14 +54,7 @@ class Options(BaseModel):
     @property
     def chosen_topics(self) -> Collection[str] | None:
         """The topics to deliver, by default the built-in ones; None means all."""
-        if ANY in self.topics:
-            return None
-        return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS
-
-    def absent_from(self, topics: Collection[str], where: str) -> list[str]:
-        """Return a list of at most one warning: the requested topics and messages missing from `topics`."""
-        absent = [name for name in self.topics if name != ANY and _topics_of(name).isdisjoint(topics)]
-        return [f"{where} has no messages of {', '.join(absent)}"] if absent else []
+        return topics_of(self.topics)
 
 
 class ReplayOptions(Options):
@@ -85,9 +68,18 @@ class ReplayOptions(Options):
 
 
 class RecordedOptions(ReplayOptions):
-    """Options of `ulog:`, `mcap:` and `tlog:`."""
+    """Options of `ulog:` and `tlog:`, and of `mcap:`."""
 
     loop: bool = Field(False, description="1 to restart at the end, or 0")
+
+
+class RecordingOptions(RecordedOptions):
+    """Options of `mcap:`."""
+
+    layout: Annotated[str, Field(pattern=_LAYOUTS)] | None = Field(
+        None,
+        description="the PX4 release whose layouts the messages have, if the file names another one",
+    )
 
 
 class SimulatorOptions(ReplayOptions):

@@ -1,72 +1,14 @@
 """The two kinds of sources, replay and live, and the messages they yield."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from nedbus.client import LogStreamStatus
+from nedbus.samples import LogStreamStatus, Rejection, SourceMessage
 from nedbus.transport import Session
-from nedbus.ulog import LoggedStream
-from nedbus_msgs import BY_TOPIC, Address, Definition, Encoded, encode_upgraded
+from nedbus_msgs import Address
 
 from .options import RecordedOptions, SimulatorOptions
-
-
-@dataclass(slots=True)  # not frozen, because that would take four times as long to create
-class SourceMessage:
-    """One message from a source, not yet validated.
-
-    `due`: in a replay, seconds since the start of the recording; of a live message, its arrival, monotonic, or 0.
-    `given`: the fields by name, in any PX4 layout; None for those of a `payload` of the stream `logged`.
-    `lost`: number of messages lost between the vehicle and the source, just before this one.
-    `rebooted`: True for the first message after the vehicle rebooted.
-    `error`: why the message was rejected (`given` is then empty); None if it was decoded.
-    `definition`: message definition; None for the default of the topic.
-    `source`: value of `sample.source`, if it differs from the kind of the source.
-    `dropout`: seconds for which the vehicle's logger recorded nothing, just before this message.
-    """
-
-    due: float
-    address: Address
-    given: Mapping[str, object] | None
-    lost: int = 0
-    rebooted: bool = False
-    error: str | None = None
-    definition: Definition[Any] | None = None
-    source: str | None = None
-    dropout: float = 0.0
-    logged: LoggedStream | None = None
-    payload: bytes = b""
-
-    @property
-    def fields(self) -> Mapping[str, object]:
-        """The fields by name, in any PX4 layout."""
-        if self.given is None:
-            self.given = {} if self.logged is None else self.logged.decode(self.payload)
-        return self.given
-
-    @property
-    def timestamp(self) -> Any:
-        """The value of `timestamp`, None without one."""
-        if self.given is None and self.logged is not None:
-            return self.logged.timestamp(self.payload)[0]
-        return self.fields.get("timestamp")
-
-    def encode(self) -> Encoded:
-        """Validate and encode the message; raise InvalidMessageError."""
-        if self.given is None and self.logged is not None and (encoded := self.logged.encode_valid(self.payload)):
-            return encoded
-        return encode_upgraded(self.definition or BY_TOPIC[self.address.topic], self.fields)
-
-
-@dataclass(frozen=True, slots=True)
-class Rejection:
-    """Input that a live source could not convert; each `where` (key, link or address) is logged once."""
-
-    where: str
-    reason: str
-    address: Address | None = None
-    count: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +49,7 @@ class ReplayRun:
     """
 
     messages: Iterator[SourceMessage]
-    addresses: dict[Address, Definition[Any] | None]
+    addresses: MutableMapping[Address, Any]
     total: int | None
     summary: str
     warnings: tuple[str, ...] = ()

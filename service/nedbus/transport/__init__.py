@@ -1,6 +1,7 @@
 """Zenoh transport: sessions, routers, TLS, queries, liveliness tokens, and the keys of rmw_zenoh."""
 
-from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
+from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
+
 from .liveliness import LivelinessTokens, query_tokens, token_keys
 from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (

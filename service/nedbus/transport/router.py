@@ -14,11 +14,11 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
+from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
-from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .queries import query
 from .session import COMMON_SETTINGS, Session, error_reason, insert_settings, open_session, random_backoff
 from .tls import Tls

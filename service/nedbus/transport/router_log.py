@@ -16,9 +16,9 @@ from typing import Final
 
 import zenoh
 
+from nedbus.endpoints import split_endpoint
 from nedbus.log_event import about
 
-from .endpoints import split_endpoint
 from .session import Session
 from .tls import Tls
 

@@ -15,10 +15,10 @@ from typing import Final
 
 import zenoh
 
+from nedbus.endpoints import check_endpoints, resolution_error
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 from nedbus.timings import TIMINGS
 
-from .endpoints import check_endpoints, resolution_error
 from .tls import Tls
 
 Session = zenoh.Session

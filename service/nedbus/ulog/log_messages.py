@@ -25,7 +25,6 @@ _LAYOUT: Final = PayloadLayout(tuple(PayloadField(a, field_type(b), c) for a, b,
 LOG_MESSAGE: Final = Subscription(-1, 0, "log_message", _LAYOUT)
 """Subscription of the messages that `LogMessageBuilder` generates."""
 
-_TOPICS: Final = ("", "event", "vehicle_status")
 _INFO: Final = 6
 _PROTOCOL: Final = 8  # lowest log level of events meant for ground stations, not for display
 _ALL_MODES: Final = 2**32 - 1
@@ -205,6 +204,9 @@ class LogMessageBuilder:
     `problem`: why the event metadata is unusable; "" if it is usable.
     """
 
+    TOPICS: Final = ("event", "vehicle_status")
+    """The topics that it needs."""
+
     def __init__(self) -> None:
         self.limit = RateLimit()
         self.problem = ""
@@ -223,7 +225,7 @@ class LogMessageBuilder:
             name = record.subscription.name if isinstance(record, Data) else ""
             if name != LOG_MESSAGE.name:  # PX4 may also log the topic itself
                 yield record
-            if name not in _TOPICS:
+            if name and name not in self.TOPICS:
                 continue
             with suppress(LookupError, TypeError, ValueError, struct.error):  # the topic may have other fields
                 if (text := self._read(record)) and self.limit.admits(text.timestamp):

@@ -2,7 +2,7 @@
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from typing import Final, Literal, NamedTuple
@@ -56,20 +56,22 @@ class UlogParser:
 
     `verify`: return a message only if a valid record follows it, and resynchronise after damage; for files, which have
     no checksums. Without it, the lengths are trusted, and less than 65 KiB held; for transports with checksums.
+    `topics`: those whose data messages are returned, None for all; others are only checked.
     `subscriptions`: the current ones with a decodable format, by message id.
     `undecodable`: number of data messages without a matching subscription; `mismatched`: those of another length.
     """
 
-    def __init__(self, *, verify: bool) -> None:
+    def __init__(self, *, verify: bool, topics: Collection[str] | None = None) -> None:
         self.undecodable = self.mismatched = 0
-        self._verify = verify
+        self._verify, self._topics = verify, topics
         self._is_readable = True
         self._formats = Formats()
         self.subscriptions: dict[int, Subscription] = {}
         self._ended: dict[tuple[str, int], list[Subscription]] = {}  # by topic and instance
         self._count = 0  # of subscriptions that do not continue an ended one
-        self._known: dict[bytes, tuple[Subscription, int, int]] = {}
-        """By the first five bytes of a data message: its subscription, its length, and the length without padding."""
+        self._known: dict[bytes, tuple[Subscription | None, int, int]] = {}
+        """By the first five bytes of a data message: its subscription (None: not returned), its length, and the length
+        without padding."""
         self._buffer = b""
         self._sync = -1  # position in the buffer of the next sync, or the end; before the current record if unknown
         self._offset = 0  # offset of the buffer in the log
@@ -158,7 +160,8 @@ class UlogParser:
             stop = at + length
             found = None if at < mark < stop else known.get(buffer[stop : stop + _DATA_HEADER])
             if found is not None:
-                records.append(make(Data, (subscription, buffer[at + _DATA_HEADER : at + used])))
+                if subscription is not None:
+                    records.append(make(Data, (subscription, buffer[at + _DATA_HEADER : at + used])))
                 at = stop
         return at
 
@@ -281,7 +284,8 @@ class UlogParser:
                 reason = str(exc)
         elif inspected.validity == "valid":
             subscription, _, used = self._known[self._buffer[at : at + _DATA_HEADER]]
-            self._records.append(Data(subscription, self._buffer[at + _DATA_HEADER : at + used]))
+            if subscription is not None:
+                self._records.append(Data(subscription, self._buffer[at + _DATA_HEADER : at + used]))
         elif kind == ord("D"):
             self.undecodable += 1
             message_id = int.from_bytes(self._buffer[at + _HEADER : at + _DATA_HEADER], "little")
@@ -322,9 +326,9 @@ class UlogParser:
             self._count += 1
             self._records.append(subscription)
         self.subscriptions[new.message_id] = subscription
-        used = subscription.layout.size + _DATA_HEADER
+        used, is_returned = subscription.layout.size + _DATA_HEADER, self._topics is None or new.name in self._topics
         for length, head in _heads(new.message_id, subscription.layout):
-            self._known[head] = subscription, length, used
+            self._known[head] = subscription if is_returned else None, length, used
 
     def _unsubscribe(self, message_id: int) -> None:
         old = self.subscriptions.pop(message_id, None)

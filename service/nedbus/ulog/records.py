@@ -215,6 +215,8 @@ class LoggedStream:
         """Return the timestamp of a message [us], or None if it has none, in a tuple."""
         if at is not None:
             self.timestamp = struct.Struct(f"<{at}xQ").unpack_from
+        self.lacking = self.strict_bools = frozenset[str]()
+        self.head = b""
         self.omitted: dict[str, str] = {}
         """Warnings for fields left out because a value does not fit the target type, by field name."""
 
@@ -224,6 +226,14 @@ class LoggedStream:
         layout = self.subscription.layout
         types = {name: kind for name, kind, _ in layout.fields}
         return record_encoder(self.definition, types, layout.unpack)
+
+    @property
+    def dtype(self) -> Any:
+        """Argument for `numpy.dtype` that describes a payload."""
+        return self.subscription.layout.dtype
+
+    def check(self, _: bytes) -> None:
+        """Return None: the parser has checked the size of each message."""
 
     def decode(self, payload: bytes) -> dict[str, Any]:
         """Decode a message; leave out fields whose value does not fit their target type."""

@@ -14,9 +14,9 @@ from bokeh.models.widgets import Select, Slider, Toggle
 from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import EventLog, Times, state_at
+from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, MergedFlights, follow, times_of
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.sources import MAX_FILE_EVENTS, Flights, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .event_timeline import EventTimeline
@@ -48,7 +48,7 @@ class Recording:
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
-        self._flights = Flights(paths)
+        self._flights = MergedFlights(paths, EVENT_OPTIONS)
         self.indices: dict[Address, list[int]] = {}  # in `entries`, by stream
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
@@ -60,7 +60,7 @@ class Recording:
     def _read(self) -> None:
         flights, event_log = self._flights, self.timeline.event_log
         try:
-            self.timeline.times = flights.times
+            self.timeline.times = times_of(flights)
             for message, reason, payload in follow(flights.messages(), event_log, ended=flights.ended):
                 address, stamp = message.address, message.timestamp or 0
                 entry: bytes | str | int = stamp if reason is None else reason

@@ -12,7 +12,7 @@ def fail(*_: object, **__: object) -> None:
     raise EOFError("marshal data too short")
 
 
-@pytest.mark.parametrize("function", ["nedbus.cli.options.load_settings", "nedbus.cli.app.log_to_stderr"])
+@pytest.mark.parametrize("function", ["nedbus.settings.load_settings", "nedbus.cli.app.log_to_stderr"])
 def test_end_of_data_names_the_cause(monkeypatch: pytest.MonkeyPatch, function: str) -> None:
     """An EOFError, as of truncated bytecode, is one line with a remedy."""
     monkeypatch.setattr(function, fail)
@@ -25,7 +25,7 @@ def test_end_of_data_names_the_cause(monkeypatch: pytest.MonkeyPatch, function: 
 
 def test_end_of_data_with_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     """With --debug, an EOFError shows where it was raised."""
-    monkeypatch.setattr("nedbus.cli.options.load_settings", fail)
+    monkeypatch.setattr("nedbus.settings.load_settings", fail)
     ended = run_command("--debug", "health")
     assert ended.exit_code == 1
     assert "in fail\n" in ended.err

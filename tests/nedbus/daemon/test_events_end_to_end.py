@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser
 
 import nedbus
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
 from nedbus_msgs import BY_TOPIC, Address, Provenance
 from nedbus_msgs.arrays import arrays_of
 from tests.flights.messages import VALID, VLP

@@ -17,7 +17,6 @@ from pyulog import ULog
 
 import nedbus
 from nedbus.client import LogStreamStatus
-from nedbus.recording import Flight
 from nedbus.timings import Timings
 from nedbus.ulog import Data, UlogParser
 from tests.peers.command_line import run_command
@@ -82,7 +81,7 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
         service.signal(signal.SIGTERM)
         assert service.wait() == 0, service.err
         assert [each for each in peer.commands if each in (START, STOP)][-1] == STOP
-    with Flight(saved, topics=None) as flight:
+    with nedbus.open(saved) as flight:
         assert {address.topic for address in flight.addresses} >= {"vehicle_local_position", "event"}
 
 

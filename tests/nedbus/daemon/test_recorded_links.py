@@ -8,7 +8,7 @@ from typing import Final
 import pytest
 
 from nedbus.events import report_of, verdict_of
-from nedbus.sources import read_file_events
+from nedbus.flights import read_file_events
 from tests.flights.recorded_link import Service
 from tests.flights.ulogs import LOGS
 

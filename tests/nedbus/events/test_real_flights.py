@@ -18,7 +18,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.events import Event, EventLog, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
-from nedbus.sources import FileEvents
+from nedbus.flights import FileEvents
 from nedbus_msgs import ResetTracker
 from nedbus_msgs.frames import wrap
 from tests.flights import ulogs

@@ -14,7 +14,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ConfigError
-from nedbus.recording import RecordingWriter, find_utc
+from nedbus.flights import RecordingWriter, find_utc
 from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message

@@ -15,7 +15,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, McapRecord
 from mcap.writer import MCAP0_MAGIC
 
 import nedbus
-from nedbus.recording.mcap_reader import RecordingReader
+from tests.flights.replays import open_recording
 from tests.peers.processes import Start
 
 _SECONDS: Final = 5  # they need 0.7 s
@@ -27,12 +27,13 @@ _READ: Final = """
 import sys
 from pathlib import Path
 import nedbus
-from nedbus.recording import mcap_chunks, mcap_reader
-mcap_chunks._MAX_BLOCK = mcap_reader._SCHEMA_BUDGET = LIMIT
+from pathlib import Path
+from nedbus.flights.readers import ReadOptions, mcap, mcap_chunks
+mcap_chunks._MAX_BLOCK = mcap._SCHEMA_BUDGET = LIMIT
 peak = lambda: int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])  # [KiB]
 before = peak()
 try:
-    mcap_reader.RecordingReader(sys.argv[1], vehicle="1")
+    mcap.McapReader(Path(sys.argv[1]), ReadOptions(topics=None))
 except nedbus.SourceError as exc:
     print(exc)
 print(1024 * (peak() - before))
@@ -122,5 +123,5 @@ def test_index_with_many_schemas_is_read_in_linear_time(tmp_path: Path) -> None:
         file.write(MCAP0_MAGIC)
     begin = time.process_time()
     with pytest.raises(nedbus.SourceError, match="no messages"):
-        RecordingReader(path, vehicle="1")
+        open_recording(path)
     assert time.process_time() - begin < _SECONDS

@@ -18,12 +18,14 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.recording import RecordingReader, RecordingWriter
+from nedbus.flights import RecordingWriter
+from nedbus.flights.readers import ReadOptions
+from nedbus.flights.readers.mcap import McapReader
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
 from tests.flights.local_position import ROS2_TYPE, downgrade, encode_cdr, message_definition
 from tests.flights.messages import VLP, message
-from tests.flights.replays import open_replay
+from tests.flights.replays import open_recording, open_replay
 from tests.nedbus.sources.test_damage import payloads_of
 from tests.peers.command_line import run_command
 
@@ -187,11 +189,11 @@ def test_all_variants_of_mcap_are_read_completely(
         path.write_bytes(data)
         expected = [each.log_time for schema, _, each in NonSeekingReader(BytesIO(data)).iter_messages() if schema]
         assert len(expected) == 7, options
-        with RecordingReader(path, vehicle="1") as reader:
+        with open_recording(path) as reader:
             assert sum(reader.counts.values()) == len(expected), options
-            assert [each.logged for each in reader.messages()] == expected, options
-            one = [each.logged for each in reader.messages([Address("1", "second_topic")])]
-            assert one == [1, 4, 7], options
+            assert [each.time for each in reader.records()] == [each // 1000 for each in expected], options
+        with McapReader(path, ReadOptions(topics={"second_topic"})) as reader:
+            assert len(list(reader.records())) == 3, options
             assert not reader.warnings, options
 
 
@@ -235,8 +237,8 @@ def test_damaged_summary_is_not_used(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[data.rindex(b"alpha")] ^= 1
     path.write_bytes(data)
-    with RecordingReader(path, vehicle="1") as reader:
-        assert [each.address for each in reader.messages()] == [address]
+    with open_recording(path) as reader:
+        assert [each.stream.address for each in reader.records()] == [address]
         assert reader.warnings == ["the index is damaged; reading without it"]
         assert not reader.damaged
 
@@ -346,7 +348,7 @@ def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
         nedbus.read(path)
-    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_BLOCK", 2**20)
+    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_BLOCK", 2**20)
     path.write_bytes(zstandard.compress(bytes(2**21)))
     with pytest.raises(SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"):
         nedbus.read(path)

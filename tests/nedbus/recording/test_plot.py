@@ -40,9 +40,7 @@ def drawn(
     streams: Sequence[tuple[Address, MessageArray]], events: Sequence[Event] = (), times: Times | None = None
 ) -> dict[str, Any]:
     """Return the axes of a plot, by name."""
-    plot = pytest.importorskip(
-        "nedbus.recording.plot", exc_type=ImportError
-    )  # imported late: Matplotlib takes a second
+    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)  # imported late: Matplotlib takes a second
     figure = plot.draw_figure(streams, title="a flight", events=events, times=times or Times())
     figure.draw_without_rendering()
     return {str(axes.get_label()): axes for axes in figure.axes}

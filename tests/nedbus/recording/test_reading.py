@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus import recording
+from nedbus import tables
 from nedbus.errors import AddressError, ArgumentError, ConfigError, SourceError
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
+from nedbus.flights.readers.mcap import McapReader
 from nedbus_msgs import DEFAULT, Address, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from nedbus_msgs.frames import MapProjection
@@ -145,8 +146,8 @@ def test_missing_package_error_contains_the_pip_command(flight: Path, monkeypatc
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed; run pip install pandas"):
         nedbus.read(flight, dataframe="pandas")
-    for name in ("mcap_reader", "mcap_chunks"):
-        monkeypatch.delitem(sys.modules, f"nedbus.recording.{name}")
+    for name in ("mcap", "mcap_chunks"):
+        monkeypatch.delitem(sys.modules, f"nedbus.flights.readers.{name}")
     monkeypatch.setitem(sys.modules, "mcap.records", None)
     with pytest.raises(ConfigError, match=r"^mcap: not installed; .*pip install .*\[mcap\]'$"):
         nedbus.read(flight)
@@ -189,7 +190,7 @@ def count_pixels(pixels: np.ndarray, color: str) -> int:
 def texts_of(streams: list[tuple[Address, np.ndarray]], path: Path, *, title: str = "") -> list[str]:
     """Plot to an SVG file, and return its texts."""
     with pytest.importorskip("matplotlib").rc_context({"path.simplify": False, "svg.fonttype": "none"}):
-        recording.draw(streams, path, title=title)
+        tables.draw(streams, path, title=title)
     return re.findall(r"<text[^>]*>([^<]*)</text>", path.read_text())
 
 
@@ -342,13 +343,13 @@ def test_reading_several_topics_reads_the_file_once(tmp_path: Path, monkeypatch:
     path = tmp_path / "flight.mcap"
     convert_replay("sim:?duration=20", path)
     passes: list[object] = []
-    read = recording.RecordingReader.messages
+    read = McapReader.records
 
     def read_and_count(*arguments: Any) -> Iterator[Any]:
         passes.append(arguments)
         return read(*arguments)
 
-    monkeypatch.setattr(recording.RecordingReader, "messages", read_and_count)
+    monkeypatch.setattr(McapReader, "records", read_and_count)
     assert len(nedbus.read(path, ["*"], dataframe="pandas")) > 10
     assert len(passes) == 1
 
@@ -389,7 +390,7 @@ def test_ground_truth_recipe_measures_the_error(
         (
             "flight.mcap -v 9",
             2,
-            "vehicle '9' is not in flight.mcap: expected one of 1/battery_status/0, 1/est",
+            "vehicle '9' is not in flight.mcap: expected one of 1/estimator_local_position/0, 1/est",
         ),
         ("flight.mcap -o a.foo", 2, "a.foo: not an image format; the name must end with .png or .svg or .pdf"),
         ("flight.mcap -o /dev/full", 2, "/dev/full: not an image format; the name must end with .png or .svg or .pdf"),

@@ -19,11 +19,12 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import nedbus
+from nedbus import Batch
 from nedbus.cli.follow import write_notice
-from nedbus.client import Batch, Subscription
+from nedbus.client import Recorder, Subscription
 from nedbus.errors import NoDataError, SourceError
-from nedbus.recording import Recorder, RecordingReader, RecordingWriter, mcap_writer
-from nedbus.sources import ReplayRun, SourceMessage, convert
+from nedbus.flights import RecordingWriter, convert
+from nedbus.sources import ReplayRun, SourceMessage
 from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition
@@ -31,7 +32,7 @@ from nedbus_msgs.arrays import arrays_of, to_array
 from nedbus_msgs.messages import LogMessage
 from tests.flights.local_position import LAYOUTS, ROS2_TYPE, downgrade, encode, encode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message
-from tests.flights.replays import convert_replay, open_replay
+from tests.flights.replays import convert_replay, open_recording, open_replay
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
 from tests.peers.processes import ForkServer, Start, without_coverage
@@ -91,8 +92,8 @@ def test_channels_of_a_vehicle_are_limited(
 
     Its further messages are left out, counted, and logged once; those of its known channels are recorded.
     """
-    monkeypatch.setattr(mcap_writer, "_MAX_CHANNELS", 2)
-    monkeypatch.setattr(mcap_writer, "_MAX_ALL_CHANNELS", 3)
+    monkeypatch.setattr("nedbus.flights.writer._MAX_CHANNELS", 2)
+    monkeypatch.setattr("nedbus.flights.writer._MAX_ALL_CHANNELS", 3)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         for vehicle, source in (("7", "a"), ("7", "b"), ("7", "c"), ("7", "d"), ("8", "a"), ("9", "a"), ("7", "a")):
@@ -214,7 +215,7 @@ def test_messages_between_flushes_do_not_fill_the_memory(tmp_path: Path) -> None
         for _ in range(16):  # 2 MB that can hardly be compressed
             rows["data"] = noise.random((550, 440))
             writer.write(rows, blob, streams, logged=times, published=times)
-        with RecordingReader(path, vehicle="1") as reader:
+        with open_recording(path) as reader:
             assert sum(reader.counts.values()) > 16 * 550 / 4
 
 
@@ -229,9 +230,9 @@ def test_truncated_file_is_read_up_to_the_cut(tmp_path: Path) -> None:
     counts = []
     for size in range(3000, len(data), 97):
         truncated.write_bytes(data[:size])
-        with RecordingReader(truncated, vehicle="1") as reader:
+        with open_recording(truncated) as reader:
             counts.append(sum(reader.counts.values()))
-            assert len(list(reader.messages())) == counts[-1]
+            assert len(list(reader.records())) == counts[-1]
     assert counts == sorted(counts)
     assert counts[-1] == 10
 
@@ -311,7 +312,7 @@ LIMITED = """
 import resource, sys
 sys.dont_write_bytecode = True  # the interpreter would leave truncated bytecode in the checkout, without an error
 if "plot" in sys.argv:
-    import nedbus.recording.plot  # may write a cache of fonts
+    import nedbus.tables.plot  # may write a cache of fonts
 size = int(sys.argv.pop(1))
 resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 """
@@ -324,7 +325,7 @@ main()
 FILL = """
 import math
 from pathlib import Path
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
 from tests.flights.messages import message
 from tests.nedbus.recording.test_recorder import write
 
@@ -533,7 +534,7 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
     strange = [{"timestamp": 2**64 - 1}, {"timestamp": 2, "xy_valid": True}]
     messages = [SourceMessage(0.0, ADDRESS, each) for each in [{"timestamp": 1}] * 2998 + strange]
     run = ReplayRun(iter(messages), {}, None, "")
-    assert convert(run, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
+    assert convert(run.messages, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
     assert [each.timestamp for *_, each in read_independently(path)] == [1] * 2998 + [2**64 - 1]
     assert done == [1024, 2048]
 
@@ -564,8 +565,8 @@ def test_private_and_unknown_records_are_skipped(tmp_path: Path) -> None:
             parts.append(b"\x90\x05" + bytes(7) + b"hello\x30\x03" + bytes(7) + b"new")
         at = end
     extended.write_bytes(content[:8] + b"".join(parts) + content[at:])
-    with RecordingReader(extended, vehicle="1") as reader:
-        reader.check()
+    with open_recording(extended) as reader:
+        list(reader.records())
         assert (reader.damaged, sum(reader.counts.values())) == (False, 10_000)
         assert not [warning for warning in reader.warnings if "skipped" in warning]
 

@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import read_file_events
+from nedbus.flights import read_file_events
 from nedbus.web.playback import Recording
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter

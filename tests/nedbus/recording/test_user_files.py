@@ -10,7 +10,8 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import FileEvents, parse_source, read_file_events
+from nedbus.flights import FileEvents, read_file_events
+from nedbus.sources import parse_source
 from tests.flights.messages import VLP
 from tests.flights.replays import convert_replay, open_replay
 from tests.peers.command_line import run_command

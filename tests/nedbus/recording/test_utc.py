@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.recording import RecordingWriter
-from nedbus.sources import read_file_events
+from nedbus.flights import RecordingWriter, read_file_events
 from nedbus_msgs import DEFAULT_TOPIC, Address, Provenance, is_unix_time
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay

@@ -27,17 +27,16 @@ _STOP: Final = 3.0  # s; it needs less than 1 s
 _READ: Final = """
 import resource, sys
 from pathlib import Path
-import nedbus, nedbus.cli.app, nedbus.sources, nedbus.web.playback
-from nedbus.recording import plot
+import nedbus, nedbus.cli.app, nedbus.flights, nedbus.sources, nedbus.web.playback
+from nedbus.tables import plot
 from nedbus.sources.options import RecordedOptions
 path = Path(sys.argv[1])
-for module in ("nedbus.sources.mcap", "nedbus.recording.mcap_writer"):
+for module in ("nedbus.flights.readers.mcap", "nedbus.flights.writer"):
     __import__(module)
 
 def convert():
-    replay = nedbus.sources.parse_source(nedbus.sources.source_text_of_file(path, topics="*")).open_source(vehicle="1")
-    target = path.with_name("converted.mcap")
-    nedbus.sources.convert(replay.open(), target, source="ulog", on_progress=lambda _: None)
+    with nedbus.flights.MergedFlights([path], nedbus.flights.ReadOptions(topics=None)) as flights:
+        nedbus.flights.convert(flights.messages(), path.with_name("converted.mcap"), on_progress=lambda _: None)
 
 def play():
     recording = nedbus.web.playback.Recording(path)
@@ -46,7 +45,7 @@ def play():
 
 uses = [
     lambda: nedbus.read(path, ["*"]), lambda: nedbus.align(path, on=10.0), lambda: nedbus.utc_of(path),
-    lambda: nedbus.sources.read_file_events(path), convert, play,
+    lambda: nedbus.flights.read_file_events(path), convert, play,
 ]
 resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -95,7 +94,7 @@ LIMITS: Final[dict[str, tuple[Callable[[], Iterable[str]], str]]] = {
 @pytest.mark.parametrize("kind", LIMITS)
 def test_recording_beyond_a_limit_has_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """A recording whose definitions exceed a limit reports it; here the limit for all definitions is an eighth."""
-    monkeypatch.setattr("nedbus.recording.mcap_reader._DEFINITION_BUDGET", 2000)
+    monkeypatch.setattr("nedbus.flights.readers.mcap._DEFINITION_BUDGET", 2000)
     make, reason = LIMITS[kind]
     path = tmp_path / "limits.mcap"
     _mcap(make(), path)

@@ -12,7 +12,7 @@ from bokeh.models import DatetimeTickFormatter, HBar
 
 from nedbus.errors import NedbusError
 from nedbus.events import Event, Span
-from nedbus.recording import RecordingWriter
+from nedbus.flights import RecordingWriter
 from nedbus.web.fleet import TRUTH
 from nedbus.web.playback import Player, Recording
 from nedbus.web.style import DARK

@@ -6,21 +6,41 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from nedbus import clock
-from nedbus.cli.follow import follow
-from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, allow_one, command
+from nedbus.cli.options import (
+    CsvOption,
+    DurationOption,
+    FilesArgument,
+    JsonOption,
+    OpenBus,
+    VehicleOption,
+    allow_one,
+    command,
+)
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, format_duration
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import SEVERITIES, WINDOW, Event, Story, Times, Verdict, by_vehicle, report_of, verdict_of
-from nedbus.monitoring import Observer
-from nedbus.sources import FileEvents, read_file_events
+from nedbus.events import (
+    SEVERITIES,
+    WINDOW,
+    Event,
+    Story,
+    Times,
+    Verdict,
+    by_vehicle,
+    format_duration,
+    report_of,
+    verdict_of,
+)
+from nedbus.flights import FileEvents, read_file_events
 from nedbus_msgs import ANY, Selection, check_vehicle
+
+if TYPE_CHECKING:
+    from nedbus.client import Bus
 
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
@@ -34,7 +54,7 @@ _DAY: Final = 86_400.0
 
 @command
 def events(
-    open_bus: Callable[[], Bus],
+    open_bus: OpenBus,
     files: FilesArgument = None,
     *,
     vehicle: VehicleOption = ANY,
@@ -98,7 +118,7 @@ def events(
 
 @command
 def why(
-    open_bus: Callable[[], Bus],
+    open_bus: OpenBus,
     files: FilesArgument = None,
     *,
     vehicle: VehicleOption = ANY,
@@ -194,7 +214,12 @@ def _before(event: Event, time: float) -> str:
     return f"{_shown(event)} ({format_duration(max(0.0, time - event.time))} before)"
 
 
-def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
+def _follow(
+    bus: "Bus", selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None
+) -> None:
+    from nedbus.cli.follow import follow
+    from nedbus.monitoring import Observer
+
     observer, seen = Observer(bus, selection), 0
     known: set[str] = set()
 

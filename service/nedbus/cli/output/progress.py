@@ -5,8 +5,7 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Final
@@ -53,18 +52,6 @@ def log_progress(daemon: Daemon) -> Iterator[None]:
                 text += f", {status.lost} lost" if status.lost else ""
                 text += f" (gone: {', '.join(status.stale)})" if status.stale else ""
                 _log.info("%s: %s", name, text, extra=about("progress", source=name))
-
-
-@contextmanager
-def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
-    """Yield a function that shows a label, the number done and the total; it does nothing without a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    columns = TextColumn("{task.description}", markup=False), BarColumn(bar_width=24)
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task("", total=None)
-        yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)
 
 
 def suggested_commands(endpoints: Sequence[str]) -> str:

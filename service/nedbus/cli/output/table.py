@@ -102,3 +102,15 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
             yield show
     finally:
         console.show_cursor()  # a signal may have arrived while the cursor was being hidden
+
+
+@contextmanager
+def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
+    """Yield a function that shows a label, the number done and the total; it does nothing without a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = TextColumn("{task.description}", markup=False), BarColumn(bar_width=24)
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)

@@ -1,4 +1,4 @@
-"""Batch: a NumPy array of messages with the address, time and sequence number of each."""
+"""Batches of received messages."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,38 +7,19 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from nedbus_msgs import DEFAULT, Address, Message, Provenance, codec_of, provenance_of
-from nedbus_msgs.arrays import MessageArray, arrays_of
+from nedbus.samples import Batch
+from nedbus_msgs import DEFAULT, Provenance, codec_of, provenance_of
+from nedbus_msgs.arrays import arrays_of
 
 from .arrival import Arrival, encoding_of
 from .decoder import Decoder
 
 
 @dataclass(eq=False)
-class Batch:
-    """Valid messages of one type, in order of arrival; `subscription.batches()` yields them.
+class ReceivedBatch(Batch):
+    """Valid messages of one type from a bus, in order of arrival."""
 
-    `messages`: structured array of shape (n,), one column per field: `messages["x"]`.
-    `message`: type of the messages.
-    `addresses`: distinct addresses. `address_index`: index into `addresses` for each message.
-    `lost`: messages lost in transit before this batch, over all addresses.
-    """
-
-    messages: MessageArray
-    message: type[Message]
-    addresses: tuple[Address, ...]
-    address_index: npt.NDArray[np.intp]
-    lost: int
     _arrivals: Sequence[Arrival] = field(repr=False)
-
-    def __len__(self) -> int:
-        return len(self.messages)
-
-    def of(self, address: Address) -> MessageArray:
-        """Return the messages of one address."""
-        index = self.addresses.index(address) if address in self.addresses else -1
-        chosen: MessageArray = self.messages[self.address_index == index]
-        return chosen
 
     @cached_property
     def received(self) -> npt.NDArray[np.int64]:
@@ -64,7 +45,7 @@ class Batch:
         return [provenance_of(definition, encoding_of(each.stream, each.raw)) for each in self._arrivals]
 
 
-def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
+def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> ReceivedBatch:
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
     arrivals = decoder.define(arrivals)
     codec = arrivals[0].codec
@@ -86,4 +67,4 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     addresses = {arrival.stream.key: arrival.stream.address for arrival in arrivals}
     indices = {key: index for index, key in enumerate(addresses)}
     address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
-    return Batch(messages, definition.model, tuple(addresses.values()), address_index, lost, arrivals)
+    return ReceivedBatch(messages, definition.model, tuple(addresses.values()), address_index, lost, arrivals)

@@ -12,9 +12,9 @@ import zenoh
 
 from nedbus import clock
 from nedbus.client.protocol import LIVE
-from nedbus.client.sample import Sample
 from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
+from nedbus.samples import Sample
 from nedbus.transport import RawSample
 from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, codec_of, identity_of, provenance_of
 

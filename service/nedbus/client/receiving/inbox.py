@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from nedbus import clock
-from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.errors import ArgumentError, ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
+from nedbus.samples import Counts, Mode, Sample
 from nedbus.transport import RawSample
 from nedbus_msgs import AddressError, DecodeError
 
@@ -32,7 +32,7 @@ from .unread import CAPACITY, Unread
 from .writer_proxy import LossCounters, WriterProxy
 
 if TYPE_CHECKING:
-    from .batch import Batch
+    from nedbus.samples import Batch
 
 _log = logging.getLogger(__name__)
 

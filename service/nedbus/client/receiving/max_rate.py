@@ -14,9 +14,9 @@ import zenoh
 
 from nedbus.client.protocol import LIVE
 from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
-from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
+from nedbus.samples import Mode
 from nedbus.timings import TIMINGS
 from nedbus.transport import LivelinessTokens, RawSample, Session, send_query
 from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic

@@ -17,7 +17,6 @@ from typing import Any, Final, NamedTuple
 from nedbus import clock
 from nedbus.errors import ConfigError, SourceError
 
-AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 Peer = Any  # remote address, as returned by the socket
 
 _CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect causes 1, a reordered packet 2 more
@@ -175,13 +174,6 @@ def _wait(file: Any, timeout: float, events: int = 0) -> int:
     poll = select.poll()  # unlike select(), without a limit on file descriptors
     poll.register(file, select.POLLIN | events)
     return next((found for _, found in poll.poll(timeout * 1000)), 0)
-
-
-def ignore_reason(system: int, component: int) -> str:
-    """Return why the messages of a sender are ignored; "" for an autopilot."""
-    if not (system and component):
-        return "id 0 is for broadcast only; an autopilot has system id 1 to 255 and component id 1"
-    return "" if component == AUTOPILOT else f"not an autopilot, which has component id {AUTOPILOT}"
 
 
 class DuplicateIds:

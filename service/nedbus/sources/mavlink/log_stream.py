@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from nedbus import clock, ulog
-from nedbus.client import LogStreamStatus
 from nedbus.errors import OutputError
 from nedbus.log_event import about
+from nedbus.mavlink import Chunk
+from nedbus.samples import LogStreamStatus, Rejection, SourceMessage
 from nedbus.sources.options import MavlinkOptions
-from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .log_client import LogStatus, LogStreamClient
-from .log_reassembly import Chunk
 from .saved_stream import StreamFile
 
 _log = logging.getLogger(__name__)

@@ -6,13 +6,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from threading import Condition
-from typing import Any, Final, NamedTuple
+from typing import Final
 
+from nedbus.mavlink import Chunk, Received
 from nedbus.sources.source import LinkLoad, Rejection
 from nedbus.timings import TIMINGS
-
-from .link import Peer
-from .log_reassembly import Chunk
 
 _MAX_WAITING: Final = 16_384  # messages of all vehicles; beyond it the oldest of the longest queue is dropped
 _FRESH: Final = 0.2  # s; of the messages behind one that waited too long, those that waited longer are dropped, too
@@ -21,35 +19,6 @@ _MEMORY: Final = 5.0  # s without a late or dropped message until the overload h
 _MAX_READ: Final = 100  # messages per call of `read`
 _MAX_READ_TIME: Final = 0.1  # s per call of `read`
 _MAX_REJECTIONS: Final = 1000  # different ones that wait
-
-
-class Received(NamedTuple):
-    """A message of an autopilot. `time`: arrival, monotonic [s]; `lost`: messages lost before it; `chunk`: ULog data.
-
-    `sequence`: MAVLink's. A late message, which was counted as lost, has `lost` -1.
-    `parts`: number of messages whose ULog data was joined.
-    """
-
-    message: Any
-    system: int
-    sequence: int
-    peer: Peer
-    time: float
-    lost: int = 0
-    chunk: Chunk | None = None
-    parts: int = 1
-
-    def continues(self, before: "Received") -> bool:
-        """Return whether this message has ULog data that directly follows the data of an earlier one.
-
-        Acknowledged data is never joined, because it may wait longer.
-        """
-        one, two = before.chunk, self.chunk
-        if one is None or two is None or two.begins or two.lost or self.lost or self.peer != before.peer:
-            return False
-        if not one.verdict == two.verdict == "delivered":
-            return False
-        return {before.message.get_type(), self.message.get_type()} == {"LOGGING_DATA"}
 
 
 def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:

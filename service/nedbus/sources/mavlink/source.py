@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
+from nedbus.mavlink import AUTOPILOT, CONVERSIONS, Received, Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import LiveItem, Rejection, SourceMessage
 from nedbus.timings import TIMINGS
@@ -18,13 +19,10 @@ from nedbus.transport import Session
 from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .fields import CONVERSIONS
-from .link import AUTOPILOT, DuplicateIds, Link, Peer, open_link, parse_link
+from .link import DuplicateIds, Link, Peer, open_link, parse_link
 from .log_stream import LogStream
 from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
-from .receive_queue import Received
 from .saved_stream import StreamFile, state_path
-from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +111,9 @@ class _LinkSession:
         message, system, now, chunk = received.message, received.system, received.time, received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options, baud=self._link.baud)
+            options, name = self._options, self._name_of(system)
+            vehicle = Vehicle(name, options.chosen_topics, rate=options.rate, baud=self._link.baud)
+            self._vehicles[system] = vehicle
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))

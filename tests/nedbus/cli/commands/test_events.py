@@ -19,7 +19,7 @@ import pytest
 import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
-from nedbus.sources import read_file_events, source_text_of_file
+from nedbus.flights import format_of, read_file_events
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, cached_events
@@ -228,7 +228,7 @@ def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
 
 def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Above the limit only the most recent events are shown, and stderr states the total."""
-    monkeypatch.setattr("nedbus.sources.file_events.MAX_FILE_EVENTS", 2000)
+    monkeypatch.setattr("nedbus.flights.events.MAX_FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
     for second in range(2200):
@@ -479,4 +479,4 @@ def test_file_suffix_is_case_insensitive(log: Path, tmp_path: Path) -> None:
         assert run_command("events", str(path)).out == run_command("events", str(log)).out
         assert run_command("why", str(path)).exit_code == 0
         assert nedbus.addresses_of(path) == nedbus.addresses_of(log)
-        assert str(path) in str(source_text_of_file(path))
+        assert format_of(path) in ("ulog", "mcap")

@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.cli import follow
-from nedbus.cli.app import app
+from nedbus.cli.app import make_app
 from nedbus.cli.commands.pki import pki
 from nedbus.client import Subscription
 from nedbus.settings import Settings
@@ -27,7 +27,7 @@ from tests.peers.ports import free_endpoint
 from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import DEADLINE, wait_for
 
-COMMANDS = [str(each.name) for each in app.registered_commands]
+COMMANDS = [str(each.name) for each in make_app().registered_commands]
 COMMANDS += [f"pki {each.name or getattr(each.callback, '__name__', None)}" for each in pki.registered_commands]
 
 
@@ -213,7 +213,7 @@ def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.Mo
     def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
         return nedbus.Bus(settings, timeout=timeout / 10)
 
-    monkeypatch.setattr("nedbus.cli.options.Bus", connect_soon)
+    monkeypatch.setattr("nedbus.client.Bus", connect_soon)
     where = free_endpoint()
     ended = run_command(command, "-c", where)
     assert ended.exit_code == 1

@@ -447,7 +447,8 @@ def test_interrupt_during_imports_prints_no_traceback(
 
 IGNORED = """
 import signal, time
-from nedbus.cli import main, options
+from nedbus import settings
+from nedbus.cli import main
 
 class Interrupted:
     def __del__(self):
@@ -457,7 +458,7 @@ def load(*_, **__):
     Interrupted()
     time.sleep(100)
 
-options.load_settings = load
+settings.load_settings = load
 main()
 """
 
@@ -494,7 +495,7 @@ def test_second_signal_exits_at_once(start: Start, number: signal.Signals, exit_
 
 SLOW = """
 import sys, time
-from nedbus.cli.app import app
+from nedbus.cli.app import make_app
 from nedbus.daemon import daemon
 
 def open_slowly(**settings):
@@ -503,7 +504,7 @@ def open_slowly(**settings):
     return open_router(**settings)
 
 open_router, daemon.open_router = daemon.open_router, open_slowly
-app(["serve", "-s", "sim:", "-l", sys.argv[1]])
+make_app()(["serve", "-s", "sim:", "-l", sys.argv[1]])
 """
 
 

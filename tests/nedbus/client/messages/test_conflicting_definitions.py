@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 import nedbus
 from nedbus import Counts
-from nedbus.recording.mcap_writer import RecordingWriter
-from nedbus.recording.recorder import Recorder
+from nedbus.client.recorder import Recorder
+from nedbus.flights.writer import RecordingWriter
 from nedbus.transport import Session, open_router, query
 from nedbus_msgs import Address, Definition, Provenance, codec_of, define, encoding_of, field_type, short_hash
 from tests.flights.ulogs import UlogWriter

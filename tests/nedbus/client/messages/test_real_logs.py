@@ -13,10 +13,9 @@ import pytest
 from pyulog import ULog
 
 import nedbus
-from nedbus.recording import RecordingReader
 from nedbus_msgs import BY_TOPIC, MESSAGES, TOPICS, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
-from tests.flights.replays import convert_replay, open_replay
+from tests.flights.replays import convert_replay, open_recording, open_replay
 from tests.flights.ulogs import LOGS
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
@@ -171,9 +170,9 @@ def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None
         assert array.tobytes() == before[stream].tobytes(), stream
         assert nedbus.missing_of(array) == nedbus.missing_of(before[stream]), stream
     assert nedbus.utc_of(path) == nedbus.utc_of(flight)
-    with RecordingReader(path, vehicle="1") as reader:
+    with open_recording(path) as reader:
         for recorded in reader.counts:
-            provided = recorded.definition.all_fields - recorded.missing
+            provided = recorded.definition.all_fields - recorded.lacking
             assert recorded.layout is recorded.definition.recorded_layout(provided)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.sources.mavlink.boot_clock import BootClock
-from nedbus.sources.mavlink.reader import new_parser
+from nedbus.mavlink.boot_clock import BootClock
+from nedbus.mavlink.parser import new_parser
 from tests.peers.px4_log_stream import STREAMS, datagrams
 
 BOOT = 60_000

@@ -17,9 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink.log_reassembly import Chunk, Reassembly, Verdict
+from nedbus.mavlink.parser import Received
 from nedbus.sources.mavlink.link import open_link
-from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly, Verdict
-from nedbus.sources.mavlink.reader import LinkReader, LogReceiver, Received
+from nedbus.sources.mavlink.reader import LinkReader, LogReceiver
 from nedbus.sources.options import MavlinkOptions
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message

@@ -19,10 +19,10 @@ from pymavlink.dialects.v20 import common as dialect
 from pyulog import ULog
 
 from nedbus.client import LogStreamStatus
+from nedbus.mavlink.log_reassembly import Chunk, Reassembly
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import receive_queue
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings

@@ -11,10 +11,11 @@ from typing import Any, Self
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink.parser import new_parser, parse
 from nedbus.sources import Rejection
 from nedbus.sources.mavlink import receive_queue
 from nedbus.sources.mavlink.link import open_link
-from nedbus.sources.mavlink.reader import LinkReader, new_parser, parse
+from nedbus.sources.mavlink.reader import LinkReader
 from nedbus.sources.mavlink.receive_queue import Received
 from nedbus.timings import Timings
 from tests.peers.live_source import Listener

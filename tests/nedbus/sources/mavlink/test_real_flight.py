@@ -11,11 +11,10 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 from pyulog import ULog
 
+from nedbus.mavlink.parser import new_parser
+from nedbus.mavlink.vehicle import STREAMS as REQUESTED
+from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import SourceMessage
-from nedbus.sources.mavlink.reader import new_parser
-from nedbus.sources.mavlink.vehicle import STREAMS as REQUESTED
-from nedbus.sources.mavlink.vehicle import Vehicle
-from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import BY_TOPIC, upgrade_with
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
@@ -70,7 +69,7 @@ def test_converted_messages_equal_log() -> None:
     for each in open_replay(f"ulog:{LOG}?topics={','.join(TOPICS)}").messages:
         rows[each.address.topic, each.address.instance].append(upgrade_with(BY_TOPIC[each.address.topic], each.fields))
     times = {key: [row.timestamp for row in of_key] for key, of_key in rows.items()}
-    vehicle, parser = Vehicle("1", MavlinkOptions.model_validate({"topics": ",".join(TOPICS)})), dialect.MAVLink(None)
+    vehicle, parser = Vehicle("1", TOPICS), dialect.MAVLink(None)
     compared, unlogged, fields_converted = Counter[str](), Counter[str](), defaultdict[str, set[str]](set)
     for time_ns, datagram in read_datagrams(PX4 / "twelve_messages_mavlink.bin.gz"):
         for message in parser.parse_buffer(datagram) or []:
@@ -113,7 +112,7 @@ def test_converted_messages_equal_log() -> None:
 @pytest.mark.slow
 def test_gps_time_comes_from_system_time() -> None:
     """SYSTEM_TIME provides the Unix time of GPS messages, which advances with the time since boot."""
-    vehicle, parser = Vehicle("1", MavlinkOptions.model_validate({"topics": "sensor_gps"})), dialect.MAVLink(None)
+    vehicle, parser = Vehicle("1", {"sensor_gps"}), dialect.MAVLink(None)
     origins = []
     for time_ns, datagram in read_datagrams(PX4 / "twelve_messages_mavlink.bin.gz"):
         for message in parser.parse_buffer(datagram) or []:
@@ -127,7 +126,7 @@ def test_gps_time_comes_from_system_time() -> None:
 @pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
 def test_statustexts_appear_in_log() -> None:
     """The text of each STATUSTEXT of a flight is a logged string without its module name and trailing tab."""
-    vehicle, parser = Vehicle("1", MavlinkOptions(topics=("log_message",))), new_parser()
+    vehicle, parser = Vehicle("1", {"log_message"}), new_parser()
     texts = [
         (each.fields["timestamp"], str(each.fields["text"]))
         for when, from_vehicle, frame in datagrams(STREAMS / "ulog_stream_flight1.bin.gz")

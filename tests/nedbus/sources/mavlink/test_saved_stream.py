@@ -19,9 +19,9 @@ from typing import Any, Final, cast
 import pytest
 from pyulog import ULog
 
+from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.log_stream import LogFile, LogStream
 from nedbus.sources.mavlink.saved_stream import StreamFile, read_stream, state_path
 from nedbus.sources.options import MavlinkOptions

@@ -22,9 +22,9 @@ from pymavlink.dialects.v20 import common as dialect
 
 import nedbus
 from nedbus.errors import ConfigError, SourceError
+from nedbus.mavlink.vehicle import ORIGIN
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink.link import DuplicateIds, open_link
-from nedbus.sources.mavlink.vehicle import ORIGIN
 from nedbus.timings import Timings
 from tests.flights.local_position import upgrade
 from tests.flights.messages import VLP

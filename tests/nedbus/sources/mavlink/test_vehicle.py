@@ -10,10 +10,10 @@ from typing import Any, cast
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink.fields import CONVERSIONS
+from nedbus.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources import Rejection, SourceMessage
-from nedbus.sources.mavlink.fields import CONVERSIONS
 from nedbus.sources.mavlink.log_stream import LogStream
-from nedbus.sources.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import TOPICS, Address
 from nedbus_msgs.frames import quaternion_to_euler
@@ -23,7 +23,7 @@ NEEDED = (32, 230, 33, 141, 331)  # for vehicle_local_position
 
 
 def new_vehicle(topics: str) -> Vehicle:
-    return Vehicle("9", MavlinkOptions.model_validate({"topics": topics}))
+    return Vehicle("9", MavlinkOptions.model_validate({"topics": topics}).chosen_topics)
 
 
 @pytest.fixture

@@ -22,10 +22,9 @@ from pymavlink.dialects.v20 import common as dialect
 
 import nedbus
 from nedbus.doctor import examine
+from nedbus.mavlink.vehicle import Vehicle, request_rates
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
-from nedbus.sources.mavlink.vehicle import Vehicle, request_rates
-from nedbus.sources.options import MavlinkOptions
 from nedbus.transport import Attachment, Session
 from nedbus_msgs import ANY, TOPICS, Address, VehicleLocalPosition, get_topic, split_ros2_topic
 from tests.flights.local_position import decode_cdr, encode_cdr, upgrade
@@ -432,7 +431,7 @@ def count_outdated_flags(name: str, rate: float) -> int:
     def truth(microseconds: float) -> VehicleLocalPosition:
         return logged[times[bisect.bisect(times, microseconds) - 1]]
 
-    vehicle, parser = Vehicle("1", MavlinkOptions()), dialect.MAVLink(None)
+    vehicle, parser = Vehicle("1"), dialect.MAVLink(None)
     late = turn = 0
     for _, datagram in read_datagrams(PX4 / f"{name}_mavlink.bin.gz"):
         for position in parser.parse_buffer(datagram) or []:

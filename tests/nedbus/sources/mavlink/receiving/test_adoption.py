@@ -8,8 +8,8 @@ from typing import Any, Final
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import Rejection
-from nedbus.sources.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.receive_queue import Received
 from nedbus.sources.mavlink.saved_stream import StreamFile, state_path
 from nedbus.sources.options import MavlinkOptions

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.mavlink import Received
+from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import LinkLoad, Rejection
 from nedbus.sources.mavlink import receive_queue
-from nedbus.sources.mavlink.log_reassembly import Chunk
-from nedbus.sources.mavlink.receive_queue import Received, ReceiveQueue, join_data
+from nedbus.sources.mavlink.receive_queue import ReceiveQueue, join_data
 from tests.waits import DEADLINE
 
 HEARTBEAT: Any = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3)

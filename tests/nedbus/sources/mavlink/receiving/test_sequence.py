@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from nedbus.sources.mavlink.log_reassembly import Reassembly
-from nedbus.sources.mavlink.sequence import PacketRate, SequenceCounter
+from nedbus.mavlink.log_reassembly import Reassembly
+from nedbus.mavlink.sequence import PacketRate, SequenceCounter
 from tests.peers.px4_log_stream import STREAMS, datagrams, stream_message
 
 HEADER = b"ULog\x01\x12\x35\x01" + bytes(20)

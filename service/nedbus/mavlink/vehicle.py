@@ -5,20 +5,18 @@ import math
 from collections import deque
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Any, Final, cast
+from typing import Any, Final, Protocol, cast
 
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.log_event import about
-from nedbus.sources.options import MavlinkOptions
-from nedbus.sources.source import Rejection, SourceMessage
+from nedbus.samples import Rejection, SourceMessage
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
 from .boot_clock import BootClock
 from .fields import CONVERSIONS
-from .log_stream import LogStream
 
 _log = logging.getLogger(__name__)
 
@@ -75,16 +73,30 @@ def request_rates(rate: float, baud: int | None, topics: Collection[str]) -> dic
     return wanted
 
 
+class StreamedTopics(Protocol):
+    """What a vehicle's ULog stream delivers."""
+
+    @property
+    def is_streaming(self) -> bool:
+        """True while the stream delivers messages."""
+
+    def delivers(self, address: Address) -> bool:
+        """Return whether the stream has messages of an address."""
+
+
 class Vehicle:
     """State of one vehicle: pass its messages to `handle`, and send the requests from `next_request`.
 
+    `topics`: those to deliver, None for all; `rate`: positions per second to request.
     `baud`: of a serial link; None for other links, whose bandwidth is unknown.
     """
 
-    def __init__(self, name: str, options: MavlinkOptions, *, baud: int | None = None) -> None:
+    def __init__(
+        self, name: str, topics: Collection[str] | None = None, *, rate: float = 30.0, baud: int | None = None
+    ) -> None:
         self._name = name
-        self._topics = options.chosen_topics or TOPICS
-        self._rates = request_rates(options.rate, baud, self._topics)
+        self._topics = topics or TOPICS
+        self._rates = request_rates(rate, baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
         self.clock = BootClock()
@@ -122,7 +134,7 @@ class Vehicle:
         """Whether losses or a reboot were not reported yet."""
         return bool(self.lost or self._rebooted)
 
-    def report(self, message: SourceMessage, log: LogStream | None = None) -> SourceMessage:
+    def report(self, message: SourceMessage, log: StreamedTopics | None = None) -> SourceMessage:
         """Add the losses and the reboot that were not reported yet; during a ULog stream only losses of others."""
         lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
         if not (lost or self._rebooted):
@@ -151,7 +163,7 @@ class Vehicle:
         number = self._pending.pop(0)
         return number, self._rates[number]
 
-    def handle(self, message: Any, now: float, log: LogStream | None = None) -> SourceMessage | Rejection | None:
+    def handle(self, message: Any, now: float, log: StreamedTopics | None = None) -> SourceMessage | Rejection | None:
         """Convert a message; return a Rejection if it is out of order, or there are too many texts.
 
         Return None if no chosen topic needs it, or `log`, the vehicle's ULog stream, delivers that topic.

@@ -1,19 +1,20 @@
-"""Convert a replay to an MCAP recording, validating each message."""
+"""Convert flights to an MCAP recording, validating each message."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
 from pydantic import ValidationError
 
-from nedbus import recording
 from nedbus.atomic_write import atomic_write
 from nedbus.errors import OutputError
 from nedbus.log_event import about
+from nedbus.samples import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
 
-from .source import ReplayRun
+from .readers import check_recording
+from .writer import RecordingWriter
 
 _log = logging.getLogger(__name__)
 
@@ -23,27 +24,37 @@ _CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses a few seconds
 _MAX_LOGGED: Final = 5  # rejected messages logged per file
 
 
-def convert(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
+def convert(
+    messages: Iterable[SourceMessage],
+    path: Path,
+    *,
+    source: str = "",
+    boot_utc: int = 0,
+    on_progress: Callable[[int], object],
+) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
     The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `due`.
-    `source`: the kind of source, such as `ulog`. `on_progress`: called with the number of messages handled so far.
+    `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
+    `on_progress`: called with the number of messages handled so far.
 
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
     """
-    recording.check_recording(path)
+    check_recording(path)
     try:
         with atomic_write(path) as part:
-            return _write(run, part, source=source, on_progress=on_progress)
+            return _write(messages, part, source=source, boot_utc=boot_utc, on_progress=on_progress)
     except OSError as exc:  # an OutputError names the temporary file
         raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
 
 
-def _write(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
+def _write(
+    messages: Iterable[SourceMessage], path: Path, *, source: str, boot_utc: int, on_progress: Callable[[int], object]
+) -> str:
     pending: list[tuple[Message, Address, Provenance, int]] = []
     rejected, start = 0, None
-    with recording.RecordingWriter(path, chunk_size=_CHUNK_BYTES, boot_utc=run.boot_utc) as writer:
-        for done, each in enumerate(run.messages, 1):
+    with RecordingWriter(path, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer:
+        for done, each in enumerate(messages, 1):
             definition = each.definition or BY_TOPIC[each.address.topic]
             try:
                 message = upgrade_with(definition, each.fields)
@@ -56,7 +67,7 @@ def _write(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[in
                 continue
             if start is None:
                 start = min(message.timestamp * 1000, _MAX_START)
-            provenance = Provenance(source, definition.all_fields - message.model_fields_set)
+            provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
             pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
             if len(pending) == _CHUNK:
                 writer.write_messages(pending)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from nedbus import clock
-from nedbus.client import Batch, Subscription
 from nedbus.errors import ClosedError, NoDataError
+from nedbus.flights import RecordingWriter, check_recording
+from nedbus.samples import Batch
 
-from .flight_files import check_recording
-from .mcap_writer import RecordingWriter
+from .subscription import Subscription
 
 _FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`

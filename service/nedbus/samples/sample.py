@@ -1,12 +1,16 @@
 """Sample, a received message with its metadata, and Counts, the statistics of a subscription."""
 
-from dataclasses import dataclass
-from typing import Final, Generic, Literal, TypedDict
+from __future__ import annotations
 
-import zenoh
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Generic, Literal, TypedDict
+
 from typing_extensions import TypeVar
 
 from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition
+
+if TYPE_CHECKING:
+    import zenoh
 
 Mode = Literal["latest", "every"]  # a slow reader gets the newest message of each key, or every message
 M_co = TypeVar("M_co", bound=Message, default=VehicleLocalPosition, covariant=True)

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.errors import AddressError, ArgumentError, ConfigError
+from nedbus.flights import UtcOffset, utc_of
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion, is_unix_time
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import Library, Pandas, Polars, Streams, missing_of, to_dataframe
 from .reading import FlightPath, read_streams
-from .utc import utc_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,6 +38,7 @@ class _AlignOptions(TypedDict, total=False):
     on: str | float | Sequence[int] | npt.NDArray[np.int64]
     method: Literal["last", "nearest", "linear"]
     vehicle: str | int
+    layout: str | None
     utc: bool
 
 
@@ -55,12 +56,13 @@ def align(
     on: str | float | Sequence[int] | npt.NDArray[np.int64] = DEFAULT_TOPIC,
     method: Literal["last", "nearest", "linear"] = "last",
     vehicle: str | int = ANY,
+    layout: str | None = None,
     utc: bool = False,
     dataframe: Library = None,
 ) -> Any:
     """Return several streams of one or more files, or arrays from `read`, as one table, aligned in time.
 
-    `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
+    `topics`, `layout`: as in `read`; by default all topics known to nedbus.
     `fields`: the columns in addition to `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".
     `on`: the rows of the table: the messages of a stream, a rate [Hz], or times on the clock of PX4's `timestamp` [us].
     Columns are `timestamp` [us], and for each stream `<stream>.<field>` and `<stream>.age` [s], the time since the
@@ -84,12 +86,12 @@ def align(
     topics = [topics] if isinstance(topics, str) else topics
     names, start = [*reference, *(topics or ())], 0
     streams: Streams
-    if not isinstance(flight, Mapping):
-        streams, start = read_streams(flight, names if topics else None, vehicle=vehicle)
-    elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
-        raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}", problem="is not among these arrays")
+    offset: UtcOffset | None = None
+    if isinstance(flight, Mapping):
+        streams = _choose_streams(flight, topics, names)
     else:
-        streams = {name: (array, {}) for name, array in flight.items() if not topics or ANY in topics or name in names}
+        wanted = names if topics else None
+        streams, start, offset = read_streams(flight, wanted, vehicle=vehicle, layout=layout, utc=utc)
     if isinstance(on, str):
         found = [name for name in streams if f"/{name}".endswith(f"/{on}")]
         if not found:
@@ -101,10 +103,9 @@ def align(
     times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
     columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
     if utc:
-        several = {name: messages for name, (messages, _) in streams.items()}
-        offset = utc_of(flight if isinstance(flight, FlightPath | Mapping) else several, vehicle=vehicle)
-        unix = offset.unix_us(times) if offset else 0 * times
-        columns["utc"] = np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
+        if not isinstance(flight, FlightPath):  # several files have Unix times
+            offset = utc_of({name: messages for name, (messages, _) in streams.items()})
+        columns["utc"] = _to_utc(times, offset)
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
@@ -127,6 +128,17 @@ def align(
     for name, column in columns.items():
         table[name] = column
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
+
+
+def _choose_streams(arrays: Mapping[str, MessageArray], topics: Sequence[str] | None, names: Sequence[str]) -> Streams:
+    if unknown := [name for name in topics or () if name not in (ANY, *arrays)]:
+        raise AddressError("topic", unknown[0], f"one of {', '.join(arrays)}", problem="is not among these arrays")
+    return {name: (array, {}) for name, array in arrays.items() if not topics or ANY in topics or name in names}
+
+
+def _to_utc(times: _Ints, offset: UtcOffset | None) -> npt.NDArray[np.datetime64]:
+    unix = offset.unix_us(times) if offset else 0 * times
+    return np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
 
 
 def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:

@@ -27,7 +27,7 @@ from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 from nedbus.errors import SourceError
 from nedbus_msgs import is_unix_time
 
-from .flight_files import open_flight
+from .formats import open_file
 
 READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryError, OverflowError, RuntimeError)
 """Errors that the mcap package and the decompressors raise for a damaged file."""
@@ -67,22 +67,24 @@ class ChunkFile:
 
     `summary`: records with schemas, channels and statistics; empty if it is absent or damaged.
     `warnings`: the damage found so far; `damaged`: True if any of it cost messages.
+    `size`: bytes of the file; `position`: bytes read so far.
 
     Raises SourceError if the file is not MCAP or cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
         self.warnings: list[str] = []
-        self.damaged = False
-        self._file = open_flight(path)
+        self.damaged, self.position = False, 0
+        self._file = open_file(path)
         if self._read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
             self._file = self._decompress(self._file)
         self.close = self._file.close
-        self._size = os.fstat(self._file.fileno()).st_size
+        self.size = os.fstat(self._file.fileno()).st_size
         if self._read(0, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.close()
             raise SourceError(str(path), "; ".join(["not a readable MCAP file", *self.warnings]))
         self._chunks: list[_IndexedChunk] = []
+        self._end = 0  # of the data, before the summary
         self.summary = b""
         try:
             self._read_summary()
@@ -94,13 +96,8 @@ class ChunkFile:
 
         `only`: channels of interest; chunks without any of them may be skipped.
         """
-        chunks = (
-            (Opcode.CHUNK, start, end)
-            for start, end, channels in self._chunks
-            # A chunk that lists no channels may contain any.
-            if only is None or not channels or not set(channels).isdisjoint(only)
-        )
-        for opcode, offset, end in chunks if self._chunks else self._scan():
+        for opcode, offset, end in self._listed(only) if self._chunks else self._scan(len(MCAP0_MAGIC), self.size):
+            self.position = end
             if end - offset > _MAX_BLOCK:
                 text = f"skipped {end - offset} bytes from byte {offset}, above the limit of {_MAX_BLOCK} for a chunk"
                 self.warn(text, lost=True)
@@ -110,6 +107,17 @@ class ChunkFile:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
             except READ_ERRORS:
                 self.warn(f"the chunk {_describe(record, offset)} is damaged; its messages are skipped", lost=True)
+
+    def _listed(self, only: Collection[int] | None) -> Iterator[tuple[int, int, int]]:
+        """Yield opcode, begin and end of the chunks in the index, and of what lies between and behind them."""
+        begin = len(MCAP0_MAGIC)
+        for start, end, channels in self._chunks:
+            yield from self._scan(begin, start, is_listed=True)
+            begin = end
+            # A chunk that lists no channels may contain any.
+            if only is None or not channels or not set(channels).isdisjoint(only):
+                yield Opcode.CHUNK, start, end
+        yield from self._scan(begin, self._end, is_listed=True)
 
     def warn(self, warning: str, *, lost: bool = False) -> None:
         """Add a warning unless it is a duplicate; `lost`: the damage cost messages."""
@@ -140,7 +148,7 @@ class ChunkFile:
 
     def _read_summary(self) -> None:
         """Read the summary if there is one; raise one of READ_ERRORS if it is damaged."""
-        end = self._size - _FOOTER.size
+        end = self.size - _FOOTER.size
         if end < len(MCAP0_MAGIC):
             return
         opcode, length, start, _, checksum, magic = _FOOTER.unpack(self._read(end, _FOOTER.size))
@@ -160,18 +168,23 @@ class ChunkFile:
             if begin < previous:
                 raise ValueError(begin)
             previous = stop
-        self._chunks, self.summary = chunks, summary
+        self._chunks, self._end, self.summary = chunks, start, summary
 
-    def _scan(self) -> Iterator[tuple[int, int, int]]:
-        """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages between them."""
-        offset, after_chunk = len(MCAP0_MAGIC), False
-        while True:
+    def _scan(self, offset: int, stop: int, *, is_listed: bool = False) -> Iterator[tuple[int, int, int]]:
+        """Scan a range; yield opcode, begin and end of chunks, and of schemas, channels and messages between them.
+
+        `is_listed`: the range is between chunks of the index, where damage usually costs only copies of the index.
+        """
+        after_chunk = is_listed and offset > len(MCAP0_MAGIC)
+        while not is_listed or offset < stop:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
             opcode, length = _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
             end = offset + _RECORD_HEAD.size + length
             surplus = length - _expected_length(opcode, begin[_RECORD_HEAD.size :], length)
-            if opcode == 0 or end > self._size or surplus not in _SURPLUS:
-                self.warn(f"skipped truncated or damaged data from byte {offset} of {self._size} to the end", lost=True)
+            if opcode == 0 or end > stop or surplus not in _SURPLUS:
+                if is_listed:
+                    return
+                self.warn(f"skipped truncated or damaged data from byte {offset} of {self.size} to the end", lost=True)
                 return
             if opcode in _LENGTHS:
                 return

@@ -1,0 +1,84 @@
+"""Commands for files: convert, plot."""
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from nedbus import flights, tables
+from nedbus.cli.options import InstanceOption, VehicleOption, command
+from nedbus.cli.output.streams import write, write_stderr
+from nedbus.cli.output.table import show_progress
+from nedbus.errors import ConfigError, SourceError
+from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection, check_vehicle
+
+_FLIGHTS: Final = ".ulg, .mcap or .tlog files; several are merged by UTC"
+_IMAGE: Final = "Image to write (default: next to the flight)"
+FlightsArgument = Annotated[list[Path], typer.Argument(metavar="FLIGHT", help=_FLIGHTS, show_default=False)]
+
+
+@command
+def convert(
+    sources: FlightsArgument,
+    output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Recording to write", show_default=False)],
+    *,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id, for a log of one vehicle")] = None,
+    topics: Annotated[str | None, typer.Option("--topics", "-t", help='Topics, separated by commas, or "*"')] = None,
+) -> None:
+    """Convert flight logs to an MCAP recording.
+
+    Validates every message, and converts the topics of all built-in messages unless --topics selects others.
+    """
+    names = flights.parse_topics(topics or "")
+    if vehicle is not None:
+        check_vehicle(vehicle)
+    options = flights.ReadOptions(flights.topics_of(names), vehicle)
+    with flights.MergedFlights(sources, options) as merged, show_progress() as show:
+        readers = [each.reader for each in merged.files]
+        total = sum(each.total for each in readers)
+        on_progress = lambda _: show(f"{output}", sum(each.position for each in readers), total)  # noqa: E731
+        report = flights.convert(merged.messages(), output, boot_utc=merged.boot_utc, on_progress=on_progress)
+        absent = flights.absent_topics(names, {address.topic for address in merged.definitions}, "this file")
+    for warning in (*merged.warnings, *(f"{sources[0]}: {text}" for text in absent)):
+        write_stderr(warning)
+    write_stderr(f"{output}: {report}")
+    _require_undamaged(merged.damaged, sources, "converted")
+
+
+@command
+def plot(
+    sources: FlightsArgument,
+    *,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.png", help=_IMAGE)] = None,
+    topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+) -> None:
+    """Plot flights: track, altitude, speed, flags, resets and events."""
+    draw, limit = tables.draw, tables.MAX_STREAMS
+    selection, name = Selection(topic, vehicle, instance), ", ".join(map(str, sources))
+    if topic not in (ANY, *DEFAULT.topics):
+        table = f'nedbus.read("{sources[0]}", "{topic}", dataframe="pandas")'
+        raise ConfigError("--topic", f"{topic} has no track; plot {' or '.join(DEFAULT.topics)}, or read it: {table}")
+    positions = tables.Positions(sources, selection)
+    selected = positions.addresses
+    if len(selected) > limit:
+        write_stderr(f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i")
+    streams = [(address, messages) for address, messages in positions.read(selected[:limit]) if len(messages)]
+    for warning in positions.warnings:
+        write_stderr(warning)
+    if not streams:
+        raise SourceError(name, "nothing to plot: the selected streams have no valid message")
+    target = output or sources[0].with_suffix(".png")
+    read = flights.read_file_events(*sources)
+    known = (each for vehicle in read.event_log.vehicles.values() for each in vehicle.conditions.values())
+    events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.event_log.events_since(0)[0]]
+    draw(streams, target, title=", ".join(each.name for each in sources), events=events, times=read.times)
+    write(str(target))
+    _require_undamaged(positions.damaged, sources, "plotted")
+
+
+def _require_undamaged(is_damaged: bool, sources: list[Path], what: str) -> None:
+    if is_damaged:
+        name = ", ".join(map(str, sources))
+        raise SourceError(name, f"the file is damaged: only the readable messages were {what}")

@@ -1,0 +1,43 @@
+"""Flights: .ulg logs, .mcap recordings and .tlog files, read by one protocol, merged, and written as MCAP; no Zenoh.
+
+Each name imports its module on first use: MCAP needs an extra, and NumPy is slow to import.
+"""
+
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
+if TYPE_CHECKING:
+    from .conversion import convert
+    from .events import EVENT_OPTIONS, MAX_FILE_EVENTS, FileEvents, follow, read_file_events, times_of
+    from .flight import Flight, FlightSamples, open_flight
+    from .merge import LOOKAHEAD, FlightFile, MergedFlights, distinct_names, no_utc, renamed, require_files
+    from .readers import (
+        SUFFIXES,
+        FileStream,
+        FlightReader,
+        ReadOptions,
+        Record,
+        Replay,
+        check_recording,
+        find_format,
+        format_of,
+        open_reader,
+    )
+    from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
+    from .utc import FIELDS, UtcEstimate, UtcOffset, add_array, estimate_utc, find_utc, utc_of
+    from .writer import RecordingWriter
+else:
+    # No submodule may share the name of an export: importing it would replace the export.
+    _NAMES = {
+        ("mcap", "conversion"): "convert",
+        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow read_file_events times_of",
+        ("", "flight"): "Flight FlightSamples open_flight",
+        ("", "merge"): "LOOKAHEAD FlightFile MergedFlights distinct_names no_utc renamed require_files",
+        ("", "readers"): "SUFFIXES FileStream FlightReader ReadOptions Record Replay check_recording find_format"
+        " format_of open_reader",
+        ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
+        ("", "utc"): "FIELDS UtcEstimate UtcOffset add_array estimate_utc find_utc utc_of",
+        ("mcap", "writer"): "RecordingWriter",
+    }
+    __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})

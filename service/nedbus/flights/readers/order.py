@@ -1,0 +1,126 @@
+"""Order and pace of a flight: messages by log time, due times without pauses and without outliers."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from heapq import heappop, heappush
+from typing import Final, TypeVar
+
+from nedbus.samples import SourceMessage
+from nedbus.ulog import LOG_MESSAGE
+from nedbus_msgs import Address
+
+from .reader import FlightReader
+
+MAX_GAP: Final = 60_000_000
+"""Longest pause of a replay [us]; a longer one, or a damaged time, is skipped."""
+
+_MAX_STEP: Final = 1_000_000  # us; a longer step must be confirmed by the next message
+_REORDER_BUFFER: Final = 8192  # messages
+_T = TypeVar("_T")
+
+
+class Clock:
+    """Replay clock: follows the times of messages from `start` on, and ignores outliers [us].
+
+    `max_behind`: consecutive messages more than MAX_GAP behind the clock, after which it is set back.
+    `gaps`: number of steps that were too long, and skipped. `stray`: the last message, if its time is an outlier.
+    """
+
+    def __init__(self, start: int = 0, *, max_behind: int = 1) -> None:
+        self.gaps = 0
+        self.stray: object = None
+        self._max_behind, self.start = max_behind, start
+        self._now = self._due = self._behind = 0  # us; messages
+        self._is_running = False
+
+    def pace(self, timed: Iterable[tuple[int, _T]]) -> Iterator[tuple[int, _T]]:
+        """Yield the due time [us since the start] of each message; due times never decrease."""
+        held: tuple[int, _T] | None = None
+        for time, message in timed:
+            self._now = self._now or self.start
+            if held is not None:
+                if time >= held[0] - _MAX_STEP:
+                    self._follow(held[0])
+                yield self._due, held[1]
+                held = None
+            step = time - self._now
+            if step > _MAX_STEP:
+                held = time, message
+                continue
+            if step >= 0 and self._is_running:
+                self._due, self._now, self._behind = self._due + step, time, 0
+            else:
+                self._follow(time)
+            yield self._due, message
+        if held is not None:
+            if held[0] <= self._now + MAX_GAP:
+                self._follow(held[0])
+            elif self._is_running:
+                self.stray = held[1]
+            yield self._due, held[1]
+
+    def _follow(self, time: int) -> None:
+        """Advance to a time; go back only if the clock is far ahead of many consecutive messages."""
+        step = time - self._now
+        self._behind = self._behind + 1 if step < -MAX_GAP else 0
+        if step < 0 and self._behind < self._max_behind:
+            return
+        if step > MAX_GAP and self._is_running:
+            self.gaps += 1
+        elif self._is_running:
+            self._due += max(0, step)
+        self._now, self._is_running = time, True
+
+
+class Replay:
+    """The messages of a reader in order of their due times, once; `warnings`: those of the reader and of the order."""
+
+    def __init__(self, reader: FlightReader) -> None:
+        self.reader = reader
+        self._unordered: Counter[Address] = Counter()
+        self._clock = Clock(max_behind=reader.max_behind)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Damage, omissions and times out of order so far."""
+        unordered = self._unordered.copy()
+        if isinstance(self._clock.stray, SourceMessage):
+            unordered[self._clock.stray.address] += 1
+        text = "timestamps of {} are out of order ({}); the order of the file is kept"
+        found = [*self.reader.warnings, *(text.format(*each) for each in unordered.items())]
+        if self._clock.gaps:
+            found.append(f"skipped gaps of more than {MAX_GAP // 1e6:.0f} s in the timestamps ({self._clock.gaps})")
+        return found
+
+    def messages(self) -> Iterator[SourceMessage]:
+        """Yield the messages with their due times; raise the errors of the reader."""
+        for due, message in self._clock.pace(self._timed()):
+            message.due = due / 1e6
+            yield message
+
+    def _timed(self) -> Iterator[tuple[int, SourceMessage]]:
+        messages, reader, newest = self.reader.messages(), self.reader, dict[Address, int]()
+        for message in messages if reader.is_sorted else _sort(messages):
+            time, address = message.time, message.address
+            if time < newest.get(address, 0) and address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
+                self._unordered[address] += 1
+            newest[address] = time
+            self._clock.start = reader.start
+            yield time, message
+
+
+def _sort(messages: Iterable[SourceMessage]) -> Iterator[SourceMessage]:
+    """Sort messages by log time, because writers batch them by stream; flush if the time goes back by over MAX_GAP."""
+    waiting: list[tuple[int, int, SourceMessage]] = []
+    newest = 0
+    for number, message in enumerate(messages):
+        if message.time < newest - MAX_GAP:
+            while waiting:
+                yield heappop(waiting)[2]
+            newest = 0
+        newest = max(newest, message.time)
+        heappush(waiting, (message.time, number, message))
+        if len(waiting) > _REORDER_BUFFER:
+            yield heappop(waiting)[2]
+    while waiting:
+        yield heappop(waiting)[2]

@@ -1,0 +1,145 @@
+"""The protocol of flight files: one reader per format yields records, each with its stream and log time."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+from nedbus.errors import ConfigError
+from nedbus.samples import RecordStream, SourceMessage
+from nedbus_msgs import TOPICS, Address, Definition
+
+
+class FileStream(RecordStream, Protocol):
+    """One stream of records in a file; `lacking`: fields that a record has, but its source did not provide.
+
+    `dtype`: argument of `numpy.dtype` for a record; None if payloads are fields by name.
+    `converted`: the type of each field that `decode` converts. `head`: the first bytes of each record.
+    `strict_bools`: the fields whose bytes must be 0 or 1.
+    """
+
+    address: Address
+    definition: Definition[Any]
+    lacking: frozenset[str]
+    head: bytes
+    strict_bools: frozenset[str]
+
+    @property
+    def dtype(self) -> Any:
+        """The layout of a record."""
+
+    @property
+    def converted(self) -> Mapping[str, Any]:
+        """The type of each converted field."""
+
+    def check(self, payload: bytes) -> str | None:
+        """Return why a payload is no record of this stream, None if it is one."""
+
+
+class Record(NamedTuple):
+    """A message in a file: its stream, its bytes or its fields by name, and its log time [us].
+
+    `time`: None for a log, which has only the timestamps. `error`: why the file's reader rejects it.
+    """
+
+    stream: FileStream
+    payload: Any
+    time: int | None
+    error: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """Options of a reader.
+
+    `topics`: the topics to read, None for all. `vehicle`: the name for the only vehicle of a file.
+    `default_vehicle`: the name for a vehicle that the file does not name.
+    `layout`: the PX4 release whose layouts a recording has, if its definitions are those of another release.
+    """
+
+    topics: Collection[str] | None = frozenset(TOPICS)
+    vehicle: str | None = None
+    default_vehicle: str = "1"
+    layout: str | None = None
+
+
+class FlightReader(ABC):
+    """One pass over a file, with memory independent of its size.
+
+    `definitions`: the streams so far; those of an indexed file at once. `start`: when recording began, on the clock
+    of the timestamps [us], 0 if unknown. `boot_utc`: Unix time of the boot [us], 0 if unknown.
+    `position`, `total`: bytes read so far, and of the file. `damaged`: True if messages were lost so far.
+    `kind`: the format, which becomes `sample.source`. `is_sorted`: False if writers batch messages by stream.
+    `max_behind`: consecutive messages far in the past that show that the clock was set back.
+    """
+
+    kind = ""
+    is_sorted = True
+    max_behind = 1
+
+    def __init__(self, path: Path, options: ReadOptions) -> None:
+        self.path, self.options = path, options
+        self.definitions: dict[Address, Definition[Any]] = {}
+        self.start = self.boot_utc = self.position = self.total = 0
+        self.damaged = False
+        self._vehicles: set[str] = set()
+        self._resources: list[Any] = []  # open files
+
+    @property
+    @abstractmethod
+    def warnings(self) -> list[str]:
+        """Damage found and parts skipped so far."""
+
+    @abstractmethod
+    def records(self) -> Iterator[Record]:
+        """Yield the records in file order, once; raise SourceError if there are none of these topics."""
+
+    def messages(self) -> Iterator[SourceMessage]:
+        """Yield the messages in file order, once; raise SourceError if there are none of these topics."""
+        for record in self.records():
+            yield self.message_of(record)
+
+    def message_of(self, record: Record) -> SourceMessage:
+        """Return a record as a message, which is decoded when it is used."""
+        stream, payload, time, error = record
+        error = error or stream.check(payload)
+        given = {} if error else stream.decode(payload) if stream.converted else None
+        if time is None:
+            time = stream.timestamp(payload)[0] or 0
+        return SourceMessage(
+            0.0, stream.address, given, error=error, definition=stream.definition, source=self.kind, logged=stream,
+            payload=payload, time=time,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        for each in self._resources:
+            each.close()
+
+    def __del__(self) -> None:
+        self.close()  # a replay may be discarded before its end
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def layouts(self, definition: Definition[Any]) -> set[str]:
+        """Return the names of the layouts that the messages of a definition have in the file, if it defines them."""
+        return set()
+
+    def vehicle_of(self, own: str) -> str:
+        """Return the name for a vehicle of the file; raise ConfigError if one name would join several vehicles."""
+        if self.options.vehicle is None:
+            return own
+        self._vehicles.add(own)
+        if len(self._vehicles) > 1:
+            known = ", ".join(sorted(self._vehicles))
+            raise ConfigError("vehicle", f"{self.path} has several vehicles ({known}); remove this option")
+        return self.options.vehicle
+
+    def reads(self, topic: str) -> bool:
+        """Return whether the messages of a topic are to be read."""
+        return self.options.topics is None or topic in self.options.topics

@@ -1,0 +1,23 @@
+"""Flights as arrays and data frames: read, align, plot.
+
+Each name imports its module on first use: plots need an extra, and NumPy is slow to import.
+"""
+
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
+if TYPE_CHECKING:
+    from .alignment import align
+    from .arrays import FlightArrays, addresses_of, missing_of
+    from .plot import MAX_STREAMS, draw
+    from .reading import Positions, read
+else:
+    # No submodule may share the name of an export: importing it would replace the export.
+    _NAMES = {
+        ("", "alignment"): "align",
+        ("", "arrays"): "FlightArrays addresses_of missing_of",
+        ("", "reading"): "Positions read",
+        ("plot", "plot"): "MAX_STREAMS draw",
+    }
+    __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
