@@ -10,7 +10,7 @@ import pytest
 from nedbus.atomic_write import atomic_write
 from nedbus.flights import RecordingWriter
 from tests.flights.messages import message
-from tests.nedbus.recording.test_recorder import write
+from tests.nedbus.flights.test_recorder import write
 
 Synced = list[tuple[str, list[str]]]
 

@@ -196,6 +196,8 @@ def _read_one(
 def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: str, layout: str | None) -> ReadStreams:
     """Return the messages of several files by vehicle and stream, with Unix times."""
     wanted = _topics(topics)
+    for topic in wanted or ():
+        Selection(topic)  # raises AddressError for a name that no topic can have
     options = ReadOptions(wanted if wanted is None else wanted | _UTC_TOPICS, layout=layout)
     flights = [FlightArrays(path, options, lambda each: wanted is None or each.topic in wanted) for path in paths]
     names = distinct_names([(each.path, {one.vehicle for one in each.addresses}) for each in flights])

@@ -327,7 +327,7 @@ import math
 from pathlib import Path
 from nedbus.flights import RecordingWriter
 from tests.flights.messages import message
-from tests.nedbus.recording.test_recorder import write
+from tests.nedbus.flights.test_recorder import write
 
 with RecordingWriter(Path(sys.argv[1])) as writer:
     for count in range(0, 100_000, 100):

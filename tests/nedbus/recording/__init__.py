@@ -1,1 +1,0 @@
-"""Tests of recordings and logs: files, arrays, alignment and plots."""
