@@ -86,6 +86,10 @@ class UtcEstimate:
                 times.append(timestamp)
                 offsets.append(utc - timestamp)
 
+    def add_others(self, stream: str, timestamps: Iterable[int]) -> None:
+        """Add messages of a stream without UTC."""
+        self._stamps[True, stream].extend(timestamps)
+
     def result(self, boot_utc: int = 0) -> UtcOffset | str:
         """Return the offset, or why it is unknown, "" without UTC; `boot_utc`: of the file's metadata [us]."""
         with_utc = [stamps for (is_other, _), stamps in self._stamps.items() if not is_other]
@@ -178,6 +182,9 @@ def add_array(estimate: UtcEstimate, stream: str, messages: Any) -> None:
     names = set(messages.dtype.names or ()).difference((messages.dtype.metadata or {}).get("missing", ()))
     used = [name for name in ("timestamp", *FIELDS, RELATIVE) if name in names]
     known = [name for name in FIELDS if name in names]
+    if not known:
+        estimate.add_others(stream, messages["timestamp"].clip(0, _MAX_TIME).tolist())
+        return
     for values in zip(*(messages[name].tolist() for name in used), strict=True):
         row = dict(zip(used, values, strict=True))
         estimate.add(stream, row["timestamp"], {name: row[name] for name in known}, row.get(RELATIVE))
