@@ -85,7 +85,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     name, types, model = definition.name, definition.types, definition.model
     validation, make_row = definition.validation, definition.row
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
-    by_name, template, flatten = validation.by_name, validation.template, validation.flatten
+    by_name, flatten = validation.by_name, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
     tags, tag_mask, packed, offsets = _payload_parts(types, head)
     size, pack_flat, unpack_flat = packed.size, packed.pack, packed.unpack
@@ -152,9 +152,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         row = decode_full_width(payload)
         if row is None:
             return decode_any(payload, newer)
-        values = template.copy()
-        values.update(zip(template, row, strict=True))
-        return fill(model.__new__(model), values, all_fields)
+        return fill(model.__new__(model), by_name(row), all_fields)
 
     def decode_row(payload: bytes, *, newer: NewerLayouts | None = None) -> M:  # a Row at run time
         row = decode_full_width(payload)

@@ -25,7 +25,7 @@ class Validation:
     """Validation of the fields of one message, and their rounding to float32.
 
     `passes_rules`: return whether the values of all fields, already of the right types, pass the rules.
-    `template`: a dict with all field names; copying and filling it is faster than growing a dict.
+    `by_name`: return the values of all fields by name.
     `values_of`: return the values of all fields in order from a mapping.
     `validate`: return the values of all fields; raise pydantic.ValidationError for a wrong type.
     `flatten`: expand arrays of a row in place and encode text, for struct to pack; `unflatten`: the reverse.
@@ -38,7 +38,7 @@ class Validation:
         self.values_of: Callable[[Any], Values] = (
             itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         )
-        self.template: dict[str, object] = dict.fromkeys(names)
+        self.by_name = _compile_by_name(names)
         self._types = types
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
         # Not the model's schema: Pydantic takes 20 ms to build it for all messages, during which it swallows Ctrl-C.
@@ -69,12 +69,6 @@ class Validation:
         except KeyError:  # an unknown field in place of a missing one
             return None
 
-    def by_name(self, row: Values) -> dict[str, object]:
-        """Return the values of all fields by name."""
-        values = self.template.copy()
-        values.update(zip(self.template, row, strict=True))
-        return values
-
     def rounded_by_name(self, row: Values) -> dict[str, object]:
         """Return the values of all fields by name, rounded to float32; raise OverflowError beyond its range."""
         packed = self._struct.pack(*self.flatten(row))
@@ -90,6 +84,16 @@ class Validation:
             for number in (values[name] if kind.is_array else (values[name],)) if kind.base == "float32" else ():
                 if math.isfinite(number) and abs(number) > _FLOAT32_MAX:
                     yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
+
+
+def _compile_by_name(names: Sequence[str]) -> Callable[[Values], dict[str, object]]:
+    """Return a function that assigns a row to the items of a copied dict, in half the time of `dict.update`."""
+    targets = ", ".join(f"values[{name!r}]" for name in names)
+    code = f"def by_name(row):\n values = copy()\n {targets}, = row\n return values"
+    namespace: dict[str, Any] = {"copy": dict.fromkeys(names).copy}
+    exec(compile(code, "<fields>", "exec"), namespace)  # noqa: S102 - field names are identifiers, and quoted by repr
+    by_name: Callable[[Values], dict[str, object]] = namespace["by_name"]
+    return by_name
 
 
 def positions_of(types: Mapping[str, FieldType]) -> dict[str, int | slice]:

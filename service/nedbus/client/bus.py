@@ -137,10 +137,12 @@ class Bus(AbstractContextManager["Bus"]):
         """Query the last sample of each key, sorted by address; `latency` is a sample's age. Topics as in `subscribe`.
 
         Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and omitted.
+        Beyond 10,000 replies or 64 MB, the vehicles that use most of these limits lose samples first.
         A sample from a storage has `stored` set; it is returned only if the publisher does not reply.
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        answers = query(self._session, selection.key_expr(prefix=self.prefix), timeout=timeout)
+        key_expr, start = selection.key_expr(prefix=self.prefix), f"{self.prefix}/"
+        answers = query(self._session, key_expr, timeout=timeout, group_of=partial(_vehicle_of, start))
         samples = list(Decoder(self._layouts, prefix=self.prefix).read(answers))
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
         newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
@@ -294,6 +296,10 @@ def connect(
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
     return Bus(load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls), timeout=timeout, tls=tls)
+
+
+def _vehicle_of(start: str, key: str) -> str:
+    return key.removeprefix(start).partition("/")[0]
 
 
 def _close_all(opened: Iterable[Receiver | LinkWatch]) -> None:

@@ -7,7 +7,8 @@ with any thread that holds the GIL while it waits for this lock.
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import zenoh
@@ -63,24 +64,50 @@ def send_query(session: Session, selector: str, *, timeout: float, capacity: int
     return Replies(replies, timeout=timeout)
 
 
-def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]:
+def query(
+    session: Session, selector: str, *, timeout: float, group_of: Callable[[str], str] = lambda _: ""
+) -> list[RawSample]:
     """Return the replies received within `timeout` seconds, possibly several per key.
 
     At most 10,000 replies and 64 MB in total are accepted; the number of replies beyond that is logged.
+    `group_of`: return the group of a key. Beyond the limits, the group that uses most of them loses replies first.
     """
-    accepted: list[RawSample] = []
-    size = dropped = 0
+    accepted = _Accepted()
     replies = wait_for_replies([send_query(session, selector, timeout=timeout)])
     for sample in filter(None, (reply.ok for reply in replies)):
-        size += len(sample.payload) + len(str(sample.key_expr))
-        if size > MAX_QUERY_BYTES or len(accepted) >= MAX_REPLIES:
-            dropped += 1
-        else:
-            accepted.append(sample)
-    if dropped:
+        accepted.add(group_of(str(sample.key_expr)), sample)
+    if accepted.dropped:
         text = "%s: dropped %d of %d replies beyond the limits of a query, so the result is incomplete"
-        _log.warning(text, selector, dropped, len(accepted) + dropped, extra=about("incomplete"))
-    return accepted
+        _log.warning(text, selector, accepted.dropped, accepted.count + accepted.dropped, extra=about("incomplete"))
+    return [sample for samples in accepted.groups.values() for sample in samples]
+
+
+class _Accepted:
+    """The replies within the limits of a query, by group."""
+
+    def __init__(self) -> None:
+        self.groups: defaultdict[str, list[RawSample]] = defaultdict(list)
+        self.count = self.dropped = 0
+        self._size, self._used = 0, Counter[str]()  # bytes; and by group, with the share of a reply
+        self._largest = ""
+
+    def add(self, group: str, sample: RawSample) -> None:
+        """Add a reply, then drop replies of the largest group until the limits hold."""
+        self.groups[group].append(sample)
+        self._count(group, sample, 1)
+        if self._used[group] >= self._used[self._largest]:
+            self._largest = group
+        while self._size > MAX_QUERY_BYTES or self.count > MAX_REPLIES:
+            self._count(self._largest, self.groups[self._largest].pop(), -1)
+            self.dropped += 1
+            if self._largest != group:  # else the next reply of a flood needs no search
+                self._largest = max(self._used, key=self._used.__getitem__)
+
+    def _count(self, group: str, sample: RawSample, sign: int) -> None:
+        size = len(sample.payload) + len(str(sample.key_expr))
+        self.count += sign
+        self._size += sign * size
+        self._used[group] += sign * (size + MAX_QUERY_BYTES // MAX_REPLIES)
 
 
 def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:

@@ -335,6 +335,20 @@ def test_bytes_of_replies_are_bounded(
     assert f"nedbus/@service/*/status: {text}" in caplog.messages
 
 
+def test_vehicle_with_many_streams_hides_no_other(
+    client: nedbus.Bus, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Beyond the limits of a query for last messages, the vehicle with the most loses some; no other vehicle does."""
+    monkeypatch.setattr("nedbus.transport.queries.MAX_REPLIES", 5)
+    for instance in range(20):
+        bus.publisher("estimator_local_position", vehicle="loud", instance=instance).publish({"timestamp": 1})
+    for vehicle in ("a", "z"):
+        bus.publisher(VLP, vehicle=vehicle).publish({"timestamp": 1})
+    wait_for(lambda: len(bus.publishers()) == 22, what="the publishers")
+    assert [sample.vehicle for sample in client.latest("*")] == ["a", "loud", "loud", "loud", "z"]
+    assert "nedbus/*/**: dropped 17 of 22 replies" in caplog.text
+
+
 def test_published_fields_are_validated(client: nedbus.Bus, bus: nedbus.Bus) -> None:
     """A dict of fields is published if it is valid; otherwise `publish` raises and sends nothing."""
     publisher = client.publisher(VLP, vehicle="1")

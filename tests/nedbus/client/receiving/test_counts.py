@@ -290,7 +290,7 @@ def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:
 
 
 def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample needs at most 26 Python calls, in six classes, to receive it."""
+    """A reader that waits for each sample needs at most 27 Python calls, in six classes, to receive it."""
     called: list[list[str]] = []
 
     def trace(frame: FrameType, event: str, _: object) -> None:
@@ -308,6 +308,6 @@ def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, 
         names for names in called if any(name.startswith("Receiver.") for name in names)
     ]  # samples received along with an earlier one need no wait
     median = sorted(waited, key=len)[len(waited) // 2]
-    assert len(median) <= 26
+    assert len(median) <= 27
     classes = {name.partition(".")[0] for name in median if name[0].isupper()}
     assert classes == {"Subscription", "Receiver", "Inbox", "Reorder", "Unread", "Decoder"}

@@ -17,7 +17,7 @@ from tests.nedbus.client.numbered import wait_for_subscriber
 from tests.peers.ports import free_endpoint
 from tests.waits import DEADLINE, wait_for
 
-from .raw_samples import OTHER_KEY, VALID, drain, make_queue, put, raw
+from .receiving.raw_samples import OTHER_KEY, VALID, drain, make_queue, put, raw
 
 ATTITUDE = VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))
 
