@@ -192,10 +192,10 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
     entered, opened = threading.Event(), threading.Event()
     original = getattr(SourceOutput, method)
 
-    def wait(output: SourceOutput, *arguments: object) -> object:
+    def wait(output: SourceOutput, *arguments: object, **options: object) -> object:
         entered.set()
         opened.wait(DEADLINE)
-        return original(output, *arguments)
+        return original(output, *arguments, **options)
 
     monkeypatch.setattr(SourceOutput, method, wait)
     return entered, opened
@@ -203,7 +203,7 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
 
 @pytest.mark.parametrize(
     ("source", "method"),
-    [("sim:", "publish"), (f"mavlink:udpin:127.0.0.1:{free_port()}", "expire_stale")],
+    [("sim:", "publish_replay"), (f"mavlink:udpin:127.0.0.1:{free_port()}", "expire_stale")],
     ids=["replay", "live"],
 )
 def test_watchdog_is_not_sent_while_a_source_is_stuck(
@@ -230,7 +230,7 @@ def test_watchdog_is_not_sent_while_a_source_is_stuck(
 
 def test_watchdog_is_sent_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     """WATCHDOG is sent while a replay at speed=max waits for slow readers, because it is not stuck."""
-    entered, opened = block(monkeypatch, "publish")
+    entered, opened = block(monkeypatch, "publish_replay")
     with (
         notified(systemd, "sim:?speed=max&duration=3600", watchdog="20000") as (daemon, notifier),
         repeating(notifier.tick),

@@ -49,7 +49,8 @@ class Received(NamedTuple):
             return False
         if not one.verdict == two.verdict == "delivered":
             return False
-        return {before.message.get_type(), self.message.get_type()} == {"LOGGING_DATA"}
+        kinds = before.message.get_type(), self.message.get_type()
+        return kinds == ("LOGGING_DATA", "LOGGING_DATA")
 
 
 def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:
@@ -190,7 +191,8 @@ class ReceiveQueue:
         """Remove the next message of the vehicle that has used the least time; drop those that waited too long."""
         with self._changed:
             while ready := [each for each in self._vehicles.values() if each.waiting]:
-                vehicle, limit = min(ready, key=attrgetter("used")), TIMINGS.link_wait
+                vehicle = ready[0] if len(ready) == 1 else min(ready, key=attrgetter("used"))
+                limit = TIMINGS.link_wait
                 self._turn = vehicle.used
                 while vehicle.waiting:
                     received = vehicle.waiting.popleft()
