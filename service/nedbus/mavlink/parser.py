@@ -13,11 +13,15 @@ from .log_reassembly import Chunk
 from .senders import ignore_reason
 
 _SIGNATURE: Final = 13  # bytes
-_DECODED: Final = {number for number, each in dialect.mavlink_map.items() if each.msgname in DECODED}
 _HEADER: Final = 10  # bytes
 _LOG_HEADER: Final = struct.Struct("<H4B")  # the fields before the data
 _LOG_DATA: Final[Mapping[int, str]] = {
     number: each.msgname for number, each in dialect.mavlink_map.items() if each.msgname.startswith("LOGGING_DATA")
+}
+_CHECKED: Final = {  # by number of each message whose payload is not parsed: what its checksum adds
+    number: bytes([each.crc_extra])
+    for number, each in dialect.mavlink_map.items()
+    if each.msgname not in DECODED or number in _LOG_DATA
 }
 
 
@@ -47,14 +51,15 @@ class Received(NamedTuple):
             return False
         if not one.verdict == two.verdict == "delivered":
             return False
-        return {before.message.get_type(), self.message.get_type()} == {"LOGGING_DATA"}
+        kinds = before.message.get_type(), self.message.get_type()
+        return kinds == ("LOGGING_DATA", "LOGGING_DATA")
 
 
 def parse(parser: Any, data: bytes, name: str, peer: Any, now: float) -> Iterator[Received | Rejection]:
     """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival."""
     for message in parser.parse_buffer(data) or []:
-        raw = message.get_msgbuf()
-        if message.get_type() == "BAD_DATA":
+        kind, raw = message.get_type(), message.get_msgbuf()
+        if kind == "BAD_DATA":
             yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue
         # Only the header of a message can be parsed if the dialect lacks its definition.
@@ -62,7 +67,7 @@ def parse(parser: Any, data: bytes, name: str, peer: Any, now: float) -> Iterato
         reason = ignore_reason(system, component)
         if not reason:
             yield Received(message, system, sequence, peer, now)
-        elif not ((system and component) or message.get_type().startswith("UNKNOWN")):  # cameras etc. are normal
+        elif not ((system and component) or kind.startswith("UNKNOWN")):  # cameras etc. are normal
             yield Rejection(f"{name} system {system} component {component}", reason)
 
 
@@ -71,9 +76,10 @@ class _LogData:
 
     def __init__(self, number: int, frame: bytes, end: int) -> None:
         self._number, self._frame = number, frame
-        fields = _LOG_HEADER.unpack_from(frame[_HEADER:end].ljust(_LOG_HEADER.size, b"\0"))  # zeros are not sent
+        payload = frame[_HEADER:end].ljust(_LOG_HEADER.size, b"\0")  # zeros are not sent
+        fields = _LOG_HEADER.unpack_from(payload)
         self.sequence, self.target_system, self.target_component, self.length, self.first_message_offset = fields
-        self.data = frame[_HEADER + _LOG_HEADER.size : end]
+        self.data = payload[_LOG_HEADER.size :]
 
     def get_type(self) -> str:
         """Return the name of the message, as pymavlink does."""
@@ -100,19 +106,18 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
         if size < 0 or data[:3] != bytes([dialect.PROTOCOL_MARKER_V2, size % 256, 0]) or size > 255 or self.buf_len():
             return super().parse_buffer(data)
         try:
-            return [self.decode(bytearray(data))]
+            return [self.decode(data)]
         except dialect.MAVError as exc:
             return [dialect.MAVLink_bad_data(data, exc.message)]
 
-    def decode(self, msgbuf: bytearray) -> Any:
+    def decode(self, msgbuf: bytes | bytearray) -> Any:
         """Return a message; raise MAVError if it is damaged."""
         is_v2 = msgbuf[0] == dialect.PROTOCOL_MARKER_V2
         number = int.from_bytes(msgbuf[7:10], "little") if is_v2 else msgbuf[5]
-        if number not in dialect.mavlink_map or (number in _DECODED and number not in _LOG_DATA):
-            return super().decode(msgbuf)
+        if (extra := _CHECKED.get(number)) is None:
+            return super().decode(bytearray(msgbuf))
         end = len(msgbuf) - 2 - _SIGNATURE * (is_v2 and bool(msgbuf[2] & dialect.MAVLINK_IFLAG_SIGNED))
-        checked = msgbuf[1:end] + bytes([dialect.mavlink_map[number].crc_extra])
-        if dialect.x25crc(checked).crc != int.from_bytes(msgbuf[end : end + 2], "little"):
+        if dialect.x25crc(msgbuf[1:end] + extra).crc != int.from_bytes(msgbuf[end : end + 2], "little"):
             raise dialect.MAVError("invalid CRC")
         if number in _LOG_DATA:
             return _LogData(number, bytes(msgbuf), end)

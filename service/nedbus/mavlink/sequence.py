@@ -52,6 +52,6 @@ class SequenceCounter:
         if step > _MODULUS // 2 or not step:  # late, or a duplicate
             return -1 if step else 0
         self._last = sequence
-        lost = step - 1 if self._rate.explains(step - 1, now) else 0
+        lost = step - 1 if step == 1 or self._rate.explains(step - 1, now) else 0
         self._rate.add(now)
         return lost

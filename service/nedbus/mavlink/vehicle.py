@@ -89,6 +89,7 @@ class Vehicle:
 
     `topics`: those to deliver, None for all; `rate`: positions per second to request.
     `baud`: of a serial link; None for other links, whose bandwidth is unknown.
+    `lost`, `rebooted`: losses and a reboot that were not reported yet.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Vehicle:
         self.clock = BootClock()
         self._last_message = 0.0
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
-        self._rebooted = False
+        self.rebooted = False
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
@@ -129,17 +130,12 @@ class Vehicle:
         if counted is not None:
             self._certain = self.lost
 
-    @property
-    def has_news(self) -> bool:
-        """Whether losses or a reboot were not reported yet."""
-        return bool(self.lost or self._rebooted)
-
     def report(self, message: SourceMessage, log: StreamedTopics | None = None) -> SourceMessage:
         """Add the losses and the reboot that were not reported yet; during a ULog stream only losses of others."""
         lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
-        if not (lost or self._rebooted):
+        if not (lost or self.rebooted):
             return message
-        rebooted, self._rebooted, self.lost, self._certain = self._rebooted, False, self.lost - lost, 0
+        rebooted, self.rebooted, self.lost, self._certain = self.rebooted, False, self.lost - lost, 0
         return replace(message, lost=message.lost + lost, rebooted=rebooted)
 
     def next_request(self, now: float) -> tuple[int, float] | None:
@@ -265,7 +261,7 @@ class Vehicle:
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
         if self.clock.add(message, now):
-            self._rebooted = True
+            self.rebooted = True
             self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
             self._reset(now)
         microseconds: int = getattr(message, "time_usec", 0)

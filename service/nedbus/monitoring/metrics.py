@@ -93,7 +93,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of ULog messages when published"),
     "nedbus_log_stream_header_seconds":
         (_GAUGE, _LOG_STREAM, "Transfer time of the last ULog header; the vehicle's own log has a gap of this length"),
-    "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
+    "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send every 16th message"),
 }  # fmt: skip
 """Type, labels and help text of each metric, by name."""
 

@@ -64,6 +64,10 @@ class PayloadLayout:
                 fields[name] = decode_text(fields[name])
         return fields
 
+    def has_unset_bools(self, payload: bytes) -> bool:
+        """Return whether a bool's byte is neither 0 nor 1."""
+        return bool(self.bool_mask and int.from_bytes(payload, "little") & self.bool_mask)
+
     def count_unset_bools(self, payload: bytes) -> int:
         """Return the number of bools whose byte is neither 0 nor 1, because PX4 did not initialize it."""
         wrong = int.from_bytes(payload, "little") & self.bool_mask

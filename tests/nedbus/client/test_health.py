@@ -55,6 +55,7 @@ def test_rate_and_jitter_cover_the_last_second() -> None:
 def test_concurrent_add_does_not_break_a_snapshot() -> None:
     """A snapshot computes the jitter correctly even if another thread adds a message meanwhile."""
     stream = stream_at(0.0, 0.01, 0.02)
+    stream.snapshot(SECOND // 50)  # measures the messages
     window = stream._window
     before = window.intervals
 
@@ -70,6 +71,7 @@ def test_concurrent_add_does_not_break_a_snapshot() -> None:
 
     window.intervals = LateIntervals(before)
     assert stream.snapshot(SECOND // 50).jitter == pytest.approx(0.0)
+    assert stream.snapshot(SECOND // 50).messages == 4
     assert window.intervals[0] == 3
 
 

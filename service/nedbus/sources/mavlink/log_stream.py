@@ -6,7 +6,7 @@ import os
 import struct
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -116,14 +116,17 @@ class LogStream:
         if is_first and self._gaps:  # a stream that continues that of an earlier process begins with a gap
             self._estimate_lost()
         yield from self._check_definitions(is_first=not undecodable)
-        self._save_definitions(records, now)
+        self._save_definitions(records, now, others=len(records) - len(sizes))
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
-                if record.subscription not in self._streams:
-                    yield from self._open_stream(record.subscription)
-                stream = self._streams[record.subscription]
-                if stream is not None:
-                    yield from self._convert(stream, record.payload, now)
+                subscription, payload = record
+                if subscription not in self._streams:
+                    yield from self._open_stream(subscription)
+                if (stream := self._streams[subscription]) is not None:
+                    given = None
+                    if stream.converted or subscription.layout.has_unset_bools(payload):
+                        given = yield from self._decode(stream, payload)
+                    yield self._message(stream, payload, given, now)
             elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
             elif isinstance(record, ulog.Damage):
@@ -241,20 +244,26 @@ class LogStream:
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
         self._streams[subscription] = stream
 
-    def _convert(self, stream: ulog.LoggedStream, payload: bytes, now: float) -> Iterator[SourceMessage | Rejection]:
-        """Yield a message, after any new warnings about its fields."""
-        self._streamed.add(stream.address)
-        topic, reported = stream.subscription.name, len(stream.omitted)
+    def _message(
+        self, stream: ulog.LoggedStream, payload: bytes, given: Mapping[str, object] | None, now: float
+    ) -> SourceMessage:
+        address, definition = stream.address, stream.definition
+        self._streamed.add(address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
-        given, definition = stream.decode(payload) if stream.converted else None, stream.definition
+        return SourceMessage(now, address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload)
+
+    def _decode(
+        self, stream: ulog.LoggedStream, payload: bytes
+    ) -> Generator[Rejection, None, Mapping[str, object] | None]:
+        """Return the fields of a message if they must be converted, and yield any new warnings about them."""
+        topic, reported = stream.subscription.name, len(stream.omitted)
+        given = stream.decode(payload) if stream.converted else None
         for name, reason in islice(stream.omitted.items(), reported, None):
             yield Rejection(f"{self._name} {topic}.{name}", reason, count=0)
         if count := stream.subscription.layout.count_unset_bools(payload):
             reason = f"{ulog.UNSET_BOOLS.format(topic)} ({count} in the first such message)"
             yield Rejection(f"{self._name} {topic}", reason, count=0)
-        yield SourceMessage(
-            now, stream.address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload
-        )
+        return given
 
     def _count_gap(self, lost: int) -> None:
         self._gaps += 1
@@ -292,8 +301,13 @@ class LogStream:
             self._unsaved += len(data)
             self._stop_saving(str(OutputError(file.path, exc)))
 
-    def _save_definitions(self, records: Iterable[ulog.Record], now: float) -> None:
-        """Update the state file; create the log file with the first message, but not more often than every 5 s."""
+    def _save_definitions(self, records: Iterable[ulog.Record], now: float, *, others: int) -> None:
+        """Update the state file; create the log file with the first message, but not more often than every 5 s.
+
+        `others`: number of records that are not data messages.
+        """
+        if self._has_data and not (self._is_pending or others):
+            return
         for record in records:
             if isinstance(record, ulog.Data) and not self._has_data:
                 self._has_data = True

@@ -98,7 +98,7 @@ class LogReceiver:
 
     def _step(self) -> None:
         if any(vehicle.client.status.state == "streaming" for vehicle in self.vehicles.values()):
-            self._stop.wait(_PAUSE)
+            time.sleep(_PAUSE)
         items = list[Received | Rejection]()
         try:
             for item in self._reader.read(_TICK):
@@ -127,7 +127,7 @@ class LogReceiver:
     def _follow_stream(self, vehicle: _Vehicle, received: Received) -> Received | Rejection:
         message, kind, now = received.message, received.message.get_type(), received.time
         if kind.startswith("LOGGING_DATA"):
-            return self._process_data(received, vehicle)
+            return self._process_data(received, vehicle, kind)
         if kind == "HEARTBEAT":
             vehicle.peer, vehicle.is_known = received.peer, True
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -142,9 +142,9 @@ class LogReceiver:
             vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received
 
-    def _process_data(self, received: Received, vehicle: _Vehicle) -> Received | Rejection:
+    def _process_data(self, received: Received, vehicle: _Vehicle, kind: str) -> Received | Rejection:
         """Acknowledge and reassemble data of the ULog stream; see `_process`."""
-        message, kind, now = received.message, received.message.get_type(), received.time
+        message, now = received.message, received.time
         target = message.target_system, message.target_component
         is_ours = target == (SYSTEM, COMPONENT)
         if is_ours and vehicle.is_known and vehicle.reassembly.is_new and message.sequence and not vehicle.refusal:

@@ -159,7 +159,8 @@ class ReceiveQueue:
         """Remove the next message of the vehicle that has used the least time; drop those that waited too long."""
         with self._changed:
             while ready := [each for each in self._vehicles.values() if each.waiting]:
-                vehicle, limit = min(ready, key=attrgetter("used")), TIMINGS.link_wait
+                vehicle = ready[0] if len(ready) == 1 else min(ready, key=attrgetter("used"))
+                limit = TIMINGS.link_wait
                 self._turn = vehicle.used
                 while vehicle.waiting:
                     received = vehicle.waiting.popleft()

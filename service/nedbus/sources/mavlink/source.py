@@ -126,12 +126,14 @@ class _LinkSession:
             items: Iterable[SourceMessage | Rejection] = () if converted is None else (converted,)
         else:
             items = log.add(chunk, now) if log is not None else ()
+        is_measured = log is None or chunk is None  # the delay is that of the first message in each part of a stream
         for each in items:
             if not isinstance(each, SourceMessage):
                 yield each
                 continue
-            item = vehicle.report(each, log) if vehicle.has_news else each
-            if log is not None and item.source:
+            item = vehicle.report(each, log) if vehicle.lost or vehicle.rebooted else each
+            if log is not None and not is_measured:
+                is_measured = True
                 log.add_delay(item.timestamp, time.monotonic())
             if item.rebooted:
                 address = Address(item.address.vehicle, DEFAULT_TOPIC)
