@@ -83,9 +83,9 @@ def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path:
 
 @pytest.mark.slow
 def test_examples_name_the_endpoint_that_does_not_answer(start: Start, tmp_path: Path) -> None:
-    """Without a service, each longer example prints one line that names the endpoint, and exits with 1."""
+    """Without a service, each example prints one line that names the endpoint, and exits with 1."""
     endpoint = free_endpoint()
-    names = [*PRINTS.keys() - {"alarm.py", "position.py"}, "publish.py"]
+    names = [*PRINTS.keys() - {"alarm.py"}, "publish.py"]
     for process in [run_example(start, name, endpoint, tmp_path) for name in names]:
         assert process.wait() == 1, process.err
         [line] = process.err.splitlines()
