@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from nedbus.errors import InvalidMessageError
 from nedbus.log_event import about
 from nedbus.samples import Sample
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, FieldReader, Selection, is_unix_time, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, TOPICS, Address, FieldReader, Selection, is_unix_time, vehicle_name
 
 from .readers import FlightReader, open_reader
 from .selection import matching, require_one_vehicle
@@ -162,7 +162,7 @@ def estimate_utc(reader: FlightReader) -> dict[str, UtcEstimate]:
     found = defaultdict[str, UtcEstimate](UtcEstimate)
     for record in reader.records():
         address, definition = record.stream.address, record.stream.definition
-        if record.error or record.stream.check(record.payload):
+        if address.topic not in TOPICS or record.error or record.stream.check(record.payload):
             continue
         if definition.types.keys().isdisjoint(FIELDS):
             found[address.vehicle].add(address.stream, record.stream.timestamp(record.payload)[0] or 0, {}, None)
