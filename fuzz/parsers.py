@@ -18,7 +18,7 @@ from pymavlink.generator.mavcrc import x25crc
 from nedbus import ulog
 from nedbus.errors import SourceError
 from nedbus.flights.readers import ReadOptions
-from nedbus.flights.readers.mcap import McapReader
+from nedbus.flights.readers.mcap import McapReader, RecordedStream
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import SourceMessage
@@ -27,9 +27,12 @@ from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.mavlink.reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from nedbus.sources.mavlink.receive_queue import Received
 from nedbus.sources.options import MavlinkOptions
+from nedbus.tables.arrays import _Buffer
 from nedbus_msgs import (
     BY_TOPIC,
     MESSAGES,
+    TOPICS,
+    Address,
     DecodeError,
     Definition,
     EncodeError,
@@ -127,21 +130,22 @@ def parse_cdr(data: bytes) -> int:
     layouts = [*definition.layouts.values()]
     layout = layouts[data[1] % len(layouts)] if len(data) > 1 else layouts[0]
     payload = data[2:]
-    arrays, valid, accepted = arrays_of(definition), False, None
-    if layout.types.items() <= definition.types.items():  # as `nedbus.read` does
-        accepted, mask = arrays.decode_cdr([payload], layout)
-        valid = bool(mask[0])
+    topic = next(iter(definition.topics))
+    address = Address("1", topic, 0 if TOPICS[topic].instances else None)
+    buffer = _Buffer(RecordedStream("", address, definition, layout, frozenset()))
+    buffer.add(payload, 0, None)  # as `nedbus.read` does
+    accepted, valid, _ = buffer.decode(definition)
     try:
         fields = decode_with(definition, payload, layout)
         message = upgrade_with(definition, fields)
     except (DecodeError, ValidationError):
-        assert not valid, "the array accepts what the model rejects"
+        assert not valid.any(), "the array accepts what the model rejects"
         return 0
     again = decode_with(definition, encode_with(definition, fields, layout), layout)
     assert repr(again) == repr(fields)  # not ==, because NaN differs from itself
-    if accepted is not None and valid:
+    if valid.all():
         encode = codec_of(definition).encode
-        assert encode(arrays.to_message(accepted[0])) == encode(message), "the array differs"
+        assert encode(arrays_of(definition).to_message(accepted[0])) == encode(message), "the array differs"
     return 1
 
 

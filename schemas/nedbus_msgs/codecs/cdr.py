@@ -77,11 +77,14 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
 
 
 def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None:
-    """Return the only layout of a message whose exact size and rules a payload fits; None without one."""
-    found = list[Layout]()
-    for layout in definition.layouts.values():
-        cdr = cdr_layout(layout)
-        if len(payload) - cdr.size in range(_ALIGNMENT) and not cdr.check(payload):
+    """Return the only layout of a message whose size and rules a payload fits; None without one.
+
+    A payload has the size of the layout, or else that with the bytes that PX4 appends.
+    """
+    forms, found = [(layout, cdr_layout(layout)) for layout in definition.layouts.values()], list[Layout]()
+    exact = [layout for layout, cdr in forms if len(payload) - cdr.size in range(_ALIGNMENT)]
+    for layout in exact or [layout for layout, cdr in forms if len(payload) == cdr.limit]:
+        if not cdr_layout(layout).check(payload):
             with suppress(InvalidMessageError):
                 encode_upgraded(definition, decode_with(definition, payload, layout))
                 found.append(layout)

@@ -13,6 +13,7 @@ from .observation import Observation
 _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _MAX_TEXT: Final = 300  # characters of text from a peer
+_MAX_WARNING: Final = 602  # characters of the origin and the reason of a rejection
 _SILENT_PERIODS: Final = 3.0  # message intervals after which an address is silent
 _MAX_TIME: Final = 1e11  # s; maximum Unix time accepted from a service
 _CLOCK_WARNING: Final = 0.5  # s
@@ -124,8 +125,9 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         yield Finding("source", name, "warning", f"no more messages of {list_names(stale)}", advice)
     if source.rejected > 0:
         why = f" ({list_names(source.rejections)})" if source.rejections else ""
-        advice = "rejected messages are not published; see the service's log or the @rejected keys for reasons"
-        yield Finding("source", name, "warning", f"messages rejected: {source.rejected:,}{why}", advice)
+        first = "".join(f"; {text[:_MAX_WARNING]}" for text in source.warnings[:1])
+        advice = "rejected messages are not published; see the service's log or the @rejected keys for all reasons"
+        yield Finding("source", name, "warning", f"messages rejected: {source.rejected:,}{why}{first}", advice)
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         open_reader,
     )
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
-    from .utc import FIELDS, UtcEstimate, UtcOffset, add_array, estimate_utc, find_utc, utc_of
+    from .utc import FIELDS, UtcEstimate, UtcOffset, estimate_utc, find_utc, utc_of
     from .writer import RecordingWriter
 else:
     # No submodule may share the name of an export: importing it would replace the export.
@@ -37,7 +37,7 @@ else:
         ("", "readers"): "SUFFIXES FileStream FlightReader ReadOptions Record Replay check_recording find_format"
         " format_of open_reader",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
-        ("", "utc"): "FIELDS UtcEstimate UtcOffset add_array estimate_utc find_utc utc_of",
+        ("", "utc"): "FIELDS UtcEstimate UtcOffset estimate_utc find_utc utc_of",
         ("mcap", "writer"): "RecordingWriter",
     }
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})

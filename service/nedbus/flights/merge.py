@@ -51,7 +51,8 @@ class FlightFile:
     @cached_property
     def utc(self) -> Mapping[str, UtcOffset | str]:
         """The UTC offset of each vehicle, by its own name, or why it is unknown; reads the file."""
-        with open_reader(self.path, replace(self.options, topics=ReadOptions().topics)) as reader:
+        topics = ReadOptions().topics if self.options.topics else None  # a file may have other topics only
+        with open_reader(self.path, replace(self.options, topics=topics)) as reader:
             estimates = estimate_utc(reader)
             return {name: each.result(reader.boot_utc) for name, each in estimates.items()}
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from nedbus.errors import InvalidMessageError
 from nedbus.log_event import about
 from nedbus.samples import Sample
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, FieldReader, Selection, is_unix_time, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, TOPICS, Address, FieldReader, Selection, is_unix_time, vehicle_name
 
 from .readers import FlightReader, open_reader
 from .selection import matching, require_one_vehicle
@@ -76,7 +76,8 @@ class UtcEstimate:
 
     def add(self, stream: str, timestamp: int, values: Mapping[str, int | None], relative: int | None) -> None:
         """Add a message: its fields that provide UTC, and the time from its timestamp to that UTC, if it has one."""
-        self._stamps[not values, stream].append(min(timestamp, _MAX_TIME))
+        timestamp = min(timestamp, _MAX_TIME)
+        self._stamps[not values, stream].append(timestamp)
         for name, value in values.items():
             if value is None:
                 continue
@@ -86,9 +87,21 @@ class UtcEstimate:
                 times.append(timestamp)
                 offsets.append(utc - timestamp)
 
-    def add_others(self, stream: str, timestamps: Iterable[int]) -> None:
-        """Add messages of a stream without UTC."""
-        self._stamps[True, stream].extend(timestamps)
+    def add_array(self, stream: str, messages: MessageArray) -> None:
+        """Add a structured array from `read`, as `add` does."""
+        metadata: Mapping[str, Any] = messages.dtype.metadata or {}
+        names = set(messages.dtype.names or ()).difference(metadata.get("missing", ()))
+        known = [name for name in FIELDS if name in names]
+        stamps = messages["timestamp"].clip(0, _MAX_TIME).astype("i8")
+        self._stamps[not known, stream].frombytes(stamps.tobytes())
+        for name in known:
+            values = messages[name].clip(max=_MAX_TIME).astype("i8")
+            utc = stamps - values if name == FIELDS[1] else values - (messages[RELATIVE] if RELATIVE in names else 0)
+            is_used = is_unix_time(utc) & ~is_unix_time(stamps)
+            if is_used.any():
+                times, offsets = self._sources[FIELDS.index(name), stream]
+                times.frombytes(stamps[is_used].tobytes())
+                offsets.frombytes((utc - stamps)[is_used].tobytes())
 
     def result(self, boot_utc: int = 0) -> UtcOffset | str:
         """Return the offset, or why it is unknown, "" without UTC; `boot_utc`: of the file's metadata [us]."""
@@ -97,7 +110,7 @@ class UtcEstimate:
         positions = [stamps for stream, stamps in found.items() if stream == DEFAULT_TOPIC]
         others = positions or [*found.values()]
         used = [*with_utc, *others] if with_utc else [*found.values()][:1]
-        unix = sum(bool(is_unix_time(each)) for stamps in used for each in stamps)
+        unix = sum(sum(map(is_unix_time, stamps)) for stamps in used)
         if unix > sum(map(len, used)) / 2:
             return UtcOffset("timestamp", 0, unix, 0)
         agreement: Agreement | str = ""
@@ -141,7 +154,7 @@ def find_utc(
     vehicle, estimate = vehicle_name(vehicle), UtcEstimate()
     if isinstance(flight, Mapping):
         for name, messages in flight.items():
-            add_array(estimate, name, messages)
+            estimate.add_array(name, messages)
         return estimate.result()
     if not isinstance(flight, str | Path):
         samples = [each for each in flight if vehicle in (ANY, each.vehicle)]
@@ -162,7 +175,7 @@ def estimate_utc(reader: FlightReader) -> dict[str, UtcEstimate]:
     found = defaultdict[str, UtcEstimate](UtcEstimate)
     for record in reader.records():
         address, definition = record.stream.address, record.stream.definition
-        if record.error or record.stream.check(record.payload):
+        if address.topic not in TOPICS or record.error or record.stream.check(record.payload):
             continue
         if definition.types.keys().isdisjoint(FIELDS):
             found[address.vehicle].add(address.stream, record.stream.timestamp(record.payload)[0] or 0, {}, None)
@@ -175,19 +188,6 @@ def estimate_utc(reader: FlightReader) -> dict[str, UtcEstimate]:
     for address in reader.definitions:
         found[address.vehicle]
     return found
-
-
-def add_array(estimate: UtcEstimate, stream: str, messages: Any) -> None:
-    """Add a structured array from `read`."""
-    names = set(messages.dtype.names or ()).difference((messages.dtype.metadata or {}).get("missing", ()))
-    used = [name for name in ("timestamp", *FIELDS, RELATIVE) if name in names]
-    known = [name for name in FIELDS if name in names]
-    if not known:
-        estimate.add_others(stream, messages["timestamp"].clip(0, _MAX_TIME).tolist())
-        return
-    for values in zip(*(messages[name].tolist() for name in used), strict=True):
-        row = dict(zip(used, values, strict=True))
-        estimate.add(stream, row["timestamp"], {name: row[name] for name in known}, row.get(RELATIVE))
 
 
 def _add(estimate: UtcEstimate, address: Address, message: object, missing: frozenset[str]) -> None:

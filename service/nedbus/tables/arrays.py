@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.extras import import_optional
-from nedbus.flights import FIELDS, FileStream, ReadOptions, UtcEstimate, UtcOffset, add_array, open_reader
+from nedbus.flights import FIELDS, FileStream, ReadOptions, UtcEstimate, UtcOffset, open_reader
 from nedbus_msgs import Address, Definition, decode_text, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
@@ -101,7 +101,7 @@ class FlightArrays:
         estimate = UtcEstimate()
         for address in self.addresses:
             if address.vehicle == vehicle and self._buffers_of(address):
-                add_array(estimate, address.stream, self._decode(address).valid_messages)
+                estimate.add_array(address.stream, self._decode(address).valid_messages)
         return estimate.result(self.boot_utc)
 
     def _buffers_of(self, address: Address) -> list[_Buffer]:

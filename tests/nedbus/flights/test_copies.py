@@ -39,6 +39,18 @@ def copy_without_metadata(source: Path, target: Path, *, rename: dict[str, str] 
         writer.finish()
 
 
+def start_recording(folder: Path, out: BytesIO) -> tuple[Writer, int]:
+    """Start a recording with the channel of one message of nedbus's recordings, without metadata."""
+    with RecordingWriter(path := folder / "a.mcap") as recorder:
+        recorder.write_messages([(message(1), Address("1", VLP), Provenance(), 1)])
+    schema, channel, _ = next(NonSeekingReader(BytesIO(path.read_bytes())).iter_messages())
+    assert schema is not None
+    writer = Writer(out, chunk_size=2**20)
+    writer.start(profile="ros2", library="extended")
+    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+    return writer, writer.register_channel(channel.topic, "cdr", number, {})
+
+
 def test_copy_without_metadata_has_all_streams(tmp_path: Path) -> None:
     """The names of nedbus's own channels, with an instance at the end, are parsed as such."""
     original, copy = tmp_path / "a.mcap", tmp_path / "b.mcap"
@@ -83,16 +95,8 @@ def test_newer_version_of_a_topic_is_read(tmp_path: Path, caplog: pytest.LogCapt
 
 def test_messages_behind_the_indexed_chunks_are_read(tmp_path: Path) -> None:
     """Messages that the index of an MCAP file does not list are read by arrays, flights and replays."""
-    path = tmp_path / "a.mcap"
-    with RecordingWriter(path) as recorder:
-        recorder.write_messages([(message(1), Address("1", VLP), Provenance(), 1)])
-    found = next(NonSeekingReader(BytesIO(path.read_bytes())).iter_messages())
-    assert found[0] is not None
     out = BytesIO()
-    writer = Writer(out, chunk_size=2**20)
-    writer.start(profile="ros2", library="extended")
-    schema = writer.register_schema(found[0].name, found[0].encoding, found[0].data)
-    channel = writer.register_channel(f"/1/{VLP}", "cdr", schema, {})
+    writer, channel = start_recording(tmp_path, out)
     for index in range(13):
         payload = encode_with(DEFAULT, message(1 + index, x=float(index)).model_dump(), DEFAULT.current)
         if index == 10:
@@ -100,11 +104,30 @@ def test_messages_behind_the_indexed_chunks_are_read(tmp_path: Path) -> None:
             setattr(writer, "_Writer__chunk_builder", None)  # noqa: B010 - further messages are not in chunks
         writer.add_message(channel, index, payload, index)
     writer.finish()
-    path.write_bytes(out.getvalue())
+    (path := tmp_path / "b.mcap").write_bytes(out.getvalue())
     assert nedbus.read(path)["x"].tolist() == [float(index) for index in range(13)]
     with nedbus.open(path) as flight:
         assert len(list(flight())) == 13
     assert len(list(open_replay(f"mcap:{path}?speed=max").messages)) == 13
+
+
+def test_malformed_payload_is_skipped_alone(tmp_path: Path) -> None:
+    """A bool other than 0 or 1, a wrong length or another encapsulation makes only that message invalid."""
+    payload = encode_with(DEFAULT, message(1, x=1.0, y=2.0, xy_valid=True).model_dump(), DEFAULT.current)
+    first_bool = 4 + 16
+    assert payload[first_bool] == 1
+    others = [payload[:first_bool] + bytes([byte]) + payload[first_bool + 1 :] for byte in (2, 3, 255)]
+    others += [payload[:-1], payload + bytes(4), b"\x00\x00" + payload[2:]]
+    out = BytesIO()
+    writer, channel = start_recording(tmp_path, out)
+    for index, each in enumerate([payload, *others, payload]):
+        writer.add_message(channel, index, each, index)
+    writer.finish()
+    (path := tmp_path / "b.mcap").write_bytes(out.getvalue())
+    assert nedbus.read(path)[["x", "y", "xy_valid"]].tolist() == 2 * [(1.0, 2.0, True)]
+    with nedbus.open(path) as flight, flight() as samples:
+        assert [each.message.x for each in samples] == [1.0, 1.0]
+        assert samples.skipped.total() == len(others)
 
 
 @pytest.mark.parametrize("new_id", [0, 1])

@@ -74,3 +74,18 @@ def test_input_topics_belong_to_their_vehicle() -> None:
     assert {each.address.topic for each in messages if each.source == "mcap-input"} == inputs
     assert nedbus.utc_of(INPUTS) is None
     assert len(nedbus.align(INPUTS)) == 50
+
+
+def test_damaged_timestamp_leaves_the_utc_known(tmp_path: Path) -> None:
+    """A timestamp beyond 63 bits is an outlier like others, in a file as in its arrays."""
+    path, address = tmp_path / "a.mcap", Address("1", "sensor_gps", 0)
+    times = [1_000_000 * index for index in range(1, 20)]
+    with RecordingWriter(path) as writer:
+        for time in (*times, 2**63 + 5):
+            utc = BOOT_UTC + min(time, 20_000_000)
+            sent = nedbus.SensorGps.model_validate({"timestamp": time, "time_utc_usec": utc})
+            writer.write_messages([(sent, address, Provenance(), 1000 * utc)])
+    found = nedbus.utc_of(path)
+    assert found is not None
+    assert (found.offset_us, found.count) == (BOOT_UTC, 19)
+    assert nedbus.utc_of(nedbus.read(path, ["*"])) == found

@@ -26,6 +26,7 @@ _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "
 _SIMILAR: Final = 0.8  # minimum similarity of a name that counts as a misspelling
 _MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
+_MAX_WARNINGS: Final = 5  # shown per source: damage of its file, or the first rejection of each origin
 
 
 @command
@@ -110,6 +111,8 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         for what, head in _ABSENT.items():
             if absent := [each for source in service.sources for each in getattr(source, what)]:
                 write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+        for text in (each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]):
+            write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
         for each in (log for source in service.sources for log in source.log_streams):
             write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
         if refused := service.refused:

@@ -7,6 +7,7 @@ from typing import BinaryIO, Final, NamedTuple
 
 from nedbus.errors import ArgumentError, ConfigError, SourceError
 from nedbus.extras import import_optional
+from nedbus_msgs import DEFAULT, RELEASES
 
 from .reader import FlightReader, ReadOptions
 
@@ -67,6 +68,8 @@ def open_reader(path: Path, options: ReadOptions = ReadOptions(), *, form: str |
     kind = _FORMATS[name]
     if options.layout is not None and kind.extra != "mcap":
         raise ArgumentError("layout", options.layout, f"none, because a {kind.suffix} file defines its own layouts")
+    if options.layout not in (known := (None, *RELEASES, *DEFAULT.layouts)):
+        raise ArgumentError("layout", options.layout, f"one of {', '.join(dict.fromkeys(map(str, known[1:])))}")
     module = import_optional(kind.extra, f"{__package__}.{kind.module}")
     reader: FlightReader = getattr(module, kind.reader)(path, options)
     return reader

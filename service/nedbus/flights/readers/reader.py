@@ -112,6 +112,11 @@ class FlightReader(ABC):
             payload=payload, time=time,
         )  # fmt: skip
 
+    def shrinkage(self) -> list[str]:
+        """Return a list of at most one warning at the end of a file: it has fewer bytes than when it was opened."""
+        self.damaged |= (is_shorter := self.position < self.total)
+        return [f"the file has shrunk from {self.total} to {self.position} bytes"] if is_shorter else []
+
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         for each in self._resources:

@@ -63,11 +63,12 @@ class TlogReader(FlightReader):
         self._foreign = self._lost = 0  # bytes that are not MAVLink; messages before the next one
         self._rebooted = False
         self._streams: dict[Address, _ConvertedStream] = {}
+        self._shrinkage: list[str] = []
 
     @property
     def warnings(self) -> list[str]:
         """Damage so far."""
-        return [f"damaged ({self._foreign} B are not MAVLink)"] if self._foreign else []
+        return [f"damaged ({self._foreign} B are not MAVLink)"] * bool(self._foreign) + self._shrinkage
 
     def records(self) -> Iterator[Record]:
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
@@ -131,6 +132,7 @@ class TlogReader(FlightReader):
                     continue
                 yield _HEAD.unpack_from(data)[0], data[8:length]
                 self.position, data = self.position + length, data[length:]
+            self._shrinkage = self.shrinkage()
 
 
 def _record_length(data: bytes) -> int:

@@ -107,6 +107,7 @@ class UlogReader(FlightReader):
                 while chunk := file.read(_CHUNK):
                     self.position += len(chunk)
                     yield self._parser.feed(chunk)
+            self._warnings += self.shrinkage()
             yield self._parser.close()
             self._is_read = True
             self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)

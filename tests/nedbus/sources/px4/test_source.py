@@ -233,6 +233,26 @@ def test_key_without_type_hash_needs_layout(listen: Listen, zenoh_session: Sessi
     assert times(second.receive()) == [1]
 
 
+@pytest.mark.parametrize("type_hash_of_key", [type_hash("1.16"), NO_HASH])
+@pytest.mark.parametrize("trailer", [b"", 8 * b"\xa5"])
+def test_payloads_of_another_layout_are_explained(
+    run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, *, type_hash_of_key: str, trailer: bytes
+) -> None:
+    """`info` and `doctor` name the release whose layout the payloads have, from ROS 2 or with the bytes PX4 appends."""
+    run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:?layout=1.16")
+    px4 = Px4(zenoh_session, layout="1.15")
+    px4.type_hash = type_hash_of_key
+    fields = downgrade(message(1, x=1.0, y=2.0, xy_valid=True), "1.15")
+    for _ in range(3):
+        px4.raw(encode_cdr(fields, layout="1.15") + trailer)
+    wait_for(lambda: source_status(bus).rejected >= 3, what="the rejections")
+    reason = f"{204 + len(trailer)} bytes, expected 220 for layout 1.16; they fit the layout of PX4 1.15"
+    for command in ("info", "doctor"):
+        shown = " ".join(run_command(command, "--connect", endpoint).out.split())
+        assert reason in shown
+        assert "rebuild px4_msgs at release/1.15" in shown
+
+
 WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuint8 COUNT = 2\n"
 
 
