@@ -221,7 +221,7 @@ class TestAbnormalStreams:
 
     def test_stream_survives_link_outage(self) -> None:
         """The stream continues after an outage of some seconds; the messages sent meanwhile are counted as lost."""
-        with Link("armed").play("flight1") as link:
+        with Link("armed", header=100).play("flight1") as link:
             link.expect_states(*STARTED)
             link.peer.trigger("vanish")
             link.expect_states(*STARTED, ("ended", "link_lost"))
