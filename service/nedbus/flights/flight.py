@@ -289,7 +289,9 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         finally:
             flights.close()
         if not is_found:
-            matching(flights.files[0].path, sorted(flights.definitions), self._selections[0])  # raises an AddressError
+            files = flights.files
+            where = files[0].path if len(files) == 1 else f"any of the {len(files)} files"
+            matching(where, sorted(flights.definitions), self._selections[0])  # raises an AddressError
 
 
 @lru_cache(1024)

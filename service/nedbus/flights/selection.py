@@ -34,14 +34,14 @@ def _topics_of(name: str) -> Set[str]:
     return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 
-def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
-    """Return the selected addresses of a file; raise AddressError if there are none."""
+def matching(where: Path | str, addresses: Sequence[Address], selection: Selection) -> list[Address]:
+    """Return the selected addresses of a flight; raise AddressError if there are none."""
     topic, vehicle = selection.topic, selection.vehicle
     steps = {"vehicle": Selection(vehicle=vehicle), "topic": Selection(topic, vehicle), "instance": selection}
     for part, step in steps.items():
         if not any(map(step.matches, addresses)):
             expected = f"one of {_list(addresses)}"
-            raise AddressError(part, getattr(selection, part), expected, problem=f"is not in {path}")
+            raise AddressError(part, getattr(selection, part), expected, problem=f"is not in {where}")
     return list(filter(selection.matches, addresses))
 
 

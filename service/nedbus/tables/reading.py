@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
 
@@ -39,6 +40,7 @@ _UTC_TOPICS: Final = {name for name, each in BY_TOPIC.items() if not each.types.
 FlightPath = str | Path
 Files = FlightPath | Sequence[FlightPath]
 _Topics = list[str] | tuple[str, ...]
+_Select = Callable[[Path, Sequence[Address], Selection], list[Address]]
 
 
 class _Filter(TypedDict, total=False):
@@ -169,22 +171,17 @@ def _read_one(
     path: Path,
     topics: Set[str] | None,
     selections: Sequence[Selection],
-    select: Callable[[Path, Sequence[Address], Selection], list[Address]],
+    select: _Select,
     *,
     layout: str | None,
     utc: bool,
 ) -> ReadStreams:
-    wanted = topics if topics is None or not utc else topics | _UTC_TOPICS
+    options = ReadOptions(topics if topics is None or not utc else topics | _UTC_TOPICS, layout=layout)
     try:
-        flight = FlightArrays(path, ReadOptions(wanted, layout=layout), lambda each: _matches(selections, each))
+        flight = FlightArrays(path, options, lambda each: _matches(selections, each))
         chosen = dict.fromkeys(each for one in selections for each in select(path, flight.addresses, one))
     except (AddressError, SourceError):
-        if topics is None or topics >= TOPICS.keys():
-            raise
-        # The file has no such stream: read the names of those that it has, for the error.
-        others = FlightArrays(path, ReadOptions(topics | TOPICS.keys(), layout=layout), lambda _: False)
-        for one in selections:
-            select(path, others.addresses, one)
+        _explain_absent(path, options, selections, select)
         raise
     require_one_vehicle(path, chosen, selections[0].vehicle)
     streams = {address.stream: found for address, found in flight.read(chosen).items()}
@@ -199,7 +196,7 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
     for topic in wanted or ():
         Selection(topic)  # raises AddressError for a name that no topic can have
     options = ReadOptions(wanted if wanted is None else wanted | _UTC_TOPICS, layout=layout)
-    flights = [FlightArrays(path, options, lambda each: wanted is None or each.topic in wanted) for path in paths]
+    flights = [_open_for_merge(path, options, wanted) for path in paths]
     names = distinct_names([(each.path, {one.vehicle for one in each.addresses}) for each in flights])
     named = [(flight, own, name) for flight, known in zip(flights, names, strict=True) for own, name in known.items()]
     if vehicle not in (ANY, *(name for _, _, name in named)):
@@ -221,6 +218,22 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
     for flight in flights:
         _log_warnings(flight)
     return ReadStreams(streams, min(starts, default=0), None)
+
+
+def _open_for_merge(path: Path, options: ReadOptions, wanted: Set[str] | None) -> FlightArrays:
+    try:
+        return FlightArrays(path, options, lambda each: wanted is None or each.topic in wanted)
+    except SourceError:
+        _explain_absent(path, options, [Selection(topic) for topic in sorted(wanted or ())], matching)
+        raise
+
+
+def _explain_absent(path: Path, options: ReadOptions, selections: Sequence[Selection], select: _Select) -> None:
+    """Raise AddressError with the streams of a file if it has none of the selected ones."""
+    if options.topics is not None and not TOPICS.keys() <= {*options.topics}:
+        known = FlightArrays(path, replace(options, topics={*options.topics, *TOPICS}), lambda _: False).addresses
+        for one in selections:
+            select(path, known, one)
 
 
 def _log_warnings(flight: FlightArrays) -> None:
