@@ -15,10 +15,21 @@ from nedbus_msgs import BY_TOPIC, Address, FieldReader
 from . import detectors
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
 from .detectors import ChangeDetector, Fields, Finding
-from .event import WINDOW, Condition, Event, State, explain, state_of
+from .event import ALONE, WINDOW, Condition, Event, State, explain, state_of, without_wild
 from .kinds import KINDS
 from .position import PositionDetector
-from .rules import EVIDENCE, FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
+from .rules import (
+    EVIDENCE,
+    FLAPPING_CHANGES,
+    MAX_ALONE,
+    MAX_BURST,
+    MAX_SILENCE,
+    MAX_SINGLE,
+    PAUSE,
+    PERIODIC,
+    POSITIONS,
+    RECENT,
+)
 from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
@@ -60,6 +71,7 @@ class Vehicle:
         self.armed: bool | None = None
         self.time = self.last_seen = 0.0
         self.boot: float | None = None
+        self._before = -math.inf  # time of the message before the last one in its stream
         self._is_off = False  # the last time since boot was not the expected one
         self._on_event = on_event
         self._common = common
@@ -94,6 +106,7 @@ class Vehicle:
             return
         if detector.pause:
             detector.due = time + detector.pause
+        self._before, detector.time = detector.time, time
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
@@ -203,7 +216,7 @@ class Vehicle:
         is_flying = self.armed is not False
         found = [each for each in self.conditions.values() if is_flying or KINDS[each.kind].on_ground != "info"]
         kinds = {each.kind for each in found}
-        for event in reversed(self.recent):
+        for event in reversed(without_wild(self.recent)):
             if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
                 continue
@@ -228,15 +241,20 @@ class Vehicle:
             return
         for key in keys:
             self._on_ground.pop(key, None)
+        held = {key: self.conditions[key] for key in keys if key in self.conditions}
         if found.change == "end":
-            held = [self.conditions.pop(key) for key in keys if key in self.conditions]
-            if known := [each.since for each in held if not each.initial]:
+            for key in held:
+                del self.conditions[key]
+            if known := [each.since for each in held.values() if not each.initial]:
                 lasted = max(0.0, changed - min(known))
                 text = f"{text} after {format_duration(lasted)}"
             elif kind.first:
                 text = kind.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
-        numbers = {**found.numbers, "armed": 1} if self.armed and found.kind == "text" else found.numbers
+        is_alone = any(each.begin.time == self._before and not each.initial for each in held.values())
+        is_alone &= kind.message in PERIODIC and time - self._before <= MAX_ALONE
+        marks = {"armed": self.armed and found.kind == "text", ALONE: is_alone}
+        numbers = {**found.numbers, **{name: 1 for name, is_set in marks.items() if is_set}}
         event = Event(
             self.name, found.kind, found.change, severity, text, time, boot, topic, numbers, found.names, lasted
         )
