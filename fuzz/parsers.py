@@ -127,21 +127,13 @@ def parse_cdr(data: bytes) -> int:
     layouts = [*definition.layouts.values()]
     layout = layouts[data[1] % len(layouts)] if len(data) > 1 else layouts[0]
     payload = data[2:]
-    arrays, valid, accepted = arrays_of(definition), False, None
-    if layout.types.items() <= definition.types.items():  # as `nedbus.read` does
-        accepted, mask = arrays.decode_cdr([payload], layout)
-        valid = bool(mask[0])
     try:
         fields = decode_with(definition, payload, layout)
-        message = upgrade_with(definition, fields)
+        upgrade_with(definition, fields)
     except (DecodeError, ValidationError):
-        assert not valid, "the array accepts what the model rejects"
         return 0
     again = decode_with(definition, encode_with(definition, fields, layout), layout)
     assert repr(again) == repr(fields)  # not ==, because NaN differs from itself
-    if accepted is not None and valid:
-        encode = codec_of(definition).encode
-        assert encode(arrays.to_message(accepted[0])) == encode(message), "the array differs"
     return 1
 
 

@@ -12,7 +12,7 @@ from typing import Any, Final, Generic
 import numpy as np
 import numpy.typing as npt
 
-from .codecs.cdr import HEADER, cdr_layout
+from .codecs.cdr import cdr_layout
 from .codecs.msgpack import codec_of
 from .definitions import DEFAULT, M, definition_of
 from .errors import InvalidMessageError
@@ -130,37 +130,13 @@ class Arrays(Generic[M]):
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
         """Encode messages as CDR payloads without validating them; the model must have all fields of the layout."""
-        payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), self._cdr(layout))
-        for name in layout.types:
-            payloads[name] = array[name]
-        return payloads
-
-    def decode_cdr(self, payloads: Sequence[bytes], layout: Layout) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-        """Decode CDR payloads; return the messages and a mask of the valid ones.
-
-        Fields that the model lacks are dropped; the others are converted to the model's types.
-        A payload masked as invalid may still be valid: decode it with `decode_with` and the model to find out.
-        """
-        zeros = cdr_layout(layout).zeros
-        fits = np.array([len(each) == len(zeros) and each[:2] == HEADER[:2] for each in payloads], bool)
-        data = b"".join(each if fit else zeros for each, fit in zip(payloads, fits.tolist(), strict=True))
-        packed = np.frombuffer(data, self._cdr(layout))
-        bytes_of = np.frombuffer(data, np.uint8).reshape(-1, len(zeros))
-        is_current = layout is self.definition.current
-        array = packed.astype(self.dtype) if is_current else self.absent(len(payloads))
-        for name, kind in layout.types.items():
-            if not is_current and name in self.definition.types:
-                array[name] = packed[name]
-            if kind.base == "bool":
-                offset = cdr_layout(layout).offsets[name]
-                fits &= (bytes_of[:, offset : offset + kind.values] <= 1).all(axis=1)
-        return array, fits & self.valid_mask(array)
-
-    @staticmethod
-    def _cdr(layout: Layout) -> np.dtype[np.void]:
         cdr, formats = cdr_layout(layout), [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()]
         names, offsets = zip(*cdr.offsets.items(), strict=True)
-        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(cdr.zeros)})
+        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(cdr.zeros)})
+        payloads = np.frombuffer(bytearray(cdr.zeros * len(array)), dtype)
+        for name in names:
+            payloads[name] = array[name]
+        return payloads
 
 
 @cached_on_owner

@@ -53,11 +53,6 @@ def encode_cdr_array(array: MessageArray) -> npt.NDArray[np.void]:
     return arrays_of(DEFAULT).encode_cdr(array, CURRENT)
 
 
-def decode_cdr_array(payloads: Sequence[bytes]) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-    """Decode CDR payloads of the current layout; return the messages and a mask of the valid ones."""
-    return arrays_of(DEFAULT).decode_cdr(payloads, CURRENT)
-
-
 def row_of(message: VehicleLocalPosition) -> VehicleLocalPosition:
     """Return a message as a Row, typed as the message."""
     return cast("VehicleLocalPosition", tuple.__new__(DEFAULT.row, message.__dict__.values()))

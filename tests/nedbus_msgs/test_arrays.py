@@ -16,10 +16,8 @@ from nedbus_msgs.messages import HomePosition, VehicleAttitude
 from tests.flights.local_position import (
     PAYLOAD_SIZE,
     decode_array,
-    decode_cdr_array,
     decode_row,
     encode_array,
-    encode_cdr,
     encode_row,
     to_row,
     valid_mask,
@@ -125,18 +123,6 @@ def test_incomplete_payload_raises(excess: int) -> None:
     """Bytes that are not a whole number of payloads raise ValueError."""
     with pytest.raises(ValueError, match="reshape"):
         decode_array(bytes(2 * PAYLOAD_SIZE + excess))
-
-
-def test_malformed_cdr_is_not_valid() -> None:
-    """A bool other than 0 or 1, a wrong length or another encapsulation makes only that message invalid."""
-    payload = encode_cdr(FLIGHTS[0].model_dump(), layout="1.16")
-    first_bool = 4 + 16
-    assert payload[first_bool] == 1
-    others = [payload[:first_bool] + bytes([byte]) + payload[first_bool + 1 :] for byte in (2, 3, 255)]
-    others += [payload[:-1], payload + bytes(4), b"\x00\x00" + payload[2:]]
-    array, valid = decode_cdr_array([payload, *others, payload])
-    assert valid.tolist() == [True, *[False] * len(others), True]
-    assert array[0] == array[-1] == to_array(FLIGHTS[:1])[0]
 
 
 @given(st.lists(messages(), max_size=5))

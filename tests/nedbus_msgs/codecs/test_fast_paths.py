@@ -22,7 +22,6 @@ from tests.flights.local_position import (
     FIELD_TYPES,
     decode,
     decode_array,
-    decode_cdr_array,
     decode_row,
     describe,
     downgrade,
@@ -152,7 +151,7 @@ def test_payloads_are_validated_like_the_model(
 
 @given(st.lists(messages(), max_size=4))
 def test_array_round_trip(many: list[VehicleLocalPosition]) -> None:
-    """Messages are unchanged by the round trip through an array and its payloads, msgpack or CDR, with exact types."""
+    """Messages survive the round trip through an array and its payloads; the array's CDR is that of messages."""
     array = to_array(many)
     assert array.dtype == DTYPE
     assert valid_mask(array).all()
@@ -161,9 +160,6 @@ def test_array_round_trip(many: list[VehicleLocalPosition]) -> None:
     assert decode_array(encode_array(array))[0].tobytes() == array.tobytes()
     payloads = [encode_cdr(downgrade(message, "1.16"), layout="1.16") for message in many]
     assert encode_cdr_array(array).tobytes() == b"".join(payloads)
-    decoded, valid = decode_cdr_array(payloads)
-    assert valid.all()
-    assert decoded.tobytes() == array.tobytes()
 
 
 def test_columns_have_px4_types() -> None:
