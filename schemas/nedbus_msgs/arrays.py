@@ -20,7 +20,7 @@ from .model.declaration import Layout, cached_on_owner
 from .model.definition import MESSAGES, Definition
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, encode_text
-from .model.rules import column_checks, compile_lambda, expression_of
+from .model.rules import column_checks, compile_lambda, expression_of, squared_norm
 from .model.validation import Values, accessors_of
 
 MessageArray = npt.NDArray[np.void]
@@ -62,7 +62,10 @@ class Arrays(Generic[M]):
         self._checked = struct.Struct("=" + "".join(forms))
         self._passes_rules = compile_lambda(f"lambda values: {expression_of(definition.rules, accessors)}")
         self._column_checks = column_checks(
-            definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
+            definition.rules,
+            isfinite=np.isfinite,
+            any=np.logical_or.reduce,
+            squared_norm=lambda quaternions: squared_norm(quaternions.astype(float)),
         )
 
     def decode(self, payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
@@ -143,12 +146,6 @@ class Arrays(Generic[M]):
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
     """Return the cached array converter of a definition."""
     return Arrays(definition)
-
-
-def _squared_norms(quaternions: npt.NDArray[np.float32]) -> Any:
-    """Return the squared norms, in float64, of quaternions of shape (4, n)."""
-    w, x, y, z = quaternions.astype(float)
-    return w * w + x * x + y * y + z * z
 
 
 DTYPE: Final = arrays_of(DEFAULT).dtype

@@ -128,6 +128,34 @@ class MapProjection:
         return latitude, math.remainder(self.longitude + math.degrees(math.atan2(eastward, radial)), 360.0)
 
 
+@dataclass(slots=True)
+class CommonOrigin:
+    """The common origin of several vehicles: the first one that two successive messages of a vehicle have.
+
+    `projection`: its projection, None before the first origin; provisional until the second message.
+    `altitude`: its altitude [m], NaN if unknown.
+    """
+
+    projection: MapProjection | None = None
+    altitude: float = math.nan
+    _vehicle: object = None
+    _first: tuple[float, ...] = ()
+    _is_confirmed: bool = False
+
+    def update(self, vehicle: object, message: Message) -> MapProjection:
+        """Add a message with a global origin; return the projection."""
+        projection = self.projection
+        if projection is None or (not self._is_confirmed and vehicle == self._vehicle):
+            origin = (message.ref_lat, message.ref_lon, message.ref_alt)[: 3 if message.z_global else 2]
+            self._is_confirmed = origin == self._first
+            if projection is None or not self._is_confirmed:
+                self._vehicle, self._first, self.altitude = vehicle, origin, math.nan
+                projection = self.projection = MapProjection(message.ref_lat, message.ref_lon)
+        if math.isnan(self.altitude) and message.z_global:
+            self.altitude = message.ref_alt
+        return projection
+
+
 class GlobalPosition(NamedTuple):
     """Latitude and longitude [deg, WGS84], and altitude above mean sea level [m], which is NaN if unknown."""
 

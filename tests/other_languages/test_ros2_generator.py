@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -79,13 +81,17 @@ def install(folder: Path, *packages: str) -> Path:
     return folder / "bin"
 
 
-def definitions() -> dict[str, str]:
-    """Return .msg files by name: each layout of each built-in message, other messages of PX4, and all basic types."""
-    files = {"Basic": BASIC} | {path.stem: path.read_text() for path in (DATA / "msg").glob("*.msg")}
+def definitions() -> Iterator[dict[str, str]]:
+    """Yield .msg files by name: of each layout of each built-in message, and of others in each release of px4_msgs."""
+    files = {"Basic": BASIC}
     for name, definition in MESSAGES.items():
         layouts = definition.layouts.values()
         files |= {f"{name}L{number}": definition_text(definition, each) for number, each in enumerate(layouts)}
-    return files
+    yield files
+    others = [json.loads(line) for line in (DATA / "msg_releases.jsonl").read_text().splitlines()]
+    assert len({each["message"] for each in others}) >= 10
+    for release in ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main"):
+        yield {each["message"]: "\n".join(each["fields"]) for each in others if release in each["releases"]}
 
 
 @pytest.mark.slow
@@ -93,22 +99,24 @@ def definitions() -> dict[str, str]:
 @pytest.mark.timeout(420)
 def test_hash_equals_that_of_ros_2(tmp_path: Path) -> None:
     """Each definition has the hash that ROS 2's generator computes, also with nested messages and all basic types."""
-    programs, files = install(tmp_path / "venv", *GENERATOR), definitions()
-    (tmp_path / "msg").mkdir()
-    for name, text in files.items():
-        (tmp_path / "msg" / f"{name}.msg").write_text(text)
-    command = [str(programs / "rosidl"), "hash", "-o", "out", "-I", f"px4_msgs:{tmp_path}", "px4_msgs"]
-    command += [f"msg/{name}.msg" for name in files]
-    environment = os.environ | {"AMENT_PREFIX_PATH": str(programs.parent)}
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    for name, text in files.items():
-        hashes = json.loads((tmp_path / "out" / "msg" / f"{name}.json").read_text())["type_hashes"]
-        expected = {each["type_name"]: each["hash_string"] for each in hashes}[f"px4_msgs/msg/{name}"]
-        nested = "".join(f"{NESTED}{each}\n{files[each]}" for each in files if f"\n{each} " in text)
-        assert hash_of_msg(name, text + nested) == expected, name
+    programs = install(tmp_path / "venv", *GENERATOR)
+    for number, files in enumerate(definitions()):
+        (folder := tmp_path / str(number) / "msg").mkdir(parents=True)
+        for name, text in files.items():
+            (folder / f"{name}.msg").write_text(text)
+        command = [str(programs / "rosidl"), "hash", "-o", "out", "-I", f"px4_msgs:{folder.parent}", "px4_msgs"]
+        command += [f"msg/{name}.msg" for name in files]
+        environment = os.environ | {"AMENT_PREFIX_PATH": str(programs.parent)}
+        done = subprocess.run(
+            command, cwd=folder.parent, env=environment, capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        for name, text in files.items():
+            hashes = json.loads((folder.parent / "out" / "msg" / f"{name}.json").read_text())["type_hashes"]
+            expected = {each["type_name"]: each["hash_string"] for each in hashes}[f"px4_msgs/msg/{name}"]
+            used = [each for each in files if re.search(rf"^{each}[ \[]", text, re.MULTILINE)]
+            nested = "".join(f"{NESTED}{each}\n{files[each]}" for each in used)
+            assert hash_of_msg(name, text + nested) == expected, (number, name)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@
     /<vehicle>/location    foxglove.LocationFix, while the position is valid and has a global origin
     /tf                    foxglove.FrameTransforms: map -> <vehicle>/local -> <vehicle>
 
-Vehicles with different origins share the frame `map`, whose origin is the first global origin of any vehicle.
+Vehicles with different origins share the frame `map`, whose origin is the first global origin that two messages have.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from nedbus_msgs import (
     get_topic,
     ros2_type,
 )
-from nedbus_msgs.frames import MapProjection, ned_to_enu, quaternion_ned_to_enu, to_global, yaw_ned_to_enu
+from nedbus_msgs.frames import CommonOrigin, ned_to_enu, quaternion_ned_to_enu, to_global, yaw_ned_to_enu
 
 from . import FOXGLOVE_PORT
 
@@ -59,8 +59,7 @@ class FoxgloveServer:
         self._unseen: dict[Address, tuple[Message, int]] = {}
         self._channels: dict[str, tuple[PoseInFrameChannel, LocationFixChannel]] = {}  # by vehicle
         self._attitudes: dict[str, Any] = {}  # last message by vehicle
-        self._map: MapProjection | None = None  # its origin: the first global origin of any vehicle
-        self._altitude = math.nan  # [m], of the first origin with an altitude
+        self._map = CommonOrigin()
         self._local_in_map: dict[str, messages.Vector3] = {}  # last known translation of each local frame
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
@@ -127,7 +126,7 @@ class FoxgloveServer:
             local, pose_in_local = f"{vehicle}/local", messages.Pose(position=position, orientation=orientation)
             poses.log(messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local), log_time=time_ns)
             if message.xy_global:
-                self._local_in_map[vehicle] = self._locate(message)
+                self._local_in_map[vehicle] = self._locate(vehicle, message)
             origin = self._local_in_map.get(vehicle, messages.Vector3(x=0.0, y=0.0, z=0.0))
             frames = (("map", local, origin, _NO_ROTATION), (local, vehicle, position, orientation))
             transforms = [
@@ -153,14 +152,10 @@ class FoxgloveServer:
             )
             locations.log(location, log_time=time_ns)
 
-    def _locate(self, message: VehicleLocalPosition) -> messages.Vector3:
+    def _locate(self, vehicle: str, message: VehicleLocalPosition) -> messages.Vector3:
         """Return the translation from `map` to the local frame of a message with a global origin, in ENU [m]."""
-        if self._map is None:
-            self._map = MapProjection(message.ref_lat, message.ref_lon)
-        if math.isnan(self._altitude) and message.z_global:
-            self._altitude = message.ref_alt
-        north, east = self._map.project(message.ref_lat, message.ref_lon)
-        up = message.ref_alt - self._altitude
+        north, east = self._map.update(vehicle, message).project(message.ref_lat, message.ref_lon)
+        up = message.ref_alt - self._map.altitude
         return messages.Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
 
     def _close_unpublished(self) -> None:

@@ -65,11 +65,12 @@ class ChangeDetector:
     `detect` receives None for fields that were not provided. `context`: other fields passed to it.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: timestamps of the last message and of the one before [us].
+    `time`: time of the last message on the event log's clock [s], set by Vehicle.
     `pause`: minimum interval between messages [s]; those before `due`, on the event log's clock, are skipped.
     """
 
     pause = 0.0
-    due = -math.inf
+    due = time = -math.inf
 
     def __init__(self, compared: Sequence[str], context: Sequence[str], detect: Detect) -> None:
         self._read = read_fields(("timestamp", *compared))

@@ -10,13 +10,16 @@ from typing import Annotated, Final, Literal
 from pydantic import Field
 
 from .kinds import KINDS, SEVERITIES, Severity, importance
-from .rules import LARGE_CORRECTION
+from .rules import LARGE_CORRECTION, MAX_ALONE
 
 WINDOW: Final = 10.0
 """Seconds before an event in which events of related kinds are evidence; the start of an active one may be older."""
 
 ALL: Final = "*"
 """Vehicle name in events that concern all vehicles: events of the router link and of the reader."""
+
+ALONE: Final = "one_message"
+"""Name among an event's `numbers` if only one message, between two that agree, had the value that it ends."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
 """Time on the event log's clock [s]; the bounds validate reports from peers."""
@@ -119,6 +122,21 @@ def state_of(conditions: Iterable[Condition]) -> State:
         return State("info", "ok", None, ())
     first = ordered[0]
     return State(first.severity, first.text, first.since, tuple(ordered))
+
+
+def without_wild(events: Iterable[Event]) -> list[Event]:
+    """Return chronological events without the conditions, and the moves of an origin, that one message alone had."""
+    kept: list[Event] = []
+    for event in events:
+        if ALONE in event.numbers:
+            key, before = (event.vehicle, event.kind), range(len(kept) - 1, -1, -1)
+            begin = next((each for each in before if (kept[each].vehicle, kept[each].kind) == key), None)
+            if begin is not None and event.time - kept[begin].time <= MAX_ALONE:
+                del kept[begin]
+                if event.change != "begin":
+                    continue
+        kept.append(event)
+    return kept
 
 
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:

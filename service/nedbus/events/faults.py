@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from .event import ALL
+from .event import ALL, without_wild
 from .report import AccountReport, VehicleReport, by_vehicle
 from .times import format_duration, format_since, format_utc
 
@@ -65,7 +65,7 @@ def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: 
 def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
     lines = []
     for report in reports:
-        for event in report.events:
+        for event in without_wild(report.events):
             is_recent = expected.within is not None and event.time > report.now - expected.within
             is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
             if is_recent and is_selected and event.severity != "info":

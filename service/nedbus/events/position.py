@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 from nedbus_msgs import JUMP_FIELDS, RESET_COUNTERS, Quantity, jump_of
 from nedbus_msgs.frames import MapProjection
 
 from .detectors import ChangeDetector, Fields, Finding, detect_flags, read_fields
+from .event import ALONE
 from .kinds import Severity, flagged
-from .rules import JUMP_DISTANCE, JUMP_SHARE, SMALL_RESET
+from .rules import JUMP_DISTANCE, JUMP_SHARE, MAX_ALONE, SMALL_RESET
 
 _KINDS: Final = flagged("VehicleLocalPosition")
 _COMPARED: Final = (
@@ -41,6 +43,7 @@ class PositionDetector(ChangeDetector):
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
         self._jump: Step | None = None  # in progress
+        self._left: tuple[int, object] = (0, ())  # time when an origin changed [us], and the one before
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings in a message, None if nothing has changed."""
@@ -69,7 +72,11 @@ class PositionDetector(ChangeDetector):
                 {name: _CONTEXT.get(name) if value is None else value for name, value in fields.items()}
                 for fields in (before, after)
             )
-            yield from _detect_origin(earlier, values)
+            for found in _detect_origin(earlier, values):
+                old, new = ([each[name] for name in _ORIGIN] for each in (earlier, values))
+                is_back = self._left == (self.earlier, new) and self.stamp - self.earlier <= 1e6 * MAX_ALONE
+                self._left = self.stamp, old
+                yield replace(found, numbers={**found.numbers, ALONE: 1}) if is_back else found
             counts = [(name, [each[RESET_COUNTERS[name]] for each in (earlier, values)]) for name in _RESETS]
             quantities = [name for name, each in counts if None not in each and each[0] != each[1]]
             if quantities:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from .event import WINDOW, Condition, Event, State, explain, state_of
+from .event import WINDOW, Condition, Event, State, explain, state_of, without_wild
 from .kinds import KINDS, importance
 from .rules import EVIDENCE, RECENT
 from .times import Times
@@ -87,6 +87,7 @@ def stories_of(
     `events`: all events of the vehicle, in order. `conditions`: conditions active after the last event.
     `topics`: published topics. `at`: return the stories active at this time, else the last one before, else the first.
     """
+    events = without_wild(events)
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
     chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
     if not any(span.until is None if at is None else span.holds(at) for span in chosen):

@@ -12,13 +12,12 @@ from typing import Final
 
 from nedbus_msgs import BY_TOPIC, Address, FieldReader
 
-from . import detectors
+from . import detectors, rules
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
 from .detectors import ChangeDetector, Fields, Finding
-from .event import WINDOW, Condition, Event, State, explain, state_of
+from .event import ALONE, WINDOW, Condition, Event, State, explain, state_of, without_wild
 from .kinds import KINDS
 from .position import PositionDetector
-from .rules import EVIDENCE, FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
 from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
@@ -31,8 +30,8 @@ _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference; conditions come from the best one received.
-_GROUPS: Final = (POSITIONS, EVIDENCE["GPS"])
-_EVIDENCE_OF: Final = {topic: name for name, topics in EVIDENCE.items() for topic in topics}
+_GROUPS: Final = (rules.POSITIONS, rules.EVIDENCE["GPS"])
+_EVIDENCE_OF: Final = {topic: name for name, topics in rules.EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = FieldReader(_SAMPLE)
 
@@ -60,6 +59,7 @@ class Vehicle:
         self.armed: bool | None = None
         self.time = self.last_seen = 0.0
         self.boot: float | None = None
+        self._before = -math.inf  # time of the message before the last one in its stream
         self._is_off = False  # the last time since boot was not the expected one
         self._on_event = on_event
         self._common = common
@@ -94,6 +94,7 @@ class Vehicle:
             return
         if detector.pause:
             detector.due = time + detector.pause
+        self._before, detector.time = detector.time, time
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
@@ -125,7 +126,7 @@ class Vehicle:
     def settle(self, time: float) -> None:
         """Report bursts and flapping that have ended; activate initial conditions once armed for PAUSE."""
         for kind, burst in list(self._bursts.items()):
-            if time - burst.end <= PAUSE and (kind != "lost" or time - burst.begin <= MAX_BURST):
+            if time - burst.end <= rules.PAUSE and (kind != "lost" or time - burst.begin <= rules.MAX_BURST):
                 continue
             del self._bursts[kind]
             messages, numbers = f"{burst.count} message{'s' * (burst.count > 1)}", {"messages": burst.count}
@@ -139,13 +140,13 @@ class Vehicle:
                 duration = burst.count / 1e3
                 text = f"logging dropout of {format_duration(duration)}"
                 self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
-        if self._on_ground and time - self._armed_at >= PAUSE:
+        if self._on_ground and time - self._armed_at >= rules.PAUSE:
             self.conditions |= self._on_ground
             self.initial += [*dict.fromkeys(self._on_ground.values())][: _MAX_RECENT - len(self.initial)]
             self._on_ground.clear()
         for key, events in list(self._changes.items()):
             last = events[-1]
-            if key in self._suppressed and time - last.time > PAUSE:
+            if key in self._suppressed and time - last.time > rules.PAUSE:
                 count = self._suppressed.pop(key)
                 self._report(replace(last, text=f"{last.text}, the last of {count} suppressed changes"))
             if time - last.time > WINDOW:
@@ -162,7 +163,7 @@ class Vehicle:
             end = Finding("duplicate", "end", f"only one publisher of {stream} left", switch=True)
             self.emit(begin if state == "duplicate" else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
-        if state is None and is_connected and time - self._main_time > MAX_SILENCE:
+        if state is None and is_connected and time - self._main_time > rules.MAX_SILENCE:
             silent = "silent"
         if silent is None or self.main is None or {(silent, ""), ("gone", "")} & self.conditions.keys():
             return
@@ -203,8 +204,8 @@ class Vehicle:
         is_flying = self.armed is not False
         found = [each for each in self.conditions.values() if is_flying or KINDS[each.kind].on_ground != "info"]
         kinds = {each.kind for each in found}
-        for event in reversed(self.recent):
-            if event.change == "once" and time - RECENT < event.time:
+        for event in reversed(without_wild(self.recent)):
+            if event.change == "once" and time - rules.RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
                 continue
             keys = {(event.kind, event.names), (event.kind, None)}
@@ -228,15 +229,20 @@ class Vehicle:
             return
         for key in keys:
             self._on_ground.pop(key, None)
+        held = {key: self.conditions[key] for key in keys if key in self.conditions}
         if found.change == "end":
-            held = [self.conditions.pop(key) for key in keys if key in self.conditions]
-            if known := [each.since for each in held if not each.initial]:
+            for key in held:
+                del self.conditions[key]
+            if known := [each.since for each in held.values() if not each.initial]:
                 lasted = max(0.0, changed - min(known))
                 text = f"{text} after {format_duration(lasted)}"
             elif kind.first:
                 text = kind.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
-        numbers = {**found.numbers, "armed": 1} if self.armed and found.kind == "text" else found.numbers
+        is_alone = any(each.begin.time == self._before and not each.initial for each in held.values())
+        is_alone &= kind.message in rules.PERIODIC and time - self._before <= rules.MAX_ALONE
+        marks = {"armed": self.armed and found.kind == "text", ALONE: is_alone}
+        numbers = {**found.numbers, **{name: 1 for name, is_set in marks.items() if is_set}}
         event = Event(
             self.name, found.kind, found.change, severity, text, time, boot, topic, numbers, found.names, lasted
         )
@@ -272,10 +278,10 @@ class Vehicle:
             self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
         if topic == detectors.EKF_SELECTOR:
-            unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
+            unused = [each for each in self._detectors if each.topic == rules.POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
-        if instance and topic not in (*POSITIONS, _EKF):  # only the first instance of sensors and batteries
+        if instance and topic not in (*rules.POSITIONS, _EKF):  # only the first instance of sensors and batteries
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
@@ -283,14 +289,14 @@ class Vehicle:
             best = min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0))
             supply = self._supplies.get(_EVIDENCE_OF.get(topic, ""))
             if best != address and not (supply and supply.is_late):
-                is_sought = topic == POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
+                is_sought = topic == rules.POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
             if current != address:  # reopen unused streams, and end conditions of the old one
                 self._preferred[group], message = address, BY_TOPIC[topic].name
                 self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
                 self._end(address, lambda kind, _: KINDS[kind].message == message)
-        if group is POSITIONS:
+        if group is rules.POSITIONS:
             self.main, self._position = address, PositionDetector()
             return self._position
         own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
@@ -381,7 +387,7 @@ class Vehicle:
         self._armed_at = math.inf
         self._on_ground.clear()
         last, self._rebooted = self._rebooted, time
-        if time - last >= PAUSE and ("duplicate", "") not in self.conditions:
+        if time - last >= rules.PAUSE and ("duplicate", "") not in self.conditions:
             text = f"reboot: time since boot is {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
             self.emit(Finding("reboot", "once", text, numbers={"before": before / 1e6}), "", time)
 
@@ -396,8 +402,8 @@ class Vehicle:
     def _is_flapping(self, event: Event) -> bool:
         """Count an event; return True if its kind is too frequent to report each one; `settle` reports the last one."""
         keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in any combination
-        limits = [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
-        for key, limit in [(keys[1], MAX_SINGLE)] if event.change == "once" else limits:
+        limits = [*zip(keys, rules.FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
+        for key, limit in [(keys[1], rules.MAX_SINGLE)] if event.change == "once" else limits:
             events = self._changes.setdefault(key, deque(maxlen=limit))
             is_fast = len(events) == limit and event.time - events[0].time < WINDOW
             events.append(event)
@@ -442,4 +448,4 @@ class _Supply:
         if self.newest != before and last.stamp > last.earlier > 0:
             self.steps.append(last.stamp - last.earlier)
         is_known = len(self.steps) >= _MIN_STEPS
-        return self.newest, max(1e6 * MAX_SILENCE, _INTERVALS * median(self.steps)) if is_known else math.inf
+        return self.newest, max(1e6 * rules.MAX_SILENCE, _INTERVALS * median(self.steps)) if is_known else math.inf

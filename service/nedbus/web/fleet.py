@@ -117,7 +117,7 @@ class FleetSnapshot:
 class Fleet:
     """All streams of a page; one thread may add samples while another one takes snapshots.
 
-    `origin`: the common origin, by default the first global origin in any message.
+    `origin`: the common origin, by default the first one that two messages have.
     `long`: number of points in the long histories, and seconds between two points.
     """
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from nedbus.client import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPosition
-from nedbus_msgs.frames import MapProjection, to_global
+from nedbus_msgs.frames import CommonOrigin, to_global
 
 POINTS: Final = 600  # number of points in the history of the last minute
 LONG: Final = 900, 1.0  # number of points in the long history, and seconds between two points: 15 minutes
@@ -69,19 +68,17 @@ class History:
         self.written += 1
 
 
-@dataclass(slots=True)
-class Origin:
-    """The common origin: the first global origin in any message."""
+class Origin(CommonOrigin):
+    """The common origin of all vehicles."""
 
-    projection: MapProjection | None = None
-
-    def locate(self, message: VehicleLocalPosition, missing: frozenset[str] = frozenset()) -> Position:
+    def locate(
+        self, address: Address, message: VehicleLocalPosition, missing: frozenset[str] = frozenset()
+    ) -> Position:
         """Return the position in a message, NaN where invalid; a validity flag in `missing` counts as valid."""
         position = to_global(message)
         north, east = message.x, message.y
         if position:
-            self.projection = self.projection or MapProjection(message.ref_lat, message.ref_lon)
-            north, east = self.projection.project(position.latitude, position.longitude)
+            north, east = self.update(address, message).project(position.latitude, position.longitude)
         if not (message.xy_valid or "xy_valid" in missing):
             north = east = math.nan
         altitude = (message.ref_alt if message.z_global else 0.0) - message.z
@@ -120,7 +117,7 @@ class PageStream:
             self._tracker.add(before.message)  # the tracker needs the last message before the change
         self._state, self._sampled = state, time
         message, missing = sample.message, sample.provenance.missing
-        track, position = self._tracker.add(message), self.origin.locate(message, missing)
+        track, position = self._tracker.add(message), self.origin.locate(sample.address, message, missing)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
             gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
             self.minute.write(gap)
@@ -153,7 +150,7 @@ def _distance(position: Position, message: VehicleLocalPosition, truth: PageStre
     if truth is None or not math.isfinite(position.north):
         return math.nan
     real = truth.last.message
-    other = truth.origin.locate(real)
+    other = truth.origin.locate(truth.last.address, real)
     seconds = ((message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)) / 1e6
     if other.common != position.common or abs(seconds) > _MAX_TRUTH_AGE:
         return math.nan

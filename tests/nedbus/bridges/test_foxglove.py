@@ -130,12 +130,14 @@ def test_message_without_nominal_rate_reaches_the_first_subscriber(
         client.until(lambda: topic in client.data)
 
 
-def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
-    """Poses in ENU, frames and locations use Foxglove's protobuf schemas."""
+@pytest.mark.parametrize("wild", [None, {"ref_lat": -33.0, "ref_lon": 151.0, "ref_alt": 9000.0}])
+def test_poses_and_locations_are_published(bus: nedbus.Bus, wild: dict[str, float] | None) -> None:
+    """Poses in ENU, frames and locations use Foxglove's protobuf schemas; one wild first origin does not count."""
     here = message(1, x=3.0, y=4.0, z=-5.0, heading=0.0, xy_valid=True, eph=1.0, epv=1.0, **ORIGIN)
     there = here.model_copy(update={"ref_lat": 47.001, "ref_alt": 410.0})
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
-        for vehicle, each in (("1", here), ("2", there)):
+        wild_first = [("1", here.model_copy(update=wild))] if wild else []
+        for vehicle, each in (*wild_first, ("1", here), ("2", there)):
             server.log(sample := Sample(each, Address(vehicle, VLP), received=1))
         names = {"/1/pose", "/1/location", "/2/pose", "/2/location", "/tf", f"/1/{VLP}"}
         client.until(lambda: names <= client.topics.keys())

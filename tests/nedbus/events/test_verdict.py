@@ -6,14 +6,29 @@ import json
 import textwrap
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from nedbus.events import ALL, Condition, Event, Times, Verdict, from_json, report_of, verdict_of
+from nedbus.events import (
+    ALL,
+    Condition,
+    Event,
+    Expectation,
+    Times,
+    Verdict,
+    faults_of,
+    from_json,
+    report_of,
+    verdict_of,
+)  # fmt: skip
 from nedbus.events.detectors import Finding
+from nedbus.flights import read_file_events
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import UlogWriter
 
-from .flight import ARMED, DISARMED, Flight, lose_gps
+from .flight import ARMED, DISARMED, GOOD_GPS, ORIGIN, Flight, lose_gps
 
 LIVE = Times(is_live=True)
 
@@ -387,3 +402,95 @@ def test_simultaneous_px4_texts_are_separate_events() -> None:
     held = list(read.vehicles["1"].held)
     found = verdict_of("1", read.events, held, topics=read.vehicles["1"].topics, times=LIVE, end=read.now)
     assert 'PX4: "invalid setpoints", PX4: "Failsafe: blind land"' in found.text
+
+
+WILD: list[tuple[str, dict[str, Any]]] = [
+    *((VLP, {flag: False}) for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "xy_global", "z_global")),
+    (VLP, {"dead_reckoning": True}),
+    (VLP, {"xy_valid": False, "z_valid": False, "dead_reckoning": True}),
+    (VLP, {"ref_lat": -33.0, "ref_lon": 151.0, "ref_timestamp": 9}),
+    (VLP, {"xy_reset_counter": 77}),
+    (VLP, {"x": 1e6}),
+    ("vehicle_gps_position", {"fix_type": 0}),
+    ("vehicle_gps_position", {"fix_type": 0, "satellites_used": 0}),
+    ("vehicle_gps_position", {"jamming_state": 3}),
+    ("vehicle_gps_position", {"spoofing_state": 3}),
+    ("battery_status", {"warning": 3}),
+    ("battery_status", {"warning": 4}),
+]
+SOUND: dict[str, dict[str, Any]] = {
+    VLP: {}, "vehicle_gps_position": GOOD_GPS, "battery_status": {"warning": 0, "remaining": 0.2, "connected": True},
+}  # fmt: skip
+
+
+def fly_all(flight: Flight, topic: str = "", wild: dict[str, Any] | None = None) -> None:
+    """Send one message of each topic, one of them with wild values, and wait for the next ones."""
+    for name, fields in SOUND.items():
+        flight.send(name, **fields | (wild or {} if name == topic else {}))
+    flight.wait(0.1)
+
+
+@pytest.mark.parametrize("position", ["middle", "second"])
+@pytest.mark.parametrize(("topic", "wild"), WILD)
+def test_one_wild_message_is_no_fault(topic: str, wild: dict[str, Any], position: str) -> None:
+    """A flag, fix, warning, origin, counter or position wrong in one message is no fault, state or failed check."""
+    flight = Flight()
+    flight.status(ARMED)
+    for _ in range(20 if position == "middle" else 1):
+        fly_all(flight)
+    healthy = {each.kind for each in flight.event_log.state("1", flight.now).conditions}
+    fly_all(flight, topic, wild)
+    for _ in range(20):
+        fly_all(flight)
+    assert verdict(flight).text.startswith("no faults")
+    assert {each.kind for each in flight.event_log.state("1", flight.now).conditions} == healthy
+    report = report_of(flight.event_log, "s", "h", flight.now, within=60)
+    read = from_json(json.loads(json.dumps(asdict(report))))
+    assert read is not None
+    assert faults_of([read], Expectation(within=60)) == []
+
+
+@pytest.mark.parametrize(("topic", "wild"), [*WILD[:4], *WILD[6:9], *WILD[11:]])
+def test_two_wrong_messages_are_a_fault(topic: str, wild: dict[str, Any]) -> None:
+    """What a second message confirms, or the only message of 0.5 s has, is a fault that begins with the first one."""
+    for count, pause in ((2, 0.1), (1, 0.5)):
+        flight = Flight()
+        flight.status(ARMED)
+        for number in range(20):
+            if number == 10:
+                began = flight.now
+            for name, fields in SOUND.items():
+                flight.send(name, **fields | (wild if name == topic and 10 <= number < 10 + count else {}))
+            flight.wait(pause)
+        found = verdict(flight)
+        assert found.begin is not None, found.text
+        assert (found.begin.time, found.begin.topic) == (began, topic)
+
+
+def test_wild_message_is_no_evidence() -> None:
+    """A GPS fix lost in one message does not explain a fault that follows."""
+    flight = Flight()
+    for wild in ({}, {"fix_type": 0}, {}, {}):
+        fly_all(flight, "vehicle_gps_position", wild)
+    flight.send(xy_valid=False)
+    flight.wait(0.1).send(xy_valid=False)
+    found = verdict(flight)
+    assert found.begin is not None
+    assert found.begin.kind == "xy_invalid"
+    assert found.cause == ()
+
+
+@pytest.mark.parametrize("wild", [{"xy_valid": False}, {"ref_lat": -33.0, "ref_timestamp": 9}, {"z_valid": False}])
+def test_one_wild_message_of_a_log_is_no_fault(tmp_path: Path, wild: dict[str, Any]) -> None:
+    """In a log at 50 Hz, one wild message is no fault, unlike two of them."""
+    for count in (1, 2):
+        writer = UlogWriter()
+        writer.define([VLP])
+        for number in range(200):
+            fields = VALID | ORIGIN | (wild if 100 <= number < 100 + count else {})
+            writer.add(VLP, message(1_000_000 + 20_000 * number, **fields))
+        read = read_file_events(writer.write(tmp_path / f"{count}.ulg"))
+        topics = read.event_log.vehicles["1"].topics
+        found = verdict_of("1", read.event_log.events, topics=topics, times=read.times, end=read.end)
+        assert len(read.event_log.events) == 2
+        assert found.text.startswith("no faults") == (count == 1)

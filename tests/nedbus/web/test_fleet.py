@@ -274,6 +274,18 @@ def test_vehicles_with_global_origins_share_one_origin(sim: SimulatedFleet) -> N
     assert places["lost"] == (2.0, 1.0, 0.0, False)
 
 
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_one_wild_origin_is_not_the_common_one(sim: SimulatedFleet, number: int) -> None:
+    """The common origin is one that two successive messages of a vehicle have, also if one message was wild."""
+    for each in range(4):
+        fields = ZURICH | ({"ref_lat": -33.0, "ref_lon": 151.0} if each == number else {})
+        sim.fly(0.1, WING, **fields, x=1.0, y=2.0)
+    sim.fly(1, QUAD, **{**ZURICH, "ref_lat": 10.0})
+    projection = sim.fleet.origin.projection
+    assert projection == MapProjection(ZURICH["ref_lat"], ZURICH["ref_lon"])
+    assert column(sim.stream(WING), "north")[-1] == pytest.approx(1.0, abs=1e-3)
+
+
 def test_invalid_position_is_nan_in_the_history(sim: SimulatedFleet) -> None:
     """Invalid values are NaN in the history, each quantity by its own flag; the last valid position is kept."""
     sim.fly(1, x=1.0, y=2.0, z=-3.0, vx=4.0)

@@ -151,7 +151,7 @@ def test_payloads_are_validated_like_the_model(
 
 @given(st.lists(messages(), max_size=4))
 def test_array_round_trip(many: list[VehicleLocalPosition]) -> None:
-    """Messages are unchanged by the round trip through an array and its payloads, msgpack or CDR, with exact types."""
+    """Messages survive the round trip through an array and its payloads; the array's CDR is that of messages."""
     array = to_array(many)
     assert array.dtype == DTYPE
     assert valid_mask(array).all()
