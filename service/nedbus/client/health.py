@@ -11,8 +11,9 @@ from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from operator import itemgetter
-from statistics import median
+from statistics import fmean, median
 from typing import Any, Final, Literal, get_args
 
 from nedbus import clock
@@ -115,21 +116,15 @@ class _Window:
     start: int
     messages: int = 0
     intervals: tuple[int, float, float] = (0, 0.0, 0.0)  # number, mean [s], sum of squared differences from the mean
-    latencies: list[float] = field(default_factory=list)
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
     flags: _FlagCounts = field(default_factory=Counter)
 
-    def add_interval(self, interval: float) -> None:
-        """Add an interval [s] by Welford's method; the tuple is replaced as a whole, because other threads read it."""
-        number, mean, squares = self.intervals
-        new = mean + (interval - mean) / (number + 1)
-        self.intervals = number + 1, new, squares + (interval - mean) * (interval - new)
-
-    def add_latency(self, latency: float) -> None:
-        """Add a latency [s]; beyond the maximum number it replaces the oldest one."""
-        if len(self.latencies) < _MAX_MEASURED:
-            self.latencies.append(latency)
-        else:
-            self.latencies[(self.messages - 1) % _MAX_MEASURED] = latency
+    def add_intervals(self, intervals: Collection[float]) -> None:
+        """Add intervals [s] by Chan's method; the tuple is replaced as a whole, because other threads read it."""
+        (number, mean, squares), added = self.intervals, len(intervals)
+        own, total = fmean(intervals), number + added
+        squares += sum([(interval - own) ** 2 for interval in intervals]) + (own - mean) ** 2 * number * added / total
+        self.intervals = total, mean + (own - mean) * added / total, squares
 
     @property
     def mean(self) -> float:
@@ -185,6 +180,7 @@ class StreamHealth:
         self._latencies = Histogram(_LATENCY_BUCKETS)
         self._window = self._last_window = _Window(0)
         self._waiting = deque[tuple[tuple[Any, ...], int, float | None, int, Collection[str]]]()  # at most _BATCH
+        self._window_end = _WINDOW  # of those that wait
         self._lock = threading.Lock()
 
     def add(
@@ -197,46 +193,64 @@ class StreamHealth:
         missing: Collection[str] = (),
     ) -> None:
         """Add a valid message, its row or a mapping of its fields; `missing` fields are unknown; `received` in ns."""
-        self._waiting.append((self._read(message), received, latency, lost, missing))
-        if len(self._waiting) >= _BATCH:
+        if received >= self._window_end:
             self._measure()
+            self._window_end = received + _WINDOW
+        elif len(self._waiting) >= _BATCH:
+            self._measure()
+        self._waiting.append((self._read(message), received, latency, lost, missing))
 
     def _measure(self) -> None:
+        """Measure the waiting messages, which are of one window."""
         with self._lock:
-            while self._waiting:
-                self._measure_one(*self._waiting.popleft())
+            if waiting := [self._waiting.popleft() for _ in range(len(self._waiting))]:
+                self._measure_all(*zip(*waiting, strict=True))
 
-    def _measure_one(
-        self, values: tuple[Any, ...], received: int, latency: float | None, lost: int, missing: Collection[str]
+    def _measure_all(
+        self,
+        values: Sequence[tuple[Any, ...]],
+        received: Sequence[int],
+        latencies: Sequence[float | None],
+        lost: Sequence[int],
+        missing: Sequence[Collection[str]],
     ) -> None:
+        if received[0] - self._window.start >= _WINDOW:
+            self._begin_window(received[0])
         window = self._window
-        if received - window.start >= _WINDOW:
-            if window.messages:
-                self._last_window = window
-            if (mean := window.mean) > 0:  # capped against bursts, such as recovered messages
-                usual = self._usual_rate or 1 / mean
-                self._usual_rate = usual + _SMOOTHING * (min(1 / mean, 2 * usual) - usual)
-            window = self._window = _Window(received)
-        self._messages += 1
-        self._lost += lost
-        window.messages += 1
-        if self._received is not None:
-            interval = (received - self._received) / 1e9
-            window.add_interval(interval)
-            self._intervals.append(interval)
-        self._received = received
-        rebooted = self._add_time(int(values[0]))
-        if latency is not None:
-            window.add_latency(latency)
-            self._latencies.add(latency)
-        if self._is_position:
-            flags, counters = values[1:_COUNTERS], values[_COUNTERS:]
-            if rebooted or counters != self._seen[0] or missing != self._seen[1]:
-                self._add_counters(counters, missing, rebooted=rebooted)
-            if missing:
-                flags = tuple(None if name in missing else flag for name, flag in zip(DOUBT_FLAGS, flags, strict=True))
-            window.flags[flags] += 1
-            self._flags[flags] += 1
+        window.messages += len(values)
+        self._lost += sum(lost)
+        times = received if self._received is None else (self._received, *received)
+        if len(times) > 1:
+            intervals = [(later - earlier) / 1e9 for earlier, later in pairwise(times)]
+            window.add_intervals(intervals)
+            self._intervals.extend(intervals)
+        self._received = received[-1]
+        for latency in latencies:
+            if latency is not None:
+                window.latencies.append(latency)
+                self._latencies.add(latency)
+        for each, absent in zip(values, missing, strict=True):
+            rebooted = self._add_time(int(each[0]))
+            if self._is_position:
+                self._add_position(each[1:_COUNTERS], each[_COUNTERS:], absent, rebooted=rebooted)
+
+    def _begin_window(self, received: int) -> None:
+        if self._window.messages:
+            self._last_window = self._window
+        if (mean := self._window.mean) > 0:  # capped against bursts, such as recovered messages
+            usual = self._usual_rate or 1 / mean
+            self._usual_rate = usual + _SMOOTHING * (min(1 / mean, 2 * usual) - usual)
+        self._window = _Window(received)
+
+    def _add_position(
+        self, flags: tuple[Any, ...], counters: tuple[Any, ...], missing: Collection[str], *, rebooted: bool
+    ) -> None:
+        if rebooted or counters != self._seen[0] or missing != self._seen[1]:
+            self._add_counters(counters, missing, rebooted=rebooted)
+        if missing:
+            flags = tuple(None if name in missing else flag for name, flag in zip(DOUBT_FLAGS, flags, strict=True))
+        self._window.flags[flags] += 1
+        self._flags[flags] += 1
 
     @property
     def latencies(self) -> Histogram:
@@ -288,25 +302,30 @@ class StreamHealth:
 
     def _add_time(self, timestamp: int) -> bool:
         """Track PX4's time; return True for the first timestamp, and for one so far back that it means a reboot."""
-        step = None if self._time is None else timestamp - self._time
+        self._messages += 1
+        last, steps = self._time, self._steps
+        if last is None or timestamp < last:
+            return self._step_back(timestamp, last)
+        self._earlier, self._time, step = last, timestamp, timestamp - last
+        is_gap = step > _FACTOR * self._usual_step > 0 and len(steps) >= _MIN_STEPS
+        self._gaps += is_gap and not self._topic.on_change
+        steps.append(step)
+        if is_gap or len(steps) < _USUAL or self._messages % _USUAL == 0:
+            self._usual_step = median(steps)
+        return False
+
+    def _step_back(self, timestamp: int, last: int | None) -> bool:
+        step = None if last is None else timestamp - last
         if step is not None and step < -_REBOOT_STEP and 0 < timestamp - self._earlier <= _REBOOT_STEP:
             self._out_of_order, self._time = self._out_of_order + 1, timestamp  # only the time of the last was wild
             return False
-        self._earlier = self._time or 0
+        self._earlier = last or 0
         if step is None or step < -_REBOOT_STEP:
             self._reboots += step is not None and self._topic.name != _QUEUED
             self._time, self._usual_step = timestamp, 0.0
             self._steps.clear()
             return True
-        if step < 0:
-            self._out_of_order += 1
-            return False
-        self._time = timestamp
-        is_gap = len(self._steps) >= _MIN_STEPS and step > _FACTOR * self._usual_step > 0
-        self._gaps += is_gap and not self._topic.on_change
-        self._steps.append(step)
-        if is_gap or len(self._steps) < _USUAL or self._messages % _USUAL == 0:
-            self._usual_step = median(self._steps)
+        self._out_of_order += 1
         return False
 
 

@@ -151,7 +151,7 @@ class SourceOutput:
             return
         if (source := message.source or self._kind) != publisher.source:
             publisher.relabel(source)
-        start = self._now()
+        start = None if self.published % _TIMED else self._now()
         try:
             row, payload, provided, missing = message.encode()
             publisher.publish_encoded(payload, provided)
@@ -160,7 +160,7 @@ class SourceOutput:
             self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)  # without values
             return
         now = self._now()
-        if not self.published % _TIMED:
+        if start is not None:
             self.durations.add(now - start)
         self.published += 1
         received = now if received is None else received

@@ -16,7 +16,7 @@ def open_replay(file: str, options: RecordedOptions, default_vehicle: str) -> Re
     path, layout = Path(file).expanduser(), options.layout if isinstance(options, RecordingOptions) else None
     flight = FlightFile(path, ReadOptions(options.chosen_topics, options.vehicle, default_vehicle, layout))
     reader = flight.reader
-    run = ReplayRun(iter(()), reader.definitions, reader.total, "", position=0)
+    run = ReplayRun(iter(()), reader.definitions, reader.total, "", position=lambda: reader.position)
     run.messages = _read(flight, run, options)
     run.boot_utc, run.summary = reader.boot_utc, _summary(reader)
     _update(run, flight, ())
@@ -27,9 +27,7 @@ def _read(flight: FlightFile, run: ReplayRun, options: RecordedOptions) -> Itera
     """Yield the messages of a file, and update its run."""
     reader = flight.reader
     try:
-        for message in flight.messages:
-            run.position = reader.position
-            yield message
+        yield from flight.messages
     finally:
         reader.close()
     absent = absent_topics(options.topics, {address.topic for address in reader.definitions}, "this file")

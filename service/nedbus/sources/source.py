@@ -44,7 +44,7 @@ class ReplayRun:
     `total`: number of messages, or of bytes if `position` is set; None if endless.
     `summary`: description for the log; `warnings`: damage and skipped parts.
     `damage`: description of damage that cost messages, and makes the run fail; None if no message was lost.
-    `position`: bytes read so far; None if progress is counted in messages.
+    `position`: returns the bytes read so far; None if progress is counted in messages.
     `boot_utc`: Unix time of the vehicle's boot [us], from the metadata of the file; 0 if unknown.
     """
 
@@ -54,12 +54,12 @@ class ReplayRun:
     summary: str
     warnings: tuple[str, ...] = ()
     damage: str | None = None
-    position: int | None = None
+    position: Callable[[], int] | None = None
     boot_utc: int = 0
 
     def done(self, messages: int) -> int:
         """Return the progress towards `total`, given the number of messages so far."""
-        return messages if self.position is None else self.position
+        return messages if self.position is None else self.position()
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,6 +52,25 @@ def test_rate_and_jitter_cover_the_last_second() -> None:
     assert health.messages == 201
 
 
+def test_health_does_not_depend_on_when_it_is_read() -> None:
+    """Messages are measured in batches, but each one at once for readers; at most 32 wait."""
+    often, once = StreamHealth(VLP), StreamHealth(VLP)
+    for number in range(500):
+        for stream in often, once:
+            latency = number % 7 / 100
+            stream.add(message(number * 8000), received=number * SECOND // 125, latency=latency, lost=number % 3)
+        assert len(once._waiting) <= 32
+        if number in (4, 5):
+            assert often.usual_interval == pytest.approx(None if number == 4 else 0.008)
+        assert sum(often.latencies.counts) == number + 1
+        assert often.snapshot(number * SECOND // 125).messages == number + 1
+    first, second = (dataclasses.asdict(stream.snapshot(4 * SECOND)) for stream in (often, once))
+    assert first.pop("jitter") == pytest.approx(second.pop("jitter"), abs=1e-12)
+    assert first.pop("rate") == pytest.approx(second.pop("rate"))
+    assert first.pop("usual_rate") == pytest.approx(second.pop("usual_rate"))
+    assert first == second
+
+
 def test_concurrent_add_does_not_break_a_snapshot() -> None:
     """A snapshot computes the jitter correctly even if another thread adds a message meanwhile."""
     stream = stream_at(0.0, 0.01, 0.02)

@@ -128,7 +128,7 @@ def test_addresses_of_a_replay_are_limited() -> None:
     addresses: dict[Address, Definition[Any] | None] = dict.fromkeys(
         Address(f"v{number}", VLP) for number in range(10_001)
     )
-    fake.output.claim_all(ReplayRun(iter(()), addresses, None, "", position=0), lossless=True)
+    fake.output.claim_all(ReplayRun(iter(()), addresses, None, ""), lossless=True)
     assert len(fake.output.addresses) == 10_000
     last = [*addresses][-1]
     for address in (last, last, POSITION):

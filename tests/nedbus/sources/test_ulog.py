@@ -52,7 +52,7 @@ def test_real_log_is_read_completely_and_exactly(name: str) -> None:
     run = open_log(path, "?topics=VehicleLocalPosition")
     assert f"layout {layout}," in run.summary
     messages = list(run.messages)
-    assert (len(run.addresses), run.warnings, run.position) == (streams, (), run.total)
+    assert (len(run.addresses), run.warnings, run.done(0)) == (streams, (), run.total)
     assert [each.due for each in messages] == sorted(each.due for each in messages)
     assert len(messages) == total
     fields = 0

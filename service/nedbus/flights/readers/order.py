@@ -1,8 +1,9 @@
 """Order and pace of a flight: messages by log time, due times without pauses and without outliers."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from heapq import heappop, heappush
+from operator import attrgetter
 from typing import Final, TypeVar
 
 from nedbus.samples import SourceMessage
@@ -20,24 +21,26 @@ _T = TypeVar("_T")
 
 
 class Clock:
-    """Replay clock: follows the times of messages from `start` on, and ignores outliers [us].
+    """Replay clock: follows the times of messages from the one of `start` on, and ignores outliers [us].
 
+    `start`: called at the first message.
     `max_behind`: consecutive messages more than MAX_GAP behind the clock, after which it is set back.
     `gaps`: number of steps that were too long, and skipped. `stray`: the last message, if its time is an outlier.
     """
 
-    def __init__(self, start: int = 0, *, max_behind: int = 1) -> None:
+    def __init__(self, start: Callable[[], int] = int, *, max_behind: int = 1) -> None:
         self.gaps = 0
         self.stray: object = None
-        self._max_behind, self.start = max_behind, start
+        self._max_behind, self._start = max_behind, start
         self._now = self._due = self._behind = 0  # us; messages
         self._is_running = False
 
-    def pace(self, timed: Iterable[tuple[int, _T]]) -> Iterator[tuple[int, _T]]:
+    def pace(self, messages: Iterable[_T], time_of: Callable[[_T], int]) -> Iterator[tuple[int, _T]]:
         """Yield the due time [us since the start] of each message; due times never decrease."""
         held: tuple[int, _T] | None = None
-        for time, message in timed:
-            self._now = self._now or self.start
+        for message in messages:
+            time = time_of(message)
+            self._now = self._now or self._start()
             if held is not None:
                 if time >= held[0] - _MAX_STEP:
                     self._follow(held[0])
@@ -78,7 +81,7 @@ class Replay:
     def __init__(self, reader: FlightReader) -> None:
         self.reader = reader
         self._unordered: Counter[Address] = Counter()
-        self._clock = Clock(max_behind=reader.max_behind)
+        self._clock = Clock(lambda: reader.start, max_behind=reader.max_behind)
 
     @property
     def warnings(self) -> list[str]:
@@ -94,19 +97,15 @@ class Replay:
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages with their due times; raise the errors of the reader."""
-        for due, message in self._clock.pace(self._timed()):
+        messages, newest = self.reader.messages(), dict[Address, int]()
+        ordered = messages if self.reader.is_sorted else _sort(messages)
+        for due, message in self._clock.pace(ordered, attrgetter("time")):
             message.due = due / 1e6
-            yield message
-
-    def _timed(self) -> Iterator[tuple[int, SourceMessage]]:
-        messages, reader, newest = self.reader.messages(), self.reader, dict[Address, int]()
-        for message in messages if reader.is_sorted else _sort(messages):
             time, address = message.time, message.address
             if time < newest.get(address, 0) and address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
                 self._unordered[address] += 1
             newest[address] = time
-            self._clock.start = reader.start
-            yield time, message
+            yield message
 
 
 def _sort(messages: Iterable[SourceMessage]) -> Iterator[SourceMessage]:

@@ -82,7 +82,7 @@ class FlightReader(ABC):
         self.path, self.options = path, options
         self.definitions: dict[Address, Definition[Any]] = {}
         self.start = self.boot_utc = self.position = self.total = 0
-        self.damaged = False
+        self.damaged, self._dropout = False, 0.0  # s lost by the logger before the next message
         self._vehicles: set[str] = set()
         self._resources: list[Any] = []  # open files
 
@@ -97,8 +97,7 @@ class FlightReader(ABC):
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in file order, once; raise SourceError if there are none of these topics."""
-        for record in self.records():
-            yield self.message_of(record)
+        return map(self.message_of, self.records())
 
     def message_of(self, record: Record) -> SourceMessage:
         """Return a record as a message, which is decoded when it is used."""
@@ -107,10 +106,11 @@ class FlightReader(ABC):
         given = {} if error else stream.decode(payload) if stream.converted else None
         if time is None:
             time = stream.timestamp(payload)[0] or 0
+        dropout, self._dropout = self._dropout, 0.0
+        definition, kind = stream.definition, self.kind
         return SourceMessage(
-            0.0, stream.address, given, error=error, definition=stream.definition, source=self.kind, logged=stream,
-            payload=payload, time=time,
-        )  # fmt: skip
+            0.0, stream.address, given, 0, False, error, definition, kind, dropout, stream, payload, time
+        )
 
     def shrinkage(self) -> list[str]:
         """Return a list of at most one warning at the end of a file: it has fewer bytes than when it was opened."""

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -74,7 +75,7 @@ class TlogReader(FlightReader):
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
         vehicles: dict[int, tuple[Vehicle, SequenceCounter]] = {}
         parser, booted = new_parser(), set[int]()
-        for due, (stamp, frame) in Clock().pace((stamp, (stamp, frame)) for stamp, frame in self._frames()):
+        for due, (stamp, frame) in Clock().pace(self._frames(), itemgetter(0)):
             for item in parse(parser, frame, str(self.path), None, due / 1e6):
                 if isinstance(item, Rejection):
                     self._skip(len(frame) if item.where == str(self.path) else 0)

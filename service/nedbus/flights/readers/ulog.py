@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from nedbus import ulog
 from nedbus.errors import AddressError, SourceError
-from nedbus.samples import SourceMessage
 from nedbus_msgs import ALL, TOPICS, Address, Definition
 
 from .formats import open_file
@@ -36,7 +35,6 @@ class UlogReader(FlightReader):
         self._parser = ulog.UlogParser(verify=True, topics=needed)
         self._damages, self._is_read = 0, False
         self._unset_bools: Counter[str] = Counter()  # by topic
-        self._dropout = 0.0  # s lost by the logger before the next message
         self._warnings: list[str] = []
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
@@ -90,12 +88,6 @@ class UlogReader(FlightReader):
                 names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
                 reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
             raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
-
-    def message_of(self, record: Record) -> SourceMessage:
-        """Return a record as a message, with the time that the logger lost before it."""
-        message = super().message_of(record)
-        message.dropout, self._dropout = self._dropout, 0.0
-        return message
 
     def layouts(self, definition: Definition[Any]) -> set[str]:
         """Return the names of the layouts of a definition so far."""
