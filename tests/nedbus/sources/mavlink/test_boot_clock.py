@@ -49,6 +49,23 @@ def test_second_sensor_of_a_kind_without_data_is_no_reboot() -> None:
     assert not any(reboots(position(BOOT), *both))
 
 
+def test_single_time_far_ahead_is_no_reboot() -> None:
+    """One message with a wild time in the future neither sets the clock nor makes the messages after it older."""
+    flight = [kind(BOOT + 100 * number) for number in range(40) for kind in (position, attitude)]
+    flight[20] = position(10**8)
+    clock = BootClock()
+    assert not any(clock.add(message, 0.05 * number) for number, message in enumerate(flight))
+    assert clock.newest == 1000 * (BOOT + 3900)
+
+
+def test_time_far_ahead_counts_once_it_is_confirmed() -> None:
+    """Two messages in a row that are ahead, as of a simulation that runs fast, set the clock."""
+    clock = BootClock()
+    for each in (position(1000), position(BOOT), attitude(BOOT + 10)):
+        assert not clock.add(each, 0.0)
+    assert clock.newest == 1000 * (BOOT + 10)
+
+
 def test_two_kinds_in_a_row_that_went_back_show_a_reboot() -> None:
     """The second kind whose own time went back shows the reboot, and is the first message of the new boot."""
     assert reboots(position(BOOT), attitude(BOOT), position(300), attitude(310)) == [False, False, False, True]
