@@ -232,8 +232,9 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 
     Raises AddressError for a topic of another message, and for a class that declares no topics.
     """
-    name = message if isinstance(message, str) else message.__name__
-    topics = [name] if isinstance(message, str) else [each.name for each in vars(message).get("TOPICS", ())]
+    declared = vars(message).get("TOPICS", ()) if isinstance(message, type) else ()
+    topics = [message] if isinstance(message, str) else [each.name for each in declared]
+    name = getattr(message, "__name__", message)
     if not topics:
         raise AddressError("message", name, "a class that declares TOPICS, or the name of a topic")
     if topic not in (None, *topics):

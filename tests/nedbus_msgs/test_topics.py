@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from typing import Any
 
 import pytest
 import zenoh
@@ -23,6 +24,7 @@ from nedbus_msgs import (
     check_prefix,
     schema_key,
     status_key,
+    topic_of,
 )
 
 CHUNK = st.text("ABCXYZabcxyz0189_-", min_size=1, max_size=64)
@@ -191,3 +193,10 @@ def test_address_without_instance_sorts_first() -> None:
     """The first instance of a topic that is not built in has no number, and sorts before numbered ones."""
     plain, second, other = Address("1", "logger_status"), Address("1", "logger_status", 1), Address("1", "event")
     assert sorted([second, plain, other]) == [other, plain, second]
+
+
+@pytest.mark.parametrize("message", [3, None, object(), int])
+def test_neither_message_nor_topic_raises(message: Any) -> None:
+    """What is neither a message class nor the name of a topic is rejected with what is expected."""
+    with pytest.raises(AddressError, match="a class that declares TOPICS, or the name of a topic"):
+        topic_of(message)
