@@ -125,12 +125,25 @@ def state_of(conditions: Iterable[Condition]) -> State:
 
 
 def without_wild(events: Iterable[Event]) -> list[Event]:
-    """Return chronological events without the conditions, and the moves of an origin, that one message alone had."""
-    kept: list[Event] = []
+    """Return chronological events without the conditions, and the moves of an origin, that one message alone had.
+
+    A condition that recurs within WINDOW is real, since the stream is not sound otherwise.
+    """
+    events = list(events)
+    wild, last = set[int](), dict[tuple[str, str], Event]()  # ids of events
     for event in events:
         if ALONE in event.numbers:
-            key, before = (event.vehicle, event.kind), range(len(kept) - 1, -1, -1)
-            begin = next((each for each in before if (kept[each].vehicle, kept[each].kind) == key), None)
+            before = last.get((event.vehicle, event.kind))
+            last[event.vehicle, event.kind] = event
+            if before is None or event.time - before.time > WINDOW:
+                wild.add(id(event))
+            else:
+                wild.discard(id(before))
+    kept: list[Event] = []
+    for event in events:
+        if id(event) in wild:
+            key, indices = (event.vehicle, event.kind), range(len(kept) - 1, -1, -1)
+            begin = next((each for each in indices if (kept[each].vehicle, kept[each].kind) == key), None)
             if begin is not None and event.time - kept[begin].time <= MAX_ALONE:
                 del kept[begin]
                 if event.change != "begin":
