@@ -41,7 +41,8 @@ _TEXTS: Final[Mapping[LogReason, str]] = {
     " header={:.0f}",
     "stalled": "the header of the ULog stream stalled for {:.1f} s; PX4 may not receive the acknowledgements",
     "silent": "the ULog stream seems to have ended; no data arrived for {:.1f} s",
-    "stopped_elsewhere": "PX4 stopped the ULog stream, probably because another client requested it",
+    "stopped_elsewhere": "PX4 stopped the ULog stream, probably because another client requested it; it is requested"
+    " again {}",
     "link_lost": "no message arrived from the vehicle for {:.1f} s; the link seems to be lost",
     "unreadable": "the ULog stream cannot be read, because {}",
     "left": "the ULog stream of the armed vehicle continues, for the next process",
@@ -386,7 +387,8 @@ class LogStreamClient:
             self._enter("ended", "stalled", now, since_acked)
         elif state == "streaming" and self._acked_in_row >= _STOP_TAIL and silence > TIMINGS.log_silence:
             self._has_header = False
-            self._enter("ended", "stopped_elsewhere", now)
+            again = f"in {TIMINGS.log_retry:.0f} s" if self._may_start() else "after disarming"
+            self._enter("ended", "stopped_elsewhere", now, again)
         elif not self._may_start():
             if silence > max(TIMINGS.log_timeout, 2 * limit):
                 self._enter("ended", "silent", now, silence)

@@ -299,13 +299,17 @@ class TestOwnership:
         assert session.client.status.reason == "taken"
 
     def test_stop_by_another_client_is_detected(self, session: Session) -> None:
-        """After a STOP by another client PX4 sends only 44 more LOGGING_DATA_ACKED; the client retries START later."""
+        """After a STOP by another client PX4 sends only 44 more LOGGING_DATA_ACKED; the client retries START later.
+
+        The status says when.
+        """
         session.start()
         for _ in range(44):
             session.receive(acked=True)
             session.now += 0.004
         session.wait(TIMINGS.log_retry - 0.5)
         assert session.states[-1] == ("ended", "stopped_elsewhere")
+        assert session.client.status.text.endswith(f"it is requested again in {TIMINGS.log_retry:.0f} s")
         assert session.commands == ["start"]
         session.wait(3)
         assert session.commands[:2] == ["start", "start"]
