@@ -86,9 +86,7 @@ CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all refere
 FLAPPING_CHANGES: Final = 4, 20  # per condition and per kind, in WINDOW; beyond that, only the last is reported
 MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; beyond that, only the last is reported
 PERIODIC: Final = ("VehicleLocalPosition", "SensorGps", "BatteryStatus")  # PX4 sends the others when they change
-MAX_ALONE: Final = (
-    0.4  # s; a condition of a PERIODIC message that its next message ends this soon may be one wild value
-)
+MAX_ALONE: Final = 0.4  # s; a condition of a PERIODIC message that ends this soon, with the next one, may be wild
 PAUSE: Final = 5.0  # s without a recurrence after which flapping, losses, rejections or an overload have ended
 MAX_BURST: Final = 20.0  # s after which continuing losses are reported
 

@@ -49,7 +49,7 @@ def test_publisher_without_readers_never_waits(
     assert session.now == pytest.approx(1.0)
 
 
-def test_publisher_asks_nobody_until_its_key_has_a_subscriber(
+def test_publisher_sends_no_requests_until_its_key_has_a_subscriber(
     session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """With the router in its process, a publisher requests nothing without a subscriber, and the first one at once."""
