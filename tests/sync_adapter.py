@@ -10,7 +10,7 @@ from typing import Any, Self, cast
 
 import nedbus
 
-_WRAPPED = (nedbus.AsyncBus, nedbus.AsyncPublisher, nedbus.AsyncSubscription)
+_WRAPPED = (nedbus.AsyncBus, nedbus.AsyncPublisher, nedbus.AsyncSubscription, nedbus.AsyncNewest)
 
 
 class SyncAdapter:
@@ -23,6 +23,9 @@ class SyncAdapter:
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._wrapped, name)
         return partial(self._call, value) if callable(value) else value
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._wrapped[key]
 
     def __enter__(self) -> Self:
         self._call(self._wrapped.__aenter__)

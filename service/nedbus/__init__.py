@@ -36,9 +36,12 @@ if TYPE_CHECKING:
     from . import health as health
     from .client import (
         AsyncBus,
+        AsyncNewest,
         AsyncPublisher,
         AsyncSubscription,
         Bus,
+        Newest,
+        NewestMessage,
         Publisher,
         Subscription,
         connect,
@@ -72,6 +75,7 @@ __all__ = [
     "AddressError",
     "ArgumentError",
     "AsyncBus",
+    "AsyncNewest",
     "AsyncPublisher",
     "AsyncSubscription",
     "Batch",
@@ -88,6 +92,8 @@ __all__ = [
     "MessageArray",
     "Mode",
     "NedbusError",
+    "Newest",
+    "NewestMessage",
     "NoDataError",
     "Provenance",
     "Publisher",
@@ -122,7 +128,8 @@ __all__ = [
 # By module; a module is imported on first use of one of its names: those for files load no Zenoh, and few load NumPy.
 _MODULES = {
     "nedbus.samples": "Batch Counts Mode Sample",
-    "nedbus.client": "AsyncBus AsyncPublisher AsyncSubscription Bus Publisher Subscription connect connect_async",
+    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest NewestMessage Publisher"
+    " Subscription connect connect_async",
     "nedbus.flights": "Flight FlightSamples UtcOffset open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.transport": "Session Tls",

@@ -23,7 +23,8 @@ from .discovery import (
     reply_parts,
 )
 from .fleet_tokens import FleetTokens
-from .health import Health, Histogram, Monitor, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
+from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
+from .newest import AsyncNewest, Monitor, Newest, NewestMessage
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer

@@ -16,10 +16,12 @@ from nedbus.errors import ClosedError
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
-from nedbus_msgs import Definition, Message, Selection
+from nedbus_msgs import ANY, Definition, Message, Selection
 
-from .bus import Bus
+from .bus import Bus, require_callable, select
+from .newest import AsyncNewest
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
+from .receiving import Receiver
 from .subscription import AsyncSubscription
 
 _P = ParamSpec("_P")
@@ -104,8 +106,28 @@ class AsyncBus:
         inbox = bus._make_inbox(selections, mode, max_rate, limit)
         return AsyncSubscription(partial(self._in_thread, bus._open_receiver, inbox), inbox)
 
+    def newest(
+        self,
+        *messages: type[Message] | str,
+        vehicle: str | int = ANY,
+        instance: int | None = None,
+        max_rate: float | None = None,
+    ) -> AsyncNewest:
+        """Return a view of the newest message of each stream; see `Bus.newest`. It opens on first use."""
+        bus, selections = self._blocking, select(messages, vehicle, instance)
+        inbox = bus._make_inbox(selections, "latest", max_rate, None)
+
+        def open_receiver() -> Receiver:
+            bus.publishers(timeout=0.0)  # connects for the list of publishers, which would block the event loop
+            return bus._open_receiver(inbox)
+
+        return AsyncNewest(
+            partial(self._in_thread, open_receiver), inbox, (each.topic for each in selections), owner=bus
+        )
+
     def on_link(self, call: Callable[[bool], object]) -> None:
         """Call a function in the running event loop when the link to the router is lost or up; see `Bus.on_link`."""
+        require_callable(call)
         self._blocking.on_link(partial(_call_in, asyncio.get_running_loop(), call))
 
     @overload

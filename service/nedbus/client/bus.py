@@ -19,6 +19,7 @@ from .closing import Finalizer
 from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_reports, find_services
 from .fleet_tokens import FleetTokens
 from .link import LinkWatch
+from .newest import Newest
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
@@ -108,8 +109,7 @@ class Bus(AbstractContextManager["Bus"]):
         """
         if topic is not None and len(messages) > 1:
             raise ArgumentError("topic", topic, "None with several messages: pass the names of the topics instead")
-        topics = [topic_of(message, topic) for message in messages or (VehicleLocalPosition,)]
-        selections = [Selection(each, vehicle_name(vehicle), instance) for each in dict.fromkeys(topics)]
+        selections = select(messages, vehicle, instance, topic)
         return self.subscribe_to(*selections, mode=mode, max_rate=max_rate, limit=limit)
 
     def subscribe_to(
@@ -118,6 +118,23 @@ class Bus(AbstractContextManager["Bus"]):
         """Subscribe to selections of addresses; see `subscribe`."""
         inbox = self._make_inbox(selections, mode, max_rate, limit)
         return Subscription(self._open_receiver(inbox), inbox, owner=self)
+
+    def newest(
+        self,
+        *messages: type[Message] | str,
+        vehicle: str | int = ANY,
+        instance: int | None = None,
+        max_rate: float | None = None,
+    ) -> Newest:
+        """Return a view of the newest message of each stream, for loops that run at their own rate.
+
+        `view.update()` reads what has arrived; then `view.get(VehicleAttitude)` has the message, its `age`, and whether
+        it is `updated` and its stream `alive`. It starts with the last message of each stream.
+        Arguments and errors as in `subscribe`.
+        """
+        selections = select(messages, vehicle, instance)
+        inbox = self._make_inbox(selections, "latest", max_rate, None)
+        return Newest(self._open_receiver(inbox), inbox, (each.topic for each in selections), owner=self)
 
     @overload
     def latest(
@@ -220,7 +237,10 @@ class Bus(AbstractContextManager["Bus"]):
         """Call a function with False when the link to the router is lost, and with True when it is up again.
 
         The calls are made on a separate thread, in order, until the bus is closed.
+
+        Raises ArgumentError if `call` is not a function.
         """
+        require_callable(call)
         self._links.append(LinkWatch(self._session, call))
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
@@ -248,6 +268,10 @@ class Bus(AbstractContextManager["Bus"]):
     def _session(self) -> Session:
         self._require_open()
         return self._zenoh
+
+    def _network(self) -> tuple[bool, Publishers]:
+        """Return whether there is a link, and the publishers known so far; used by the views of the newest messages."""
+        return self.connected, self.publishers(timeout=0.0)
 
     def _require_open(self) -> None:
         require_unforked()
@@ -296,6 +320,20 @@ def connect(
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
     return Bus(load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls), timeout=timeout, tls=tls)
+
+
+def require_callable(call: object) -> None:
+    """Raise ArgumentError unless `call` can be called."""
+    if not callable(call):
+        raise ArgumentError("call", call, "a function that takes True or False")
+
+
+def select(
+    messages: Sequence[type[Message] | str], vehicle: str | int, instance: int | None, topic: str | None = None
+) -> list[Selection]:
+    """Return the selections of the arguments of `subscribe`."""
+    topics = [topic_of(message, topic) for message in messages or (VehicleLocalPosition,)]
+    return [Selection(each, vehicle_name(vehicle), instance) for each in dict.fromkeys(topics)]
 
 
 def _vehicle_of(start: str, key: str) -> str:

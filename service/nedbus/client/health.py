@@ -3,29 +3,25 @@
 Rates and ages use a monotonic clock, because the wall clock may be set at any time.
 """
 
-import logging
 import math
 import threading
 import time
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from operator import itemgetter
 from statistics import fmean, median
 from typing import Any, Final, Literal, get_args
 
 from nedbus import clock
 from nedbus.events import format_duration
-from nedbus.log_event import about
 from nedbus.samples import Sample
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     DEFAULT,
     DOUBT_FLAGS,
     RESET_COUNTERS,
-    Address,
     FieldReader,
     Message,
     Quantity,
@@ -34,8 +30,6 @@ from nedbus_msgs import (
 )
 
 StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"]  # worst first
-
-_log = logging.getLogger(__name__)
 
 _REBOOT_STEP: Final = 1_000_000  # us; PX4's time steps back by more in a reboot, by less if a message is out of order
 _FACTOR: Final = 3.0  # times the usual interval, after which there is a gap, or the stream is stale
@@ -47,10 +41,9 @@ _WINDOW: Final = 1_000_000_000  # ns
 _BATCH: Final = 32  # messages that wait to be measured together, which takes half the time of one after the other
 _MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
-_MAX_STREAMS: Final = 4096  # per monitor
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
 _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
-_ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token counts as gone
+ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token counts as gone
 _QUEUED: Final = "log_message"  # PX4's queue may hold old ones, so their timestamps reveal no reboot
 _FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
 _COUNTERS: Final = 1 + len(DOUBT_FLAGS)  # index of the first counter in _FIELDS
@@ -93,9 +86,13 @@ class Health:
     @property
     def stale_after(self) -> float:
         """Seconds without a message until this stream is stale: 3 intervals, at least 3 s; infinity if it may pause."""
-        if not self.nominal and (self.on_change or (self.usual_rate or 0) < _MIN_PERIODIC_RATE):
-            return math.inf
-        return max(TIMINGS.stale, _FACTOR * (self.usual_interval or 0.0))
+        return _stale_after(self.nominal, self.usual_rate, self.usual_interval, on_change=self.on_change)
+
+
+def _stale_after(nominal: float, rate: float | None, interval: float | None, *, on_change: bool) -> float:
+    if not nominal and (on_change or (rate or 0) < _MIN_PERIODIC_RATE):
+        return math.inf
+    return max(TIMINGS.stale, _FACTOR * (interval or 0.0))
 
 
 _FlagCounts = Counter[tuple[bool | None, ...]]  # messages by the values of all flags, None for unknown ones
@@ -264,6 +261,12 @@ class StreamHealth:
         self._measure()
         return median(self._intervals) if len(self._intervals) >= _MIN_STEPS else None
 
+    @property
+    def stale_after(self) -> float:
+        """As in Health."""
+        interval, topic = self.usual_interval, self._topic
+        return _stale_after(topic.rate, self._usual_rate, interval, on_change=topic.on_change)
+
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
         self._measure()
@@ -329,65 +332,6 @@ class StreamHealth:
         return False
 
 
-class Monitor:
-    """Measure all streams of a subscription, at most 4096; beyond that the least recently updated one is evicted.
-
-    Retained samples are ignored.
-    `evicted`: the number of evicted streams.
-    """
-
-    def __init__(self) -> None:
-        self.evicted = 0
-        self._latest = time.monotonic_ns()  # arrival time of the latest sample [ns]
-        self._to_utc = clock.utc_ns() - self._latest  # from the monotonic to the wall clock [ns]
-        self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
-
-    def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`."""
-        if sample.retained:
-            return False
-        if received is None:  # not the time of reading: a reader that starts or lags would show a higher rate
-            received = self._latest = self._arrival(sample.received)
-        address = sample.address
-        stream = self._streams.pop(address, None)
-        if stream is None and len(self._streams) >= _MAX_STREAMS:
-            if not self.evicted:
-                text = "more than %d streams: the health of the least recently updated ones is discarded"
-                _log.warning(text, _MAX_STREAMS, extra=about("incomplete"))
-            self.evicted += 1
-            del self._streams[next(iter(self._streams))]
-        self._streams[address] = stream = StreamHealth(sample.topic) if stream is None else stream
-        missing = sample.provenance.missing
-        stream.add(sample.message, received=received, latency=sample.latency, lost=sample.lost, missing=missing)
-        return True
-
-    def _arrival(self, received: int) -> int:
-        """Return the arrival time on `monotonic_ns` of a sample that arrived at a time of the wall clock [ns].
-
-        Samples are read in the order of arrival. One that seems to have arrived before the last one shows a step of the
-        wall clock, which is the change of the difference between the two clocks.
-        """
-        now, utc, before = time.monotonic_ns(), clock.utc_ns(), self._to_utc
-        self._to_utc, arrival = utc - now, now - max(0, utc - received)
-        if arrival < self._latest:
-            arrival += self._to_utc - before
-        return min(now, max(self._latest, arrival))
-
-    def snapshot(self, now: int | None = None) -> dict[Address, Health]:
-        """Return the health of each stream, sorted by address, now or at `now` [ns] of the clock used in `add`."""
-        streams = sorted(self._streams.items(), key=itemgetter(0))
-        return {address: stream.snapshot(now) for address, stream in streams}
-
-    def latencies(self, address: Address) -> Histogram | None:
-        """Return the latency histogram of a stream since the start [s]; None for an unknown stream."""
-        stream = self._streams.get(address)
-        return stream.latencies if stream is not None else None
-
-    def forget(self, address: Address) -> None:
-        """Remove a stream; its next sample starts a new measurement."""
-        self._streams.pop(address, None)
-
-
 @dataclass(frozen=True, slots=True)
 class StreamState:
     """Current state of a stream, with a reason unless it is ok."""
@@ -404,19 +348,28 @@ class StreamState:
         return f"{self.name}: {self.reason}" if self.reason else self.name
 
 
+def silence_of(age: float, stale_after: float, *, publishers: int | None, connected: bool) -> StateName | None:
+    """Return why no messages arrive on a stream, by the age of the last one [s]; None while they do."""
+    if not connected:
+        return "disconnected"
+    if age > ABSENT and publishers == 0:
+        return "gone"
+    return "stale" if age > stale_after else None
+
+
 def stream_state(health: Health, *, publishers: int | None = None, connected: bool = True) -> StreamState:
     """Return the state of a stream with the given health.
 
     `publishers`: the number of publishers with a liveliness token; None if unknown.
     `connected`: True if there is a link to the router.
     """
-    if not connected:
-        return StreamState("disconnected", "no link")
-    age = health.age
-    if age is not None and age > _ABSENT and publishers == 0:
-        return StreamState("gone", f"last message {format_duration(age)} ago")
-    if age is not None and age > health.stale_after:
-        return StreamState("stale", f"nothing for {format_duration(age)}")
+    match silence_of(health.age or 0.0, health.stale_after, publishers=publishers, connected=connected):
+        case "disconnected":
+            return StreamState("disconnected", "no link")
+        case "gone":
+            return StreamState("gone", f"last message {format_duration(health.age or 0.0)} ago")
+        case "stale":
+            return StreamState("stale", f"nothing for {format_duration(health.age or 0.0)}")
     if publishers is not None and publishers > 1:
         return StreamState("duplicate", f"{publishers} publishers: stop one, or give it another vehicle")
     reasons = []
@@ -436,8 +389,10 @@ def describe_stream(health: Health, state: StreamState) -> str:
     return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
 
 
-def health_of_last(sample: Sample[Message]) -> Health:
-    """Return the health of a stream from its last message alone; its age is measured by the wall clock."""
+def health_of_last(sample: Sample[Message], *, age: float | None = None) -> Health:
+    """Return the health of a stream from its last message alone; its age is by default measured by the wall clock."""
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
-    return stream.snapshot(0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent))
+    if age is None:
+        age = 0.0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent) / 1e9
+    return replace(stream.snapshot(0), age=age)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
 
-from nedbus import Sample
 from nedbus.client import describe_stream, stream_state
-from nedbus.health import Health, Monitor, StreamHealth
-from nedbus_msgs import DOUBT_FLAGS, Address
+from nedbus.health import Health, StreamHealth
+from nedbus_msgs import DOUBT_FLAGS
 from tests.flights.messages import VALID, VLP, message
 
 SECOND = 1_000_000_000
@@ -271,66 +269,6 @@ def test_rare_topic_without_nominal_rate_is_never_stale() -> None:
             stream.add(message(round(index * period * 1e6)), received=round(index * period * SECOND))
         assert stream.snapshot(0).stale_after == expected
     assert StreamHealth("vehicle_command").snapshot(0).stale_after == math.inf
-
-
-def sample(vehicle: str, timestamp: int = 0) -> Sample:
-    return Sample(message(timestamp), Address(vehicle, VLP), received=time.time_ns())
-
-
-@pytest.mark.parametrize("step", [3600, -3600])
-def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Rate and age use the monotonic clock: setting the wall clock between arrival and reading changes nothing."""
-    now, utc, address = 10_000 * SECOND, 10_000 * SECOND, Address("1", VLP)
-    monkeypatch.setattr("time.monotonic_ns", lambda: now)
-    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: utc)
-    monitor = Monitor()
-    for index in range(300):
-        now, utc = now + SECOND // 100, utc + SECOND // 100
-        arrived = dataclasses.replace(sample("1", index * 10_000), received=utc)
-        utc += step * SECOND * (index == 150)
-        monitor.add(arrived)
-    assert monitor.snapshot()[address].rate == pytest.approx(100.0)
-    now += 7 * SECOND
-    health = monitor.snapshot()[address]
-    assert health.rate is None
-    assert health.age == pytest.approx(7.0)
-
-
-def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples that queue up while a reader starts, and that it then reads together, do not raise the rate."""
-    now, start, address = 0, time.time_ns(), Address("1", VLP)
-    monkeypatch.setattr("time.monotonic_ns", lambda: now)
-    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: start + now)
-    monitor, now = Monitor(), SECOND
-    for index in range(151):
-        arrival = SECOND // 2 + index * SECOND // 100
-        now = max(now, arrival)
-        monitor.add(dataclasses.replace(sample("1", index * 10_000), received=start + arrival))
-    assert monitor.snapshot()[address].rate == pytest.approx(100.0)
-
-
-def test_number_of_monitored_streams_is_bounded() -> None:
-    """In a flood of keys, the monitor keeps the 4,096 most recently updated streams, including an active one."""
-    monitor, real = Monitor(), sample("real")
-    flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
-    for each in flood:
-        monitor.add(each)
-        monitor.add(real)
-    streams = monitor.snapshot()
-    assert (len(streams), streams[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
-    assert flood[-4095].address in streams
-    assert flood[-4096].address not in streams
-    monitor.forget(real.address)
-    assert real.address not in monitor.snapshot()
-
-
-def test_retained_sample_is_not_measured() -> None:
-    """Measurement of a stream starts with its first live sample, because a retained one may have any age."""
-    monitor, first = Monitor(), sample("1")
-    assert not monitor.add(dataclasses.replace(first, retained=True))
-    assert monitor.snapshot() == {}
-    assert monitor.add(first)
-    assert monitor.snapshot()[first.address].messages == 1
 
 
 def test_stream_has_the_worst_state_that_applies() -> None:

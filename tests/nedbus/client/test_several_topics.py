@@ -149,6 +149,12 @@ def test_publisher_of_a_class_publishes_its_topic(bus: nedbus.Bus, client: nedbu
         bus.publisher(VehicleAttitude, topic=VLP, vehicle=1)
 
 
+def test_callback_that_cannot_be_called_raises(client: nedbus.Bus) -> None:
+    """`on_link` rejects anything but a function at once, not on the thread that would call it."""
+    with pytest.raises(ArgumentError, match="call 3 is not valid: expected a function"):
+        client.on_link(3)  # type: ignore[arg-type] # not a function
+
+
 def test_changes_of_the_link_are_reported() -> None:
     """`on_link` calls a function when the router is gone and when it is back, with asyncio in the event loop."""
     endpoint = free_endpoint()

@@ -1,0 +1,323 @@
+"""The newest message of each stream, with its age and the health of its stream: of a bus, or of any samples."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar, overload
+
+from nedbus import clock
+from nedbus.errors import ArgumentError, ClosedError, NoDataError
+from nedbus.log_event import about
+from nedbus.samples import Counts, M_co, Sample
+from nedbus.transport import require_unforked
+from nedbus_msgs import ANY, Address, Message, topic_of
+
+from .discovery import Publishers
+from .health import ABSENT, Health, Histogram, StreamHealth, health_of_last, silence_of
+from .receiving import MAX_KEYS, Inbox, Receiver
+from .subscription import AsyncSubscription, Subscription
+
+if TYPE_CHECKING:
+    from .bus import Bus
+
+_log = logging.getLogger(__name__)
+
+_M = TypeVar("_M", bound=Message)
+_NETWORK_INTERVAL: Final = 1.0  # s between two looks at the link and at the list of publishers
+_MAX_NAMED: Final = 5  # streams in an error
+
+
+@dataclass(slots=True)
+class _View:
+    """What the messages of a view share: the number of its last update, and the state of the network.
+
+    `ask`: returns whether there is a link, and the publishers; None if both are unknown.
+    """
+
+    ask: Callable[[], tuple[bool, Publishers]] | None = None
+    number: int = 0
+    _asked: float = -math.inf
+    _answer: tuple[bool, Publishers] = field(default_factory=lambda: (False, Publishers()))
+
+    def network(self, address: Address) -> tuple[bool, int | None]:
+        """Return whether there is a link, and the number of publishers of an address; None if that is unknown."""
+        if self.ask is None:
+            return True, None
+        if time.monotonic() - self._asked > _NETWORK_INTERVAL:
+            try:
+                self._answer = self.ask()
+            except ClosedError:
+                self._answer = False, Publishers()
+            self._asked = time.monotonic()
+        connected, publishers = self._answer
+        return connected, publishers[address] or (0 if publishers.complete else None)
+
+
+@dataclass(slots=True, eq=False)
+class NewestMessage(Generic[M_co]):
+    """The newest message of a stream; the object follows its stream.
+
+    `sample`: the message with its metadata.
+    """
+
+    sample: Sample[M_co]
+    _view: _View
+    _arrived: float = -math.inf  # on the monotonic clock [ns]; a retained message when it was sent, -inf if unknown
+    _number: int = 0  # of the update in which it arrived
+    _measured: StreamHealth | None = None  # None before the first message that is not retained
+
+    @property
+    def message(self) -> M_co:
+        """The message."""
+        return self.sample.message
+
+    @property
+    def updated(self) -> bool:
+        """True if the message arrived in the last update of its view."""
+        return self._number == self._view.number
+
+    @property
+    def age(self) -> float:
+        """Seconds since the message arrived or, if it is retained, since it was sent; infinity if that is unknown."""
+        return max(0.0, time.monotonic_ns() - self._arrived) / 1e9
+
+    @property
+    def alive(self) -> bool:
+        """True while the stream is neither disconnected, gone nor stale, by the rule of `nedbus hz`.
+
+        It is alive for 1 s after a message. Later it is disconnected without a link to the router, gone without a
+        publisher, and stale after `health.stale_after`; link and publishers are looked up once per second at most.
+        """
+        age = self.age
+        if age <= ABSENT:
+            return True
+        connected, publishers = self._view.network(self.sample.address)
+        measured = self._measured or StreamHealth(self.sample.topic)
+        return silence_of(age, measured.stale_after, publishers=publishers, connected=connected) is None
+
+    @property
+    def health(self) -> Health:
+        """The health of the stream, measured on the messages that its view has received."""
+        return health_of_last(self.sample, age=self.age) if self._measured is None else self._measured.snapshot()
+
+    def _put(self, sample: Sample[Any], arrived: float) -> None:
+        """Replace the message, except by a retained one that is older."""
+        if not sample.retained:
+            measured, missing = self._measured or StreamHealth(sample.topic), sample.provenance.missing
+            received, latency = int(arrived), sample.latency
+            measured.add(sample.message, received=received, latency=latency, lost=sample.lost, missing=missing)
+            self._measured = measured
+        elif self._measured is not None or arrived < self._arrived:
+            return
+        self.sample, self._arrived, self._number = sample, arrived, self._view.number
+
+
+class Monitor(Mapping[Address, NewestMessage[Message]]):
+    """The newest message and the health of each stream, from the samples passed to `add`; at most 10,000 streams.
+
+    Beyond that the least recently updated one is evicted. `evicted`: the number of evicted streams.
+    A retained sample is shown until the first live one, and not measured. Thread-safe.
+
+    A key is an Address or, if one stream has it, a topic or the class of its message. `monitor[key]` raises KeyError
+    before the first message, for which `monitor.get(key)` returns None, and ArgumentError if several streams match.
+    """
+
+    def __init__(self) -> None:
+        self.evicted = 0
+        self._view, self._wanted = _View(), frozenset({ANY})  # topics
+        self._lock = threading.Lock()
+        self._latest = time.monotonic_ns()  # arrival time of the latest sample [ns]
+        self._to_utc = clock.utc_ns() - self._latest  # from the monotonic to the wall clock [ns]
+        self._streams: dict[Address, NewestMessage[Any]] = {}  # least recently updated first
+        self._by_topic: defaultdict[str, dict[Address, NewestMessage[Any]]] = defaultdict(dict)
+
+    def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
+        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`."""
+        address = sample.address
+        with self._lock:
+            stream = self._streams.pop(address, None)
+            if stream is None:
+                if len(self._streams) >= MAX_KEYS:
+                    self._evict()
+                stream = self._by_topic[address.topic][address] = NewestMessage(sample, self._view)
+            self._streams[address] = stream
+            stream._put(sample, self._arrival(sample) if received is None else received)
+        return not sample.retained
+
+    @overload
+    def __getitem__(self, key: type[_M]) -> NewestMessage[_M]: ...
+    @overload
+    def __getitem__(self, key: Address | str) -> NewestMessage[Message]: ...
+    def __getitem__(self, key: Any) -> NewestMessage[Any]:
+        with self._lock:
+            if isinstance(key, Address):
+                return self._streams[key]
+            topic = topic_of(key)
+            if not self._wanted & {ANY, topic}:
+                raise ArgumentError("topic", topic, f"one of this view: {', '.join(sorted(self._wanted))}")
+            streams = self._by_topic.get(topic, {})
+            if len(streams) > 1:
+                names = ", ".join(map(str, islice(sorted(streams), _MAX_NAMED)))
+                raise ArgumentError("topic", topic, f"an address, such as {names}", problem="has several streams")
+            return streams[next(iter(streams))] if streams else self._streams[key]
+
+    @overload  # type: ignore[override] # a class selects the type of the message
+    def get(self, key: type[_M], /) -> NewestMessage[_M] | None: ...
+    @overload
+    def get(self, key: Address | str, /) -> NewestMessage[Message] | None: ...
+    def get(self, key: Any, /, default: Any = None) -> Any:
+        """Return the newest message of a stream, None before its first; raise ArgumentError like `monitor[key]`."""
+        return super().get(key, default)
+
+    def __iter__(self) -> Iterator[Address]:
+        with self._lock:
+            return iter(list(self._streams))
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def snapshot(self, now: int | None = None) -> dict[Address, Health]:
+        """Return the health of each measured stream, by address, now or at `now` [ns] of the clock used in `add`."""
+        with self._lock:
+            streams = [(address, each._measured) for address, each in self._streams.items() if each._measured]
+        return {address: stream.snapshot(now) for address, stream in sorted(streams, key=itemgetter(0))}
+
+    def latencies(self, address: Address) -> Histogram | None:
+        """Return the latency histogram of a stream since the start [s]; None if it is not measured."""
+        stream = self._streams.get(address)
+        return stream._measured.latencies if stream is not None and stream._measured is not None else None
+
+    def forget(self, address: Address) -> None:
+        """Remove a stream; its next sample starts a new measurement."""
+        with self._lock:
+            self._remove(address)
+
+    def _arrival(self, sample: Sample[Any]) -> float:
+        """Return the time on `monotonic_ns` at which a sample arrived or, if it is retained, was sent.
+
+        Samples are read in the order of arrival. One that seems to have arrived before the last one shows a step of the
+        wall clock, which is the change of the difference between the two clocks.
+        """
+        now, utc, before = time.monotonic_ns(), clock.utc_ns(), self._to_utc
+        if sample.retained:
+            return -math.inf if sample.sent is None else now - max(0, utc - sample.sent)
+        self._to_utc, arrival = utc - now, now - max(0, utc - sample.received)
+        if arrival < self._latest:
+            arrival += self._to_utc - before
+        self._latest = min(now, max(self._latest, arrival))
+        return self._latest
+
+    def _evict(self) -> None:
+        if not self.evicted:
+            text = "more than %d streams: the least recently updated ones are discarded, with their health"
+            _log.warning(text, MAX_KEYS, extra=about("incomplete"))
+        self.evicted += 1
+        self._remove(next(iter(self._streams)))
+
+    def _remove(self, address: Address) -> None:
+        if self._streams.pop(address, None) is not None:
+            del self._by_topic[address.topic][address]
+            if not self._by_topic[address.topic]:
+                del self._by_topic[address.topic]
+
+
+class _NewestBase(Monitor):
+    def __init__(self, inbox: Inbox, topics: Iterable[str], ask: Callable[[], tuple[bool, Publishers]]) -> None:
+        super().__init__()
+        self._inbox, self._wanted, self._view.ask = inbox, frozenset(topics), ask
+
+    @property
+    def closed(self) -> bool:
+        """True once the view or its bus is closed, or receiving has failed."""
+        return self._inbox.ended
+
+    @property
+    def counts(self) -> Counts:
+        """Received, lost, dropped, invalid and discarded messages so far, as of a subscription in mode "latest"."""
+        return self._inbox.counts
+
+    def _read(self, *samples: Sample[Any]) -> list[NewestMessage[Message]]:
+        """Start a new update: add these samples, and those that have arrived; return the streams with news."""
+        ended = self._inbox.ended  # before `pop`, as in Subscription
+        self._view.number += 1
+        popped = (self._inbox.pop() for _ in range(self._inbox.waiting))
+        arrived = [*samples, *(each for each in popped if each is not None)]
+        if ended and not arrived:
+            raise self._inbox.end_error
+        for sample in arrived:
+            self.add(sample)
+        return [stream for sample in arrived if (stream := self._streams[sample.address]).updated]
+
+
+class Newest(_NewestBase):
+    """View of the newest message of each stream; `bus.newest(...)` returns one. Read it after each `update`.
+
+    It needs no thread unless `update` has a timeout. Call `update` from one thread; any thread may read the messages.
+    """
+
+    def __init__(self, receiver: Receiver, inbox: Inbox, topics: Iterable[str], *, owner: Bus) -> None:
+        super().__init__(inbox, topics, owner._network)
+        self._receiver, self._subscription = receiver, Subscription[Message](receiver, inbox, owner=owner)
+
+    def update(self, timeout: float | None = 0.0) -> list[NewestMessage[Message]]:
+        """Read what has arrived, if nothing wait up to `timeout` seconds (None: without limit) for a message.
+
+        Returns the streams with a new message. If the definition of a custom message is being looked up, waits for it.
+        Raises ClosedError if the view is closed, ReceiveError if it has failed.
+        """
+        require_unforked()
+        self._receiver.receive()
+        news = self._read()
+        if not news and timeout != 0:
+            with suppress(NoDataError):
+                news = self._read(self._subscription.receive(timeout))
+        return news
+
+    def close(self) -> None:
+        """Close the view; its messages remain. A second call does nothing."""
+        self._subscription.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class AsyncNewest(_NewestBase):
+    """The asyncio version of Newest: `await update()`, `await close()`; it opens on first use."""
+
+    def __init__(
+        self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox, topics: Iterable[str], *, owner: Bus
+    ) -> None:
+        super().__init__(inbox, topics, owner._network)
+        self._subscription = AsyncSubscription[Message](open_receiver, inbox)
+
+    async def update(self, timeout: float | None = 0.0) -> list[NewestMessage[Message]]:
+        """Read what has arrived, or wait for a message; see `Newest.update`."""
+        await self._subscription._open()
+        news = self._read()
+        if not news and timeout != 0:
+            with suppress(NoDataError):
+                news = self._read(await self._subscription.receive(timeout))
+        return news
+
+    async def close(self) -> None:
+        """Close the view; its messages remain. A second call does nothing."""
+        await self._subscription.close()
+
+    async def __aenter__(self) -> Self:
+        await self._subscription._open()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.close()
