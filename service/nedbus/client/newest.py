@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, ItemsView, Iterable, Iterator, Mapping, ValuesView
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
@@ -179,27 +179,38 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         return super().get(key, default)
 
     def __iter__(self) -> Iterator[Address]:
-        with self._lock:
-            return iter(list(self._streams))
+        return iter(self._copy())
+
+    def values(self) -> ValuesView[NewestMessage[Any]]:
+        """Return the newest messages, as they are known now."""
+        return self._copy().values()
+
+    def items(self) -> ItemsView[Address, NewestMessage[Any]]:
+        """Return the addresses and newest messages, as they are known now."""
+        return self._copy().items()
 
     def __len__(self) -> int:
         return len(self._streams)
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
         """Return the health of each measured stream, by address, now or at `now` [ns] of the clock used in `add`."""
-        with self._lock:
-            streams = [(address, each._measured) for address, each in self._streams.items() if each._measured]
-        return {address: stream.snapshot(now) for address, stream in sorted(streams, key=itemgetter(0))}
+        streams = sorted(self.items(), key=itemgetter(0))
+        return {address: each._measured.snapshot(now) for address, each in streams if each._measured}
 
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latency histogram of a stream since the start [s]; None if it is not measured."""
         stream = self._streams.get(address)
         return stream._measured.latencies if stream is not None and stream._measured is not None else None
 
-    def forget(self, address: Address) -> None:
-        """Remove a stream; its next sample starts a new measurement."""
+    def forget(self, address: Address, *, silence: float = 0.0) -> None:
+        """Remove a stream unless it has been silent for less than `silence` s; its next sample starts a new one."""
         with self._lock:
-            self._remove(address)
+            if address in self._streams and self._streams[address].age >= silence:
+                self._remove(address)
+
+    def _copy(self) -> dict[Address, NewestMessage[Any]]:
+        with self._lock:
+            return self._streams.copy()
 
     def _arrival(self, sample: Sample[Any]) -> float:
         """Return the time on `monotonic_ns` at which a sample arrived or, if it is retained, was sent.
@@ -224,10 +235,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         self._remove(next(iter(self._streams)))
 
     def _remove(self, address: Address) -> None:
-        if self._streams.pop(address, None) is not None:
-            del self._by_topic[address.topic][address]
-            if not self._by_topic[address.topic]:
-                del self._by_topic[address.topic]
+        del self._streams[address], self._by_topic[address.topic][address]
+        if not self._by_topic[address.topic]:
+            del self._by_topic[address.topic]
 
 
 class _NewestBase(Monitor):

@@ -12,16 +12,16 @@ from typing import Any, Final
 from prometheus_client.core import Metric
 
 from nedbus import clock
-from nedbus.client import Bus, LogStreamStatus, Sample, find_services
+from nedbus.client import Bus, LogStreamStatus, find_services
 from nedbus.errors import NedbusError
 from nedbus.events import report_of
 from nedbus.timings import TIMINGS
 from nedbus.transport import RouterState, Session, query_routers
-from nedbus_msgs import Address, Selection
+from nedbus_msgs import Selection
 
 from .http_server import Page
 from .metrics import MeasuredStream, build_info, make_metrics, metrics_page, stream_metrics, vehicle_metrics
-from .observer import Observer, Snapshot
+from .observer import Observer
 from .pages import vehicles_page
 
 _POLL_INTERVAL: Final = 0.5  # s
@@ -45,7 +45,6 @@ class Exporter(Observer):
         self._routers: list[RouterState] = []
         self.log_streams: Mapping[str, LogStreamStatus] = {}  # by vehicle
         self._session: Session | None = None  # for queries
-        self._sources: dict[Address, str] = {}
 
     def run(self, stop: threading.Event) -> None:
         """Run until `stop` is set; raise the error that ended the reader early."""
@@ -64,25 +63,14 @@ class Exporter(Observer):
             for task in tasks:
                 task.result()
 
-    def poll(self) -> Snapshot:
-        """Poll all vehicles; called by `run` twice a second."""
-        snapshot = super().poll()
-        with self._lock:  # not by `snapshot`: a stream may have been added since
-            for address in [each for each in self._sources if self.monitor.latencies(each) is None]:
-                del self._sources[address]
-        return snapshot
-
-    def add(self, sample: Sample[Any]) -> None:
-        """Add a sample; called by `run` for each one read."""
-        super().add(sample)
-        with self._lock:
-            self._sources[sample.address] = sample.source or ""
-
     def _metrics(self) -> Iterator[Metric]:
         counts = self.subscription.counts
         streams = [
-            MeasuredStream((address.vehicle, address.stream, self._sources.get(address, "")), health, latencies=each)
-            for address, (health, each) in self.measure().items()
+            MeasuredStream(
+                (address.vehicle, address.stream, each.sample.source or ""), each.health, latencies=latencies
+            )
+            for address, each in self.monitor.items()
+            if (latencies := self.monitor.latencies(address)) is not None
         ]
         yield build_info(self._version)
         yield from make_metrics({
@@ -118,7 +106,7 @@ class Exporter(Observer):
                         states = query_routers(self._session, timeout=TIMINGS.routers_timeout)
                 self._routers = states[:_MAX_ROUTERS]
                 due = time.monotonic() + TIMINGS.routers_interval
-            elif self._session is not None and any(each.startswith("mavlink") for each in [*self._sources.values()]):
+            elif self._session is not None and self._has_mavlink():
                 with suppress(NedbusError):
                     services = find_services(self._session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout)
                     logs = (log for each in services for source in each.sources for log in source.log_streams)
@@ -126,8 +114,11 @@ class Exporter(Observer):
         if self._session is not None:
             self._session.close()
 
+    def _has_mavlink(self) -> bool:
+        return any((each.sample.source or "").startswith("mavlink") for each in self.monitor.values())
+
     def _status(self) -> dict[str, Any]:
-        streams = {str(address): asdict(each) for address, (each, _) in self.measure().items()}
+        streams = {str(address): asdict(health) for address, health in self.monitor.snapshot().items()}
         return {"connected": self._bus.connected, **asdict(self.subscription.counts), "streams": streams}
 
     def _faults(self) -> list[str]:

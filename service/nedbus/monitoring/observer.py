@@ -1,13 +1,13 @@
 """Observer of the health of selected streams and of their vehicles' events."""
 
-import threading
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from nedbus import clock
-from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
+from nedbus.client import Bus, Health, Monitor, RejectionReport, Sample, stream_state
 from nedbus.events import RECENT, EventLog
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Selection
@@ -39,8 +39,8 @@ class Snapshot:
 class Observer:
     """Subscribe to a selection and keep an `event_log` of its vehicles on the steady clock.
 
-    The thread that reads `subscription` passes each sample to `add`. One thread calls `poll`, about twice a second. Any
-    thread may call `measure`.
+    The thread that reads `subscription` passes each sample to `add`. One thread calls `poll`, about twice a second.
+    `monitor`: the newest message and the health of each stream.
     """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
@@ -51,28 +51,18 @@ class Observer:
         self._rejections = bus.rejections()
         self._last_poll: float | None = None
         self._disconnected = 0.0  # time of the last poll without a link
-        self._lock = threading.Lock()  # a stream is briefly missing from the monitor while it is updated
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample just read; ignore a retained one, because its stream may have ended long ago."""
-        with self._lock:
-            counts = self.monitor.add(sample)
-        if counts:
+        """Add a sample just read; a retained one is no event, because its stream may have ended long ago."""
+        if self.monitor.add(sample):
             missing, now = sample.provenance.missing, clock.steady()
             self.event_log.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
-
-    def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
-        """Return the current health and latencies by stream."""
-        with self._lock:
-            healths = self.monitor.snapshot()
-            return {address: (health, self.monitor.latencies(address)) for address, health in healths.items()}
 
     def poll(self) -> Snapshot:
         """Poll streams, rejections and the link, and record changes in the event log."""
         now, connected = clock.steady(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
-        with self._lock:
-            healths = self.monitor.snapshot()
+        healths = self.monitor.snapshot()
         taken = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
@@ -92,20 +82,10 @@ class Observer:
         present = {each.vehicle for each in alive}
         self.event_log.update(now, states, link=link, dropped=dropped, is_behind=is_behind, present=present)
         if settled:
-            silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
-            self._forget(healths, [
-                address
-                for age, address in silent
-                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.event_log.vehicles)
-            ])  # fmt: skip
+            for address, each in self.monitor.items():
+                limit = min(TIMINGS.forgotten, math.inf if address.vehicle in self.event_log.vehicles else RECENT)
+                if not alive[address] and each.age > limit:
+                    self.monitor.forget(address, silence=limit)  # unless a message has arrived in the meantime
         behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped" if self.event_log.overload else ""
+        healths = {address: each for address, each in healths.items() if address in self.monitor}
         return Snapshot(now, healths, alive, rejected, link, behind)
-
-    def _forget(self, healths: dict[Address, Health], addresses: Sequence[Address]) -> None:
-        """Forget streams without a sample since this snapshot was taken."""
-        with self._lock:
-            newest = self.monitor.snapshot() if addresses else {}
-            for address in addresses:
-                if address in newest and newest[address].messages == healths[address].messages:
-                    del healths[address]
-                    self.monitor.forget(address)

@@ -79,7 +79,7 @@ class World:
             "vehicles": max(len(each.vehicles) for each in event_logs),
             "counts": max(len(each.counts) for each in event_logs),
             "addresses": len(self.output.addresses + self.output.stale),
-            "streams": len(self.reader.measure()),
+            "streams": len(self.reader.monitor.snapshot()),
             "page": len(self.fleet.streams),
             "rows": len(self.fleet.snapshot.vehicles),
         }
@@ -121,7 +121,7 @@ def test_unpublished_stream_of_present_vehicle_is_forgotten_after_an_hour(monkey
         world.receive(position)
         world.poll(position)
         world.receive(position)
-        assert world.reader.measure().keys() == known
+        assert world.reader.monitor.keys() == known
         assert {*world.output.addresses, *world.output.stale} == known
         assert world.fleet.streams.keys() == known
 
@@ -139,4 +139,4 @@ def test_stream_that_returns_during_a_poll_is_kept(monkeypatch: pytest.MonkeyPat
     world.now += TIMINGS.forgotten + 1.0
     monkeypatch.setattr(world.reader._bus, "publishers", publishers)
     world.reader.poll()
-    assert [health.messages for health, _ in world.reader.measure().values()] == [2]
+    assert [health.messages for health in world.reader.monitor.snapshot().values()] == [2]

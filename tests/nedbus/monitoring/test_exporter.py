@@ -33,14 +33,19 @@ def test_stream_that_begins_during_a_poll_keeps_its_source(bus: nedbus.Bus, monk
     assert 'source="sim"' in exporter.pages["/metrics"]().content.decode()
 
 
-def test_labels_of_retained_and_forgotten_streams_are_removed(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only streams that are measured keep the label of their source."""
+def test_retained_and_forgotten_streams_have_no_metrics(bus: nedbus.Bus) -> None:
+    """Only streams that are measured are exported, labelled with the source of their newest message."""
     exporter = Exporter(bus, Selection(), version="0")
     sample = Sample(message(1_000_000, **VALID), WING, 0, provenance=Provenance("sim"))
-    for stream in (sample, replace(sample, address=Address("quad", VLP), retained=True)):
-        exporter.add(stream)
-    exporter.poll()
-    assert [*exporter._sources] == [WING]
+
+    def labels() -> list[str]:
+        page = exporter.pages["/metrics"]().content.decode()
+        return [line for line in page.splitlines() if line.startswith("nedbus_messages_received_total{")]
+
+    for source in ("ulog", "sim"):
+        exporter.add(replace(sample, provenance=Provenance(source)))
+    exporter.add(replace(sample, address=Address("quad", VLP), retained=True))
+    assert len(exporter.monitor) == 2
+    assert labels() == [f'nedbus_messages_received_total{{source="sim",topic="{VLP}",vehicle="wing"}} 2.0']
     exporter.monitor.forget(WING)
-    exporter.poll()
-    assert not exporter._sources
+    assert labels() == []
