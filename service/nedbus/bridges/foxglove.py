@@ -19,14 +19,13 @@ import foxglove
 from foxglove import messages
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
 
-from nedbus.client import Bus, Sample
-from nedbus.errors import ListenError, NoDataError
+from nedbus.client import Bus, Monitor, Sample
+from nedbus.errors import ListenError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     DEFAULT_TOPIC,
     Address,
     Definition,
-    Message,
     Selection,
     VehicleLocalPosition,
     definition_text,
@@ -52,13 +51,11 @@ class FoxgloveServer:
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
-        self._bus = bus
+        self._bus, self._newest = bus, Monitor()
         self._context = foxglove.Context()
         self._fields: dict[tuple[Address, Definition[Any]], foxglove.Channel] = {}
-        # The last message of each stream without a rate, kept until a client subscribes.
-        self._unseen: dict[Address, tuple[Message, int]] = {}
+        self._unseen: set[Address] = set()  # streams without a rate, whose last message no client has received
         self._channels: dict[str, tuple[PoseInFrameChannel, LocationFixChannel]] = {}  # by vehicle
-        self._attitudes: dict[str, Any] = {}  # last message by vehicle
         self._map = CommonOrigin()
         self._local_in_map: dict[str, messages.Vector3] = {}  # last known translation of each local frame
         try:
@@ -71,27 +68,23 @@ class FoxgloveServer:
 
     def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
         """Serve the selected addresses, by default all, until `stop` is set; raise ClosedError if the bus is closed."""
-        with self._bus.subscribe_to(selection or Selection()) as subscription:
+        of = selection or Selection()
+        with self._bus.newest(of.topic, vehicle=of.vehicle, instance=of.instance) as self._newest:
             next_poll = time.monotonic() + TIMINGS.bridge_poll
             while not stop.is_set():
                 if time.monotonic() >= next_poll:
                     self._close_unpublished()
-                    for address, (message, time_ns) in list(self._unseen.items()):
-                        self._log_fields(address, message, time_ns)
+                    for address in self._unseen & self._newest.keys():
+                        self._log_fields(self._newest[address].sample)
                     next_poll = time.monotonic() + TIMINGS.bridge_poll
-                try:
-                    self.log(subscription.receive(0.1))
-                except NoDataError:
-                    continue
+                for stream in self._newest.update(0.1):
+                    self.log(stream.sample)
 
     def log(self, sample: Sample[Any]) -> None:
         """Log a sample to the channels of its address and of its vehicle."""
-        time_ns = sample.sent or sample.received
-        self._log_fields(sample.address, sample.message, time_ns)
-        if sample.topic == _ATTITUDE:
-            self._attitudes[sample.vehicle] = sample.message
+        self._log_fields(sample)
         if sample.topic == DEFAULT_TOPIC:
-            self._log_position(sample.vehicle, sample.message, time_ns)
+            self._log_position(sample)
 
     def __enter__(self) -> FoxgloveServer:
         return self
@@ -99,8 +92,9 @@ class FoxgloveServer:
     def __exit__(self, *exc: object) -> None:
         self._server.stop()
 
-    def _log_fields(self, address: Address, message: Message, time_ns: int) -> None:
-        definition = message.DEFINITION
+    def _log_fields(self, sample: Sample[Any]) -> None:
+        address, message = sample.address, sample.message
+        definition: Definition[Any] = message.DEFINITION
         channel = self._fields.get((address, definition))
         if channel is None:
             text = definition_text(definition, definition.current).encode()
@@ -108,12 +102,13 @@ class FoxgloveServer:
             channel = foxglove.Channel(f"/{address}", schema=schema, message_encoding="cdr", context=self._context)
             self._fields[address, definition] = channel
         if channel.has_sinks():
-            self._unseen.pop(address, None)
-            channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
+            self._unseen.discard(address)
+            channel.log(encode_with(definition, message.__dict__, definition.current), log_time=_time_of(sample))
         elif not get_topic(address.topic).rate:
-            self._unseen[address] = message, time_ns  # the stream may never have another message
+            self._unseen.add(address)  # it may never have another message
 
-    def _log_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
+    def _log_position(self, sample: Sample[VehicleLocalPosition]) -> None:
+        vehicle, message, time_ns = sample.vehicle, sample.message, _time_of(sample)
         if vehicle not in self._channels:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
             self._channels[vehicle] = pose, LocationFixChannel(f"/{vehicle}/location", context=self._context)
@@ -121,7 +116,8 @@ class FoxgloveServer:
         stamp = messages.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         if math.isfinite(message.x + message.y + message.z):
             east, north, up = ned_to_enu((message.x, message.y, message.z))
-            x, y, z, w = orientation_of(message, self._attitudes.get(vehicle))
+            attitude = self._newest.get(Address(vehicle, _ATTITUDE))
+            x, y, z, w = orientation_of(message, attitude.message if attitude else None)
             position, orientation = messages.Vector3(x=east, y=north, z=up), messages.Quaternion(x=x, y=y, z=z, w=w)
             local, pose_in_local = f"{vehicle}/local", messages.Pose(position=position, orientation=orientation)
             poses.log(messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local), log_time=time_ns)
@@ -164,14 +160,17 @@ class FoxgloveServer:
             return  # without a link the list of vehicles is incomplete
         for address, definition in [stream for stream in self._fields if stream[0] not in published]:
             self._fields.pop((address, definition)).close()
-            self._unseen.pop(address, None)
-            if address.topic == _ATTITUDE:
-                self._attitudes.pop(address.vehicle, None)
+            self._unseen.discard(address)
+            self._newest.forget(address)
         vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}
         for name in self._channels.keys() - vehicles:
             for channel in self._channels.pop(name):
                 channel.close()
             self._local_in_map.pop(name, None)
+
+
+def _time_of(sample: Sample[Any]) -> int:
+    return sample.sent or sample.received
 
 
 def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:

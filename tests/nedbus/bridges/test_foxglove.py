@@ -182,12 +182,13 @@ def test_orientation_falls_back_to_heading_without_recent_attitude(
 
 
 def test_pose_uses_attitude_of_its_own_vehicle(bus: nedbus.Bus) -> None:
-    """A pose uses the vehicle_attitude of its own vehicle, not of another vehicle or the ground truth."""
+    """A pose uses the newest vehicle_attitude of its own vehicle, not of another vehicle or the ground truth."""
     level, rolled = (VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)))
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
-        server.log(Sample(rolled, Address("1", "vehicle_attitude"), received=1))
+        for q in (level, rolled):
+            server._newest.add(Sample(q, Address("1", "vehicle_attitude"), received=1))
         for other in (Address("2", "vehicle_attitude"), Address("1", "vehicle_attitude_groundtruth")):
-            server.log(Sample(level, other, received=1))
+            server._newest.add(Sample(level, other, received=1))
         sample = Sample(message(1, x=1.0, y=2.0, z=3.0), Address("1", VLP), received=1)
         server.log(sample)
         client.until(lambda: "/1/pose" in client.topics)
