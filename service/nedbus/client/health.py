@@ -344,6 +344,11 @@ class StreamState:
         """Index in the list of states; 0 is the worst."""
         return get_args(StateName).index(self.name)
 
+    @property
+    def is_silent(self) -> bool:
+        """True if no messages arrive."""
+        return self.name in ("disconnected", "gone", "stale")
+
     def __str__(self) -> str:
         return f"{self.name}: {self.reason}" if self.reason else self.name
 

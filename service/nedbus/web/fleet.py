@@ -5,12 +5,21 @@ import re
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count
 from typing import Any, Final, NamedTuple
 
-from nedbus.client import Health, LogStreamStatus, RejectionReport, Sample, StreamState, health_of_last, stream_state
+from nedbus.client import (
+    Health,
+    LogStreamStatus,
+    Monitor,
+    NewestMessage,
+    RejectionReport,
+    Sample,
+    StreamState,
+    stream_state,
+)
 from nedbus.events import FIXES, MODES, State, rank_vehicle
 from nedbus.monitoring import Snapshot
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -29,10 +38,11 @@ _DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its 
 
 @dataclass(frozen=True, slots=True)
 class StreamView:
-    """Snapshot of one stream: its health and state."""
+    """Snapshot of one stream: its newest message, health and state."""
 
     address: Address
     stream: PageStream
+    newest: NewestMessage[Any]
     health: Health
     state: StreamState
     rejected: int
@@ -40,7 +50,7 @@ class StreamView:
     @property
     def silence(self) -> float | None:
         """Age of the last message [s], None while messages arrive."""
-        return self.health.age or 0.0 if self.state.name in ("disconnected", "gone", "stale") else None
+        return self.health.age or 0.0 if self.state.is_silent else None
 
 
 class StatusValue(NamedTuple):
@@ -94,7 +104,7 @@ class VehicleView:
         """True while valid positions are received."""
         if self.main.silence is not None or not is_position(self.main.address):
             return False
-        last = self.main.stream.last
+        last: Sample[Any] = self.main.newest.sample
         return bool(last.message.xy_valid) or "xy_valid" in last.provenance.missing
 
 
@@ -117,19 +127,21 @@ class FleetSnapshot:
 class Fleet:
     """All streams of a page; one thread may add samples while another one takes snapshots.
 
+    `monitor`: the newest message and the health of each stream; each sample is added there first.
     `origin`: the common origin, by default the first one that two messages have.
     `long`: number of points in the long histories, and seconds between two points.
     """
 
-    def __init__(self, origin: Origin | None = None, long: tuple[int, float] = LONG) -> None:
-        self.origin = origin or Origin()
+    def __init__(
+        self, monitor: Monitor | None = None, *, origin: Origin | None = None, long: tuple[int, float] = LONG
+    ) -> None:
+        self.monitor, self.origin = Monitor() if monitor is None else monitor, origin or Origin()
         self.streams: dict[Address, PageStream] = {}
         self.snapshot = FleetSnapshot(0.0)
         self._long = long
         numbers = count()
         self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
-        self._left_out: set[Address] = set()
-        self._lock = threading.Lock()  # guards `streams` and `_left_out`
+        self._lock = threading.Lock()  # guards `streams`
         self._rejected: Counter[Address] = Counter()
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
 
@@ -143,9 +155,6 @@ class Fleet:
                 stream.add(sample, time, truth)
             elif len(self.streams) < MAX_STREAMS or (is_position(address) and self._evict(time)):
                 self.streams[address] = PageStream(sample, time, truth, self.origin, self._long)
-                self._left_out.discard(address)
-            elif len(self._left_out) < MAX_STREAMS:
-                self._left_out.add(address)
 
     def reject(self, reports: Sequence[RejectionReport]) -> None:
         """Add reports of rejected messages."""
@@ -157,25 +166,24 @@ class Fleet:
 
     def clear(self) -> None:
         """Remove all streams and reports for a seek; keep the common origin."""
-        for collection in (self.streams, self._left_out, self._rejected, self._reports):
+        self.monitor = Monitor()
+        for collection in (self.streams, self._rejected, self._reports):
             collection.clear()
 
     def update(self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus]) -> None:
         """Update `snapshot`; `states`, `logs`: states and ULog streams by vehicle."""
         self.reject(now.rejected)
-        time, alive = now.time, now.alive
+        alive = now.alive
         with self._lock:
-            if alive is not None and not now.link:
-                known, silent = {*alive, *now.healths}, time - _SILENT
-                for gone in [key for key, each in self.streams.items() if key not in known and each.time < silent]:
-                    del self.streams[gone]
-                self._left_out.intersection_update(alive)
+            newest = dict(self.monitor.items())
+            for forgotten in self.streams.keys() - newest.keys():
+                del self.streams[forgotten]
             streams = sorted(self.streams.items())
         views: dict[str, list[StreamView]] = {}
         for address, stream in streams:
-            health = now.healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
+            health = now.healths.get(address) or newest[address].health
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
-            view = StreamView(address, stream, health, state, self._rejected[address])
+            view = StreamView(address, stream, newest[address], health, state, self._rejected[address])
             views.setdefault(address.vehicle, []).append(view)
         vehicles = []
         for name, each in views.items():
@@ -184,8 +192,8 @@ class Fleet:
             vehicles.append(VehicleView(name, vehicle_state, main, tuple(each), _status(each), number, logs.get(name)))
         vehicles.sort(key=lambda view: rank_vehicle(view.vehicle, view.state.severity))
         alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
-        rejected = self._rejected.total()
-        self.snapshot = FleetSnapshot(time, vehicles, tuple(self._reports), rejected, len(self._left_out), alarms)
+        rejected, left_out = self._rejected.total(), len(newest) - len(streams)
+        self.snapshot = FleetSnapshot(now.time, vehicles, tuple(self._reports), rejected, left_out, alarms)
 
     def _evict(self, time: float) -> bool:
         """Evict the longest-silent stream, positions last and only if silent; return True if one was evicted."""
@@ -201,7 +209,7 @@ def _status(views: Sequence[StreamView]) -> dict[str, StatusValue]:
 
     def value_of(topic: str, describe: Callable[[Any], str]) -> StatusValue:
         view = known.get((topic, 0))
-        return StatusValue() if view is None else StatusValue(describe(view.stream.last.message), view.silence)
+        return StatusValue() if view is None else StatusValue(describe(view.newest.message), view.silence)
 
     gps = "vehicle_gps_position" if ("vehicle_gps_position", 0) in known else "sensor_gps"
     return {

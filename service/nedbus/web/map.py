@@ -71,7 +71,7 @@ class Map:
         labels = self._labels(placed, chosen, frame)
         replace(self.marks, [self._marker(each, position, labels.get(each.vehicle)) for each, position in placed])
         self.shown = [each.vehicle for each, _ in placed]
-        ephs = [each.main.stream.last.message.eph for each, _ in focused]
+        ephs = [each.main.newest.message.eph for each, _ in focused]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
         replace(self._ring, [{"east": at.east, "north": at.north, "radius": radius} for _, at in focused])
         if self._background is not None and overview.origin.projection is not None:
@@ -139,7 +139,7 @@ class Map:
 
     def _marker(self, view: VehicleView, at: Position, is_left: bool | None) -> dict[str, Any]:
         """Return a marker shaped by grade: filled at the current position, open at the last valid position."""
-        heading = getattr(view.main.stream.last.message, "heading", math.nan)
+        heading = getattr(view.main.newest.message, "heading", math.nan)
         colours, colour = self._style.colours, self._style.vehicle_colour(view.number)
         return {
             "east": round(at.east, 3), "north": round(at.north, 3), "angle": round(math.pi / 2 - heading, 3),

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
-from nedbus.client import Monitor, RejectionReport, Sample
+from nedbus.client import RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import EventLog, Times, state_at
 from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, MergedFlights, follow, times_of
@@ -89,11 +89,10 @@ class Player:
     """
 
     def __init__(self, recording: Recording) -> None:
-        self.fleet = Fleet(recording.overview.origin)
+        self.fleet = Fleet(origin=recording.overview.origin)
         self.on_seek: Callable[[], object] = lambda: None
         self.time = 0.0
         self.recording = recording
-        self._monitor = Monitor()
         self._next = 0
         self._ticked = time.monotonic()
         self._shown = 0.0  # last slider value set by the player; differs from the slider's while the user drags it
@@ -124,7 +123,7 @@ class Player:
         """Seek to a time, limited to the part read so far, and load the minute before it."""
         self._shown = self._slider.value
         self.fleet.clear()
-        self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.recording.length)
+        self.time = min(max(0.0, seconds), self.recording.length)
         self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
         indices = list(self.recording.indices.values())
         silent = (known[at - 1] for known in indices if (at := bisect_left(known, self._next)))
@@ -143,7 +142,7 @@ class Player:
             self._add(index)
         self._next = max(self._next, end)
         states = {name: state_at(spans, self.time) for name, spans in self.recording.timeline.spans.items()}
-        self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states, {})
+        self.fleet.update(Snapshot(self.time, self.fleet.monitor.snapshot(round(self.time * 1e9))), states, {})
 
     def _add(self, index: int) -> None:
         due, (address, entry) = self.recording.dues[index], self.recording.entries[index]
@@ -155,5 +154,5 @@ class Player:
         if isinstance(entry, bytes):
             message = codec_of(BY_TOPIC[address.topic]).decode_row(entry)
         sample = Sample(message, address, received)
-        self._monitor.add(sample, received=received)
+        self.fleet.monitor.add(sample, received=received)
         self.fleet.add(sample, due)

@@ -105,7 +105,7 @@ class LiveFleet(Exporter):
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         super().__init__(bus, selection, version=version)
-        self.fleet = Fleet()
+        self.fleet = Fleet(self.monitor)
         now = clock.utc()
         before = (event for report in bus.accounts(within=PAST) for event in report.events if event.time < now)
         remembered = [each for each in before if each.vehicle != ALL and selection.vehicle in ("*", each.vehicle)]

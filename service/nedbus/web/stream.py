@@ -1,4 +1,4 @@
-"""A stream on the page: its last sample and, for positions, a history at 10 Hz and a long one; no I/O."""
+"""A stream on the page: for positions, a history at 10 Hz and a long one; no I/O."""
 
 from __future__ import annotations
 
@@ -87,16 +87,16 @@ class Origin(CommonOrigin):
 
 
 class PageStream:
-    """Last sample and histories of one stream.
+    """Histories of one stream; `Monitor` has its newest message.
 
-    `last`: the last sample; `time`: its arrival time [s]; `valid`: the last valid position, if any.
+    `time`: when that arrived [s]. `end`: the sample at the end of the track, if any; `valid`: the last valid position.
     """
 
     def __init__(
         self, sample: Sample[Any], time: float, truth: PageStream | None, origin: Origin, long: tuple[int, float]
     ) -> None:
         self.minute, self.long = History(POINTS, _STEP), History(*long)
-        self.last = sample
+        self.end: Sample[Any] | None = None
         self.valid: Position | None = None
         self.origin = origin
         self._tracker = ResetTracker()
@@ -106,14 +106,15 @@ class PageStream:
 
     def add(self, sample: Sample[Any], time: float, truth: PageStream | None) -> None:
         """Add a sample received at `time` [s]; `truth`: the ground truth stream of its vehicle."""
-        before, self.last, self.time = self.last, sample, time
+        self.time = time
         if not is_position(sample.address):
             return
+        before, self.end = self.end, sample
         state = _state_of(sample.message)
         if state == self._state:
             if time - self._sampled < _STEP:
                 return
-        elif self._state is not None:
+        elif before is not None:
             self._tracker.add(before.message)  # the tracker needs the last message before the change
         self._state, self._sampled = state, time
         message, missing = sample.message, sample.provenance.missing
@@ -147,10 +148,10 @@ class PageStream:
 
 def _distance(position: Position, message: VehicleLocalPosition, truth: PageStream | None) -> float:
     """Return the distance to the ground truth, extrapolated to the same time [m]; NaN if they are not comparable."""
-    if truth is None or not math.isfinite(position.north):
+    if truth is None or truth.end is None or not math.isfinite(position.north):
         return math.nan
-    real = truth.last.message
-    other = truth.origin.locate(truth.last.address, real)
+    real = truth.end.message
+    other = truth.origin.locate(truth.end.address, real)
     seconds = ((message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)) / 1e6
     if other.common != position.common or abs(seconds) > _MAX_TRUTH_AGE:
         return math.nan

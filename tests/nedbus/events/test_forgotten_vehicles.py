@@ -42,7 +42,8 @@ class World:
             rejections=lambda: SimpleNamespace(take=list),
             publishers=lambda **_: self.alive,
         )
-        self.reader, self.fleet = Observer(cast("Bus", bus), Selection("*")), Fleet()
+        self.reader = Observer(cast("Bus", bus), Selection("*"))
+        self.fleet = Fleet(self.reader.monitor)
 
     @property
     def now_ns(self) -> int:

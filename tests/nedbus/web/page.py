@@ -21,7 +21,7 @@ from bokeh.models import ColumnDataSource, Model
 from bokeh.models.widgets import Div
 
 import nedbus
-from nedbus.client import LogStreamStatus, Monitor, Sample, describe_stream, stream_state
+from nedbus.client import LogStreamStatus, Sample, describe_stream, stream_state
 from nedbus.events import EventLog
 from nedbus.flights import RecordingWriter
 from nedbus.monitoring import Snapshot
@@ -46,7 +46,7 @@ class SimulatedFleet:
 
     def __init__(self) -> None:
         self.fleet = Fleet()
-        self.monitor = Monitor()
+        self.monitor = self.fleet.monitor
         self.event_log = EventLog()
         self.timeline = EventTimeline(self.event_log)
         self.time = NOON

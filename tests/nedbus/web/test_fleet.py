@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from nedbus import Sample
 from nedbus.events import EventLog, Times
 from nedbus.monitoring import Snapshot
 from nedbus.web.event_timeline import EventTimeline
@@ -17,7 +18,7 @@ from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream
 from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection
-from tests.flights.messages import VLP, message
+from tests.flights.messages import VALID, VLP, message
 from tests.nedbus.web.page import NOON, QUAD, WING, SimulatedFleet, addresses_of, describe, sim
 from tests.waits import DEADLINE
 
@@ -183,11 +184,11 @@ def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypat
     sim.time += 61
     sim.fly(0.1, names[3])
     snapshot = sim.poll()
-    assert (addresses_of(snapshot), snapshot.left_out) == (names[1:4], 1)
+    assert (addresses_of(snapshot), snapshot.left_out) == (names[1:4], 2)
     sim.time += 61
     sim.fly(0.1, names[0])
     snapshot = sim.poll()
-    assert (addresses_of(snapshot), snapshot.left_out) == ([names[0], *names[2:4]], 1)
+    assert (addresses_of(snapshot), snapshot.left_out) == ([names[0], *names[2:4]], 2)
 
 
 def test_streams_added_during_an_update_are_counted(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,13 +198,13 @@ def test_streams_added_during_an_update_are_counted(sim: SimulatedFleet, monkeyp
     waiting, adding = list(others), list[threading.Thread]()
 
     class Alive(Counter[Address]):
-        def __iter__(self) -> Iterator[Address]:
-            yield from super().__iter__()
+        def __getitem__(self, shown: Address) -> int:
             for address in waiting[:1]:
                 waiting.remove(address)
                 adding.append(threading.Thread(target=sim.add, args=[address]))
                 adding[-1].start()
                 adding[-1].join(0.1)  # it ends now if it does not have to wait
+            return super().__getitem__(shown)
 
     sim.fly(1, WING, QUAD)
     sim.fleet.update(Snapshot(sim.time, alive=Alive([WING, QUAD, *others])), {}, {})
@@ -399,3 +400,16 @@ def test_formatted_time_names_its_clock() -> None:
     recorded = EventTimeline(several, times=Times())
     recorded.set_clock("1", 70.0, 10.0)
     assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"
+
+
+def test_stream_shows_the_newest_message_of_the_monitor(sim: SimulatedFleet) -> None:
+    """The page keeps no messages; a retained one is as old as its time of sending, and a forgotten stream is gone."""
+    retained = Sample(message(1, **VALID), QUAD, 0, retained=True, _sent=time.time_ns() - 3_600_000_000_000)
+    sim.monitor.add(retained)
+    sim.fleet.add(retained, sim.time)
+    sim.fly(1, WING)
+    assert (sim.view(WING).newest, sim.view(QUAD).newest) == (sim.monitor[WING], sim.monitor[QUAD])
+    assert str(sim.view(QUAD).state) == "stale: nothing for 60 min"
+    sim.monitor.forget(QUAD)
+    assert addresses_of(sim.poll()) == [WING]
+    assert sim.fleet.streams.keys() == {WING}
