@@ -255,6 +255,11 @@ class _NewestBase(Monitor):
         """Received, lost, dropped, invalid and discarded messages so far, as of a subscription in mode "latest"."""
         return self._inbox.counts
 
+    @property
+    def invalid(self) -> dict[Address, str]:
+        """Why a message of a stream was invalid, for up to 100 streams; `counts.invalid` has the number of messages."""
+        return self._inbox.decoder.reasons.copy()
+
     def _read(self, *samples: Sample[Any]) -> list[NewestMessage[Message]]:
         """Start a new update: add these samples, and those that have arrived; return the streams with news."""
         ended = self._inbox.ended  # before `pop`, as in Subscription

@@ -8,13 +8,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from nedbus import client
 from nedbus.errors import NedbusError
 from nedbus.extras import import_optional
 from nedbus.log_event import about
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.timings import TIMINGS
-from nedbus.transport import Tls, open_client, probe_writes
+from nedbus.transport import Tls, probe_writes
 
 from .configuration import check_sources
 from .finding import Finding, limit_findings, sort_findings
@@ -79,12 +80,12 @@ def _check_sources(settings: Settings) -> Iterator[Finding]:
 
 def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[Finding]:
     """Connect to a router, observe its network, and yield the findings of `NETWORK_CHECKS`."""
-    open_session = partial(open_client, [router], timeout=TIMINGS.doctor_open, tls=tls)
-    with open_session() as session:
+    with client.connect(router, timeout=TIMINGS.doctor_open, prefix=seen.prefix, tls=tls) as bus:
+        session = bus._session  # noqa: SLF001 - a further one might exceed the limit of the router
         if seen.vehicle is not None:
-            with open_session() as writer:
+            with bus.open_session(timeout=TIMINGS.doctor_open) as writer:
                 seen.verdict = probe_writes(session, writer, [seen.vehicle], prefix=seen.prefix)[seen.vehicle]
-        seen.observe(session, open_session)
+        seen.observe(bus, session)
     for check in NETWORK_CHECKS:
         yield from limit_findings(check(seen))
 

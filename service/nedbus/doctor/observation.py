@@ -1,10 +1,10 @@
 """Observation of a network for a few seconds: services, tokens, messages and routers, which the checks evaluate."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice
 from typing import Final, TypeVar
 
@@ -13,7 +13,7 @@ import zenoh
 from nedbus import client, clock, transport
 from nedbus.events import AccountReport
 from nedbus.timings import TIMINGS
-from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, codec_of
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
 T = TypeVar("T")
 
@@ -35,7 +35,7 @@ class Observation:
     `alive`: number of publishers by address, from liveliness tokens.
     `ages`: age of the last message by address at the end of the observation [s]; None without a timestamp.
     `delays`: minimum latency by address with messages, from the clocks of both hosts [s]; None without timestamps.
-    `errors`: last decoding error by address. `listened`: duration of the observation [s].
+    `errors`: first decoding error by address. `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes. `ros2`: publishers of ROS 2 topics.
     `routers`: routers that disclose their sessions. `accounts`: event reports of services.
     """
@@ -62,56 +62,43 @@ class Observation:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
 
-    def observe(self, session: transport.Session, open_session: Callable[[], transport.Session]) -> None:
-        """Send the queries, and receive messages for at least 3 s; `open_session`: as in FleetTokens."""
+    def observe(self, bus: client.Bus, session: transport.Session) -> None:
+        """Send the queries, and receive messages for at least 3 s; `session`: that of the bus."""
         prefix, start = self.prefix, time.monotonic()
-        take_messages = _subscribe(session, f"{prefix}/*/**")
+        newest = bus.newest(ANY)
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
         self.routers = transport.query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
-        self.services = client.find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
+        self.services = bus.services(timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
-        self.accounts = client.find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        follow = partial(client.FleetTokens, open_session, prefix=prefix)
-        with closing(client.VehicleDirectory(follow, prefix=prefix)) as directory:
-            self.alive = directory.publishers(timeout=_LIST_TIMEOUT)
+        self.accounts = bus.accounts(within=0.0, timeout=_QUERY_TIMEOUT)
+        self.alive = bus.publishers(timeout=_LIST_TIMEOUT)
         tokens = transport.token_keys(session, transport.px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(transport.PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges
-        for sample in transport.query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
-            if (address := self._address_of(str(sample.key_expr))) is not None:
-                # several publishers, or a storage, may answer for one key
-                self.ages[address] = _least(_age_of(sample), self.ages.get(address))
-        queried = clock.utc()
         tokens = transport.token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
-        self._add(take_messages())
+        self._add(newest)
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)
-            self._add(take_messages())
+            self._add(newest)
             keys = (key for sample in take_others() if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}"))
             others.update(islice((key for key in keys if len(key) < _MAX_KEY_LENGTH), max(0, _MAX_KEYS - len(others))))
-        self.ages = {each: None if age is None else age + clock.utc() - queried for each, age in self.ages.items()}
+        ages = islice(((address, each.age) for address, each in newest.items()), _MAX_KEYS)
+        self.ages = {address: age if math.isfinite(age) else None for address, age in ages}
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
-    def _add(self, samples: Iterable[transport.RawSample]) -> None:
-        for sample in samples:
-            address = self._address_of(str(sample.key_expr))
-            if address is None or (address not in self.delays and len(self.delays) >= _MAX_KEYS):
-                continue
-            self.delays[address] = _least(_age_of(sample), self.delays.get(address))
-            definition = BY_TOPIC.get(address.topic)
-            if definition is not None and sample.kind == zenoh.SampleKind.PUT:
-                try:
-                    codec_of(definition).decode(sample.payload.to_bytes())
-                except DecodeError as exc:
-                    self.errors[address] = str(exc)
-
-    def _address_of(self, key: str) -> Address | None:
-        return next(iter(_parse_each(partial(Address.from_key, prefix=self.prefix), [key])), None)
+    def _add(self, newest: client.Newest) -> None:
+        for each in newest.update():
+            address = each.sample.address
+            if not each.sample.retained and (address in self.delays or len(self.delays) < _MAX_KEYS):
+                known = (self.delays.get(address), each.sample.latency)
+                self.delays[address] = min((delay for delay in known if delay is not None), default=None)
+        self.errors = {address: reason for address, reason in newest.invalid.items() if address.topic in BY_TOPIC}
+        self.delays |= {address: None for address in newest.invalid if address not in self.delays}
 
 
 def _subscribe(session: transport.Session, key_expr: str) -> Callable[[], Iterable[transport.RawSample]]:
@@ -119,16 +106,6 @@ def _subscribe(session: transport.Session, key_expr: str) -> Callable[[], Iterab
     with transport.translate_zenoh_errors():
         subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING))
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
-
-
-def _age_of(sample: transport.RawSample) -> float | None:
-    """Return the time since a sample's Zenoh timestamp [s]; None without a timestamp."""
-    stamp = sample.timestamp
-    return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9
-
-
-def _least(*ages: float | None) -> float | None:
-    return min((age for age in ages if age is not None), default=None)
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:

@@ -228,6 +228,8 @@ def test_invalid_message_does_not_replace_a_valid_one(bus: nedbus.Bus, client: n
         wait_for(view.update, what="the message")
         bus._session.put(publisher.key, b"\xc1")
         wait_for(lambda: view.update() or view.counts.invalid, what="the invalid message")
+        assert list(view.invalid) == [publisher.address]
+        assert "not a VehicleLocalPosition" in view.invalid[publisher.address]
         assert (view[VLP].message.timestamp, view.counts.invalid) == (1, 1)
 
 

@@ -29,10 +29,14 @@ _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 
 class Decoder:
-    """Decode samples and count invalid ones; the reason is logged once per key, for the first 100 keys."""
+    """Decode samples and count invalid ones; the reason is logged once per key, for the first 100 keys.
+
+    `reasons`: why a message was invalid, by address, for the same keys.
+    """
 
     def __init__(self, layouts: LayoutLookup, *, prefix: str) -> None:
         self.invalid, self.prefix, self._layouts = 0, prefix, layouts
+        self.reasons: dict[Address, str] = {}
         self._warned: set[int] = set()  # hashes, because keys may be long
         self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject
 
@@ -135,7 +139,9 @@ class Decoder:
                 return
             self._warned.add(hash(key))
             last = "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
-        reason = str(error)[:_MAX_TEXT]
+            reason = str(error)[:_MAX_TEXT]
+            if stream is not None:
+                self.reasons[stream.address] = reason
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("ignored an invalid message on %r (%s)%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
@@ -143,18 +149,21 @@ class Decoder:
         """Return the fields of an unknown layout, which the hash in the encoding identifies; {} if it is not known."""
         if stream.codec is None:
             return NO_LAYOUTS  # a definition that was looked up has a single layout
-        codec, name = self._find_codec(stream, raw), stream.codec.definition.name
+        codec, name = self._find_codec(stream, raw, unknown=f"layout {error.layout}"), stream.codec.definition.name
         return {error.layout: codec.definition.names} if codec and codec.definition.name == name else NO_LAYOUTS
 
-    def _find_codec(self, stream: Stream, raw: RawSample | DetachedSample, *, wait: bool = False) -> Codec[Any] | None:
+    def _find_codec(
+        self, stream: Stream, raw: RawSample | DetachedSample, *, wait: bool = False, unknown: str = "message"
+    ) -> Codec[Any] | None:
         """Return the codec of the definition in the encoding, from its publisher; None if no publisher has it.
 
-        `wait`: wait for a lookup in progress. Raises DecodeError if the encoding identifies no message.
+        `wait`: wait for a lookup in progress. `unknown`: what is not built in, for the error.
+        Raises DecodeError if the encoding identifies no message.
         """
         encoding = encoding_of(stream, raw)
         identity = identity_of(encoding)
         if identity is None:
             text = f"the encoding {encoding!r:.100} has no message name and hash"
-            raise DecodeError(f"unknown message or layout, and {text}")
+            raise DecodeError(f"unknown {unknown}, and {text}")
         sender = Sender(stream.address.vehicle, raw.source_info and raw.source_info.source_id.zid)
         return self._layouts.codec(*identity, sender=sender, wait=wait)

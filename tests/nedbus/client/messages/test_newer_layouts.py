@@ -105,7 +105,7 @@ def test_newer_layout_without_hash_is_invalid(
         assert receive_timestamps(subscription, 1) == [5]
         assert subscription.counts == Counts(received=1, invalid=3)
     assert [text.partition("(")[2] for text in caplog.messages] == [
-        f"not a message: unknown message or layout, and the encoding {ENCODING!r} has no message name and hash)"
+        f"not a message: unknown layout 9, and the encoding {ENCODING!r} has no message name and hash)"
     ]
     assert queries == []
 
