@@ -27,15 +27,21 @@ class Checkout(NamedTuple):
 
     folder: Path
 
-    def start(self, *arguments: str, errors: int | None = subprocess.DEVNULL) -> Process:
+    @property
+    def python(self) -> str:
+        """Its Python interpreter."""
+        python = self.folder / ".venv/bin/python"
+        return str(python) if python.exists() else sys.executable
+
+    def start(
+        self, *arguments: str, python: str = "", environment: Mapping[str, str] | None = None,
+        errors: int | None = subprocess.DEVNULL,
+    ) -> Process:  # fmt: skip
         """Start a Python process that imports this checkout; `errors`: target of its stderr."""
-        python, packages = (
-            self.folder / ".venv/bin/python",
-            [str(self.folder / each) for each in ("service", "schemas")],
+        packages = {"PYTHONPATH": os.pathsep.join(str(self.folder / each) for each in ("service", "schemas"))}
+        return start(
+            *arguments, python=python or self.python, environment={**packages, **(environment or {})}, errors=errors
         )
-        environment = {"PYTHONPATH": os.pathsep.join(packages)}
-        known = str(python) if python.exists() else sys.executable
-        return start(*arguments, python=known, environment=environment, errors=errors)
 
 
 HERE: Final = Checkout(ROOT)

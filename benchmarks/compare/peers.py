@@ -13,7 +13,10 @@ from typing import Final
 from benchmarks.processes import ROOT
 
 FORMS: Final = ROOT / "benchmarks" / "compare" / "forms"
-CORE: Final = ("raw", "straightforward", "models", "fields_in", "rows", "batches")
+NEDBUS: Final = ("models", "fields_in", "rows", "batches")
+"""Forms of nedbus."""
+
+CORE: Final = ("raw", "straightforward", *NEDBUS)
 """Forms measured in all cases: the references, and nedbus."""
 
 

@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
+BEFORE: Final = " before"
+"""End of the name of a form that runs with the checkout of `--vs`."""
+
 Measured = dict[str, float]
 """Figures of one run: rate [messages/s], CPU times and delays [us/message], memory peaks [MB]."""
 
@@ -64,8 +67,12 @@ class Results:
 
     def ratio(self, flight: str, load: Load, form: str, other: str, key: str) -> float:
         """Return the median of the ratios of two forms in the same round, when the machine had the same speed."""
+        return statistics.median(self.round_ratios(flight, load, form, other, key))
+
+    def round_ratios(self, flight: str, load: Load, form: str, other: str, key: str) -> list[float]:
+        """Return the ratio of two forms in each round."""
         pairs = zip(self.runs[flight, load.name, form], self.runs[flight, load.name, other], strict=True)
-        return statistics.median(one[key] / two[key] for one, two in pairs)
+        return [one[key] / two[key] for one, two in pairs]
 
     def ratios(self, flight: str, load: Load, form: str, other: str) -> Iterator[tuple[str, float]]:
         """Yield the ratios of all figures that are not 0."""
