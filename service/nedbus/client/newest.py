@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import threading
@@ -142,15 +143,7 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
         """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`."""
-        address = sample.address
-        with self._lock:
-            stream = self._streams.pop(address, None)
-            if stream is None:
-                if len(self._streams) >= MAX_KEYS:
-                    self._evict()
-                stream = self._by_topic[address.topic][address] = NewestMessage(sample, self._view)
-            self._streams[address] = stream
-            stream._put(sample, self._arrival(sample) if received is None else received)
+        self._add(sample, received)
         return not sample.retained
 
     @overload
@@ -207,6 +200,18 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         with self._lock:
             if address in self._streams and self._streams[address].age >= silence:
                 self._remove(address)
+
+    def _add(self, sample: Sample[Any], received: int | None = None) -> NewestMessage[Any]:
+        address = sample.address
+        with self._lock:
+            stream = self._streams.pop(address, None)
+            if stream is None:
+                if len(self._streams) >= MAX_KEYS:
+                    self._evict()
+                stream = self._by_topic[address.topic][address] = NewestMessage(sample, self._view)
+            self._streams[address] = stream
+            stream._put(sample, self._arrival(sample) if received is None else received)
+        return stream
 
     def _copy(self) -> dict[Address, NewestMessage[Any]]:
         with self._lock:
@@ -268,9 +273,7 @@ class _NewestBase(Monitor):
         arrived = [*samples, *(each for each in popped if each is not None)]
         if ended and not arrived:
             raise self._inbox.end_error
-        for sample in arrived:
-            self.add(sample)
-        return [stream for sample in arrived if (stream := self._streams[sample.address]).updated]
+        return [stream for sample in arrived if (stream := self._add(sample)).updated]
 
 
 class Newest(_NewestBase):
@@ -320,6 +323,7 @@ class AsyncNewest(_NewestBase):
     async def update(self, timeout: float | None = 0.0) -> list[NewestMessage[Message]]:
         """Read what has arrived, or wait for a message; see `Newest.update`."""
         await self._subscription._open()
+        await asyncio.sleep(0)  # otherwise a loop that never waits would starve other tasks
         news = self._read()
         if not news and timeout != 0:
             with suppress(NoDataError):

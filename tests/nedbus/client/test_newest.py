@@ -219,6 +219,21 @@ def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: n
             view.update()
 
 
+def test_more_streams_than_the_limit_in_one_update(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`update` returns every message that it has read, although the least recently updated streams are evicted."""
+    monkeypatch.setattr("nedbus.client.newest.MAX_KEYS", 3)
+    publishers = [bus.publisher(VLP, vehicle=number) for number in range(5)]
+    with bus.newest() as view:
+        for publisher in publishers:
+            wait_for_subscriber(publisher)
+            publish(publisher, 1)
+        wait_for(lambda: view._receiver.receive() and view._inbox.waiting == 5, what="the messages")
+        assert len(view.update()) == 5
+        assert (len(view), view.evicted, view.counts.received) == (3, 2, 5)
+        with pytest.raises(ArgumentError, match="has several streams"):
+            view.get(VLP)
+
+
 def test_invalid_message_does_not_replace_a_valid_one(bus: nedbus.Bus, client: nedbus.Bus) -> None:
     """A payload that cannot be decoded counts as invalid; the newest valid message remains."""
     with bus.publisher(VLP, vehicle=1) as publisher, client.newest(vehicle=1) as view:
@@ -293,6 +308,19 @@ def test_update_without_timeout_starts_no_thread(bus: nedbus.Bus) -> None:
         assert view._receiver._rings[0].pump is None
         view.update(0.001)
         assert view._receiver._rings[0].pump is not None
+
+
+def test_asyncio_loop_without_waiting_does_not_starve_other_tasks(endpoint: str) -> None:
+    """Each `update` lets other tasks run, even if it does not wait."""
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(endpoint) as reader, reader.newest() as view:
+            ran = asyncio.Event()
+            asyncio.get_running_loop().call_soon(ran.set)
+            await view.update()
+            assert ran.is_set()
+
+    asyncio.run(scenario())
 
 
 def test_asyncio_waits_for_news(bus: nedbus.Bus, endpoint: str) -> None:
