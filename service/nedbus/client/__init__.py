@@ -16,13 +16,10 @@ from .discovery import (
     ServiceStatus,
     SourceStatus,
     StreamStatus,
-    VehicleDirectory,
     Vehicles,
-    find_reports,
     find_services,
     reply_parts,
 )
-from .fleet_tokens import FleetTokens
 from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
 from .newest import AsyncNewest, Monitor, Newest, NewestMessage
 from .publishing.publisher import Publisher

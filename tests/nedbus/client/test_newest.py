@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import gc
 import math
+import threading
 import time
 import weakref
 
@@ -76,11 +77,12 @@ def test_number_of_monitored_streams_is_bounded() -> None:
     """In a flood of keys, the monitor keeps the 10,000 most recently updated streams, including an active one."""
     monitor, real = Monitor(), sample("real")
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(10_900)]
-    for each in flood:
+    for number, each in enumerate(flood):
         monitor.add(each)
-        monitor.add(real)
+        if number % 10 == 0:
+            monitor.add(real)
     streams = monitor.snapshot()
-    assert (len(streams), streams[real.address].messages, monitor.evicted) == (MAX_KEYS, 10_900, 10_901 - MAX_KEYS)
+    assert (len(streams), streams[real.address].messages, monitor.evicted) == (MAX_KEYS, 1090, 10_901 - MAX_KEYS)
     assert flood[1 - MAX_KEYS].address in streams
     assert flood[-MAX_KEYS].address not in streams
     monitor.forget(real.address)
@@ -178,6 +180,45 @@ def test_stream_is_alive_unless_disconnected_gone_or_stale(
     assert stream.alive is alive
     state = nedbus.client.stream_state(stream.health, publishers=publishers, connected=connected)
     assert silence < 1.0 or alive is (state.name not in ("disconnected", "gone", "stale"))
+
+
+def test_network_is_asked_once_per_second_at_most() -> None:
+    """However many streams are silent, a loop asks for the link and the publishers once per second, if at all."""
+    monitor, asked = Monitor(), list[int]()
+
+    def ask() -> tuple[bool, nedbus.health.Publishers]:
+        asked.append(1)
+        return True, nedbus.health.Publishers()
+
+    monitor._view.ask = ask
+    for vehicle in range(100):
+        monitor.add(sample(str(vehicle)))
+    assert all(each.alive for each in monitor.values())
+    assert not asked
+    for vehicle in range(100):
+        monitor.add(dataclasses.replace(sample(f"old-{vehicle}"), received=0, retained=True, _sent=0))
+    begin = time.monotonic()
+    assert sum(each.alive for each in monitor.values()) == 100
+    assert len(asked) <= 1 + time.monotonic() - begin
+
+
+def test_messages_are_read_while_others_are_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One thread adds and evicts streams; others iterate, look up and measure meanwhile."""
+    monkeypatch.setattr("nedbus.client.newest.MAX_KEYS", 20)
+    monitor, first = Monitor(), sample("1")
+
+    def add() -> None:
+        for number in range(3000):
+            monitor.add(dataclasses.replace(first, address=Address(f"v{number % 50}", VLP)))
+
+    adding = threading.Thread(target=add)
+    adding.start()
+    while adding.is_alive():
+        assert all(each.age >= 0 for _, each in monitor.items())
+        assert len(monitor.snapshot()) <= 20
+        assert len(list(monitor)) <= 20
+    adding.join()
+    assert {address.vehicle for address in monitor} == {f"v{number}" for number in range(30, 50)}
 
 
 def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: nedbus.Bus) -> None:
