@@ -260,6 +260,20 @@ def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: n
             view.update()
 
 
+def test_invalid_arguments_raise_at_once(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """Neither opens a view; a topic that nobody publishes has no message, and does not delay the others."""
+    for wrong in ("two words", 3):
+        with pytest.raises(AddressError):
+            client.newest(wrong)  # type: ignore[arg-type] # neither a class nor a topic
+    with pytest.raises(ArgumentError, match="max_rate 0"):
+        client.newest(max_rate=0)
+    with bus.publisher(VLP, vehicle=1) as publisher, client.newest(*(f"none_{each}" for each in range(7)), VLP) as view:
+        publish(publisher, 1)
+        wait_for(lambda: view.update(0.1), what="the message")
+        assert view.get("none_3") is None
+        assert view[VLP].message.timestamp == 1
+
+
 def test_more_streams_than_the_limit_in_one_update(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """`update` returns every message that it has read, although the least recently updated streams are evicted."""
     monkeypatch.setattr("nedbus.client.newest.MAX_KEYS", 3)
