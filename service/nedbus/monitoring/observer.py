@@ -84,7 +84,8 @@ class Observer:
         if settled:
             for address, each in self.monitor.items():
                 limit = min(TIMINGS.forgotten, math.inf if address.vehicle in self.event_log.vehicles else RECENT)
-                if not alive[address] and each.age > limit:
+                is_listed = alive.complete or not each.sample.retained  # a retained message does not come again
+                if not alive[address] and each.age > limit and is_listed:
                     self.monitor.forget(address, silence=limit)  # unless a message has arrived in the meantime
         behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped" if self.event_log.overload else ""
         healths = {address: each for address, each in healths.items() if address in self.monitor}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from types import SimpleNamespace
@@ -14,7 +13,7 @@ import pytest
 from hypothesis import example, given
 
 from nedbus import Bus, Counts, Sample, Selection
-from nedbus.client import PublisherRegistry
+from nedbus.client import PublisherRegistry, Publishers
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import from_json
@@ -55,7 +54,7 @@ class World:
             routers=("tcp/127.0.0.1:7447",),
             subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
             rejections=lambda: SimpleNamespace(take=list),
-            publishers=lambda **_: Counter((*ADDRESSES, GPS)),
+            publishers=lambda **_: Publishers((*ADDRESSES, GPS)),
         )
         self.reader = Observer(cast("Bus", bus), Selection("*"))
 

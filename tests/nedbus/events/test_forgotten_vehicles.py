@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from types import SimpleNamespace
 from typing import Final, cast
 
 import pytest
 
 from nedbus import Bus, Counts, Sample, Selection
-from nedbus.client import PublisherRegistry
+from nedbus.client import PublisherRegistry, Publishers
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.events.event_log import MAX_GONE
@@ -28,7 +27,7 @@ class World:
     """A service with a live source, a reader and its page, all of which receive every message."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.now, self.open, self.alive = 0.0, set[Address](), Counter[Address]()
+        self.now, self.open, self.alive = 0.0, set[Address](), Publishers()
         patch.setattr("nedbus.clock.steady", lambda: self.now)
         patch.setattr("nedbus.clock.utc_ns", lambda: self.now_ns)
         patch.setattr("time.monotonic_ns", lambda: self.now_ns)
@@ -66,7 +65,7 @@ class World:
         self.fleet.add(sample, self.now)
 
     def poll(self, *alive: Address) -> None:
-        self.alive = Counter(alive)
+        self.alive = Publishers(alive)
         self.daemon.update_events()
         self.output.expire_stale()
         snapshot, event_log = self.reader.poll(), self.reader.event_log
@@ -131,9 +130,9 @@ def test_stream_that_returns_during_a_poll_is_kept(monkeypatch: pytest.MonkeyPat
     """A stream is not forgotten for its age in a snapshot if a sample arrives before the publishers are listed."""
     world, address = World(monkeypatch), Address("7", VLP)
 
-    def publishers(**_: object) -> Counter[Address]:
+    def publishers(**_: object) -> Publishers:
         world.receive(address)
-        return Counter()
+        return Publishers()
 
     world.receive(address)
     world.poll(address)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 import nedbus
-from nedbus.client import Sample
+from nedbus.client import Publishers, Sample
 from nedbus.monitoring import Exporter
 from nedbus_msgs import Address, Provenance, Selection
 from tests.flights.messages import VALID, VLP, message
@@ -49,3 +49,16 @@ def test_retained_and_forgotten_streams_have_no_metrics(bus: nedbus.Bus) -> None
     assert labels() == [f'nedbus_messages_received_total{{source="sim",topic="{VLP}",vehicle="wing"}} 2.0']
     exporter.monitor.forget(WING)
     assert labels() == []
+
+
+def test_retained_message_is_kept_until_all_publishers_are_listed(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A retained message comes only once, so it is not forgotten because the list of publishers is incomplete."""
+    exporter, publishers = Exporter(bus, Selection(), version="0"), Publishers()
+    monkeypatch.setattr(bus, "publishers", lambda **_: publishers)
+    exporter.add(Sample(message(1_000_000, **VALID), WING, 0, retained=True))
+    for publishers.complete in (False, True):
+        assert WING in exporter.monitor
+        exporter.poll()
+    assert WING not in exporter.monitor
