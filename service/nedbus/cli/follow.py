@@ -1,6 +1,7 @@
 """Receive loop of commands with a subscription; it logs when the router link is lost and restored."""
 
 import logging
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -25,8 +26,9 @@ def follow(
     duration: float | None,
     each_second: Callable[[], object] = lambda: None,
 ) -> None:
-    """Handle samples until `count` are counted, or all that are received until `duration` [s] has passed or Ctrl-C.
+    """Handle samples until `count` are counted, or all that are received until `duration` [s] has passed or a signal.
 
+    Ctrl-C and SIGTERM end reception, not the output of what has been received; a second signal ends that as well.
     `handle` returns False for a sample that does not count. Every second, the link is checked and `each_second` called.
 
     Raises NoDataError if no sample was counted.
@@ -35,6 +37,7 @@ def follow(
     end = float("inf") if duration is None else start + duration
     next_second = start + 1.0
     connected, noticed, seen = True, False, 0
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         while (now := time.monotonic()) < end and (count is None or seen < count):
             if now >= next_second:
@@ -54,7 +57,7 @@ def follow(
                 continue
             seen += handle(sample) is not False
     finally:
-        if not isinstance(sys.exception(), Exception):  # the end, or Ctrl-C; a second Ctrl-C ends the output
+        if not isinstance(sys.exception(), Exception):  # the end, or a signal
             subscription.drain()
             with suppress(ClosedError):
                 while count is None or seen < count:

@@ -539,6 +539,18 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
     assert done == [1024, 2048]
 
 
+def test_conversion_without_a_valid_message_fails(tmp_path: Path) -> None:
+    """If all messages are rejected, `convert` exits with an error that quotes the first reason, and writes no file."""
+    writer, path = UlogWriter(), tmp_path / "a.mcap"
+    writer.define([VLP])
+    for timestamp in range(0, 20_000, 1000):
+        writer.add(VLP, message(timestamp), xy_valid=True)
+    ended = run_command("convert", str(writer.write(tmp_path / "a.ulg")), str(path))
+    assert ended.exit_code == 1
+    assert "a.mcap: not written, because all 20 messages are rejected: x: must be finite" in ended.err
+    assert [each.name for each in tmp_path.iterdir()] == ["a.ulg"]
+
+
 @pytest.mark.parametrize("suffix", [".mcap", ".ulg"])
 def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
     """A folder raises, and so does a FIFO, which would otherwise block forever."""
