@@ -42,8 +42,8 @@ class Bus(AbstractContextManager["Bus"]):
         self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
-        reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
-        self._directory = VehicleDirectory(partial(FleetTokens, reopen, prefix=prefix), prefix=prefix)
+        self._reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
+        self._directory = VehicleDirectory(partial(FleetTokens, self._reopen, prefix=prefix), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         self._links: list[LinkWatch] = []
@@ -269,7 +269,10 @@ class Bus(AbstractContextManager["Bus"]):
     def _open_receiver(self, inbox: Inbox) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
         session = self._session
-        receiver = MaxRateReceiver(session, inbox) if isinstance(inbox, MaxRateInbox) else Receiver(session, inbox)
+        if isinstance(inbox, MaxRateInbox):
+            receiver: Receiver = MaxRateReceiver(session, inbox, self._reopen)
+        else:
+            receiver = Receiver(session, inbox)
         self._receivers.add(receiver)
         if self.closed:  # closed by another thread in the meantime
             receiver.close()

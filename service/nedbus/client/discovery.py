@@ -69,7 +69,8 @@ class VehicleDirectory:
         self._closed.set()  # ends a wait that holds the lock
         with self._lock, suppress(zenoh.ZError):  # the session is already closed
             if self._tokens is not None:
-                self._tokens.undeclare()
+                tokens, self._tokens = self._tokens, None
+                tokens.undeclare()
 
     def publishers(self, *, timeout: float) -> Publishers:
         """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete."""
