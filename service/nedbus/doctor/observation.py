@@ -48,7 +48,7 @@ class Observation:
     asked: float = 0.0
     error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
-    alive: client.Publishers = field(default_factory=client.Publishers)
+    alive: transport.Publishers = field(default_factory=transport.Publishers)
     ages: dict[Address, float | None] = field(default_factory=dict)
     delays: dict[Address, float | None] = field(default_factory=dict)
     errors: dict[Address, str] = field(default_factory=dict)
@@ -72,8 +72,7 @@ class Observation:
         self.services = client.find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
         self.accounts = client.find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        follow = partial(client.FleetTokens, open_session, prefix=prefix)
-        with closing(client.VehicleDirectory(follow, prefix=prefix)) as directory:
+        with closing(transport.VehicleDirectory.of_fleet(open_session, prefix=prefix)) as directory:
             self.alive = directory.publishers(timeout=_LIST_TIMEOUT)
         tokens = transport.token_keys(session, transport.px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(transport.PublisherToken.parse, tokens)

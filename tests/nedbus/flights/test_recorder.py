@@ -21,7 +21,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import nedbus
 from nedbus import Batch
 from nedbus.cli.follow import write_notice
-from nedbus.client import Recorder, Subscription
+from nedbus.cli.recorder import Recorder
+from nedbus.client import Subscription
 from nedbus.errors import NoDataError, SourceError
 from nedbus.flights import RecordingWriter, convert
 from nedbus.sources import ReplayRun, SourceMessage

@@ -8,13 +8,10 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Final
 
 import zenoh
 
-from nedbus.client.discovery import Publishers, VehicleDirectory
-from nedbus.client.fleet_tokens import FleetTokens
 from nedbus.client.io_thread import CallThread
 from nedbus.client.protocol import LIVE
 from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
@@ -22,7 +19,7 @@ from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.samples import Mode
 from nedbus.timings import TIMINGS
-from nedbus.transport import RawSample, Session, send_query
+from nedbus.transport import Publishers, RawSample, Session, VehicleDirectory, send_query
 from nedbus_msgs import Address, Selection, get_topic
 
 from .arrival import Arrival, detach
@@ -99,13 +96,11 @@ class MaxRateInbox(Inbox):
 
 
 class MaxRateReceiver(Receiver):
-    """Put downsampled and last messages into a MaxRateInbox until closed."""
+    """Put downsampled and last messages into a MaxRateInbox until closed; `open_session`: as in FleetTokens."""
 
     def __init__(self, session: Session, inbox: MaxRateInbox, open_session: Callable[[], Session]) -> None:
-        """`open_session`: as in FleetTokens."""
         self._rate_inbox, prefix = inbox, inbox.decoder.prefix
-        follow = partial(FleetTokens, open_session, *inbox.selections, prefix=prefix)
-        self._directory = VehicleDirectory(follow, prefix=prefix)
+        self._directory = VehicleDirectory.of_fleet(open_session, *inbox.selections, prefix=prefix)
         self._since: dict[Address, float] = {}  # when a publisher was first seen [s]; infinity once it was checked
         self._next_check = 0.0
         _checks.start()

@@ -20,8 +20,11 @@ from typing import Final
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_REPLIES, LivelinessTokens, Replies, Session, query_tokens
 from nedbus_msgs import ANY, Selection
+
+from .liveliness import LivelinessTokens, query_tokens
+from .queries import MAX_REPLIES, Replies
+from .session import Session
 
 _log = logging.getLogger(__name__)
 

@@ -6,9 +6,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import nedbus
-from nedbus.client import fleet_tokens
 from nedbus.timings import Timings
-from nedbus.transport import LivelinessTokens, Session
+from nedbus.transport import LivelinessTokens, Session, fleet_tokens
 from nedbus_msgs import ANY, Selection
 from tests.flights.messages import VLP
 from tests.peers.command_line import run_command
