@@ -43,10 +43,7 @@ def convert(
     """
     check_recording(path)
     try:
-        with (
-            atomic_write(path) as part,
-            RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer,
-        ):
+        with atomic_write(path) as part, RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer:
             rejected, reason = _write(messages, writer, source=source, on_progress=on_progress)
             if rejected and not writer.messages:
                 raise SourceError(str(path), f"not written, because all {rejected} messages are rejected: {reason}")
