@@ -1,6 +1,7 @@
 """Receive loop of commands with a subscription; it logs when the router link is lost and restored."""
 
 import logging
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -25,25 +26,28 @@ def follow(
     duration: float | None,
     each_second: Callable[[], object] = lambda: None,
 ) -> None:
-    """Handle samples until `count` are counted, or all that are received until `duration` [s] has passed or Ctrl-C.
+    """Handle samples until `count` are counted, or all that are received until `duration` [s] has passed or a signal.
 
-    `handle` returns False for a sample that does not count. Every second, the link is checked and `each_second` called.
+    Ctrl-C and SIGTERM end reception, not the output of what has been received; a second signal ends that as well.
+    `handle` returns False for a sample that does not count.
 
     Raises NoDataError if no sample was counted.
     """
     start = time.monotonic()
     end = float("inf") if duration is None else start + duration
     next_second = start + 1.0
-    connected, noticed, seen = True, False, 0
+    noticed, seen = False, 0
+
+    def log_link(is_up: bool) -> None:
+        text = "the link to %s is up again" if is_up else "the link to %s is lost: reconnecting"
+        _log.warning(text, " or ".join(bus.routers), extra=about("link_up" if is_up else "link_lost"))
+
+    bus.on_link(log_link)
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         while (now := time.monotonic()) < end and (count is None or seen < count):
             if now >= next_second:
                 next_second = max(next_second + 1.0, now)
-                if connected != bus.connected:
-                    connected = not connected
-                    text = "the link to %s is up again" if connected else "the link to %s is lost: reconnecting"
-                    event = "link_up" if connected else "link_lost"
-                    _log.warning(text, " or ".join(bus.routers), extra=about(event))
                 each_second()
             if not seen and not noticed and now > start + TIMINGS.first_sample:
                 noticed = True
@@ -54,7 +58,7 @@ def follow(
                 continue
             seen += handle(sample) is not False
     finally:
-        if not isinstance(sys.exception(), Exception):  # the end, or Ctrl-C; a second Ctrl-C ends the output
+        if not isinstance(sys.exception(), Exception):  # the end, or a signal
             subscription.drain()
             with suppress(ClosedError):
                 while count is None or seen < count:

@@ -1,16 +1,13 @@
 """The client API: connect to a router, subscribe, query last messages, publish; blocking and asyncio."""
 
-from typing import TYPE_CHECKING
-
 from nedbus.events import format_duration
-from nedbus.extras import lazy_exports
 from nedbus.samples import Counts, Mode, Sample
+from nedbus.transport import Publishers
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect
 from .discovery import (
     LogStreamStatus,
-    Publishers,
     RejectionReport,
     Rejections,
     ServiceStatus,
@@ -28,9 +25,3 @@ from .publishing.query_server import QueryServer
 from .publishing.writer import HEARTBEAT
 from .rate_gate import check_max_rate
 from .subscription import AsyncSubscription, Subscription
-
-if TYPE_CHECKING:
-    from .recorder import Recorder
-else:
-    # Lazy: it needs an extra, and NumPy, whose import takes longer than all others together.
-    __getattr__ = lazy_exports(__name__, {"Recorder": ("mcap", "recorder")})

@@ -12,12 +12,20 @@ from nedbus.errors import ArgumentError, ClosedError, NedbusError
 from nedbus.events import AccountReport
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
-from nedbus.transport import Session, Tls, open_client, query, require_unforked, token_keys
+from nedbus.transport import (
+    Publishers,
+    Session,
+    Tls,
+    VehicleDirectory,
+    open_client,
+    query,
+    require_unforked,
+    token_keys,
+)
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
 from .closing import Finalizer
-from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_reports, find_services
-from .fleet_tokens import FleetTokens
+from .discovery import Rejections, ServiceStatus, Vehicles, find_reports, find_services
 from .link import LinkWatch
 from .newest import Newest
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
@@ -43,8 +51,8 @@ class Bus(AbstractContextManager["Bus"]):
         self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
-        reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
-        self._directory = VehicleDirectory(partial(FleetTokens, reopen, prefix=prefix), prefix=prefix)
+        self._reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
+        self._directory = VehicleDirectory.of_fleet(self._reopen, prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         self._links: list[LinkWatch] = []
@@ -293,7 +301,10 @@ class Bus(AbstractContextManager["Bus"]):
     def _open_receiver(self, inbox: Inbox) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
         session = self._session
-        receiver = MaxRateReceiver(session, inbox) if isinstance(inbox, MaxRateInbox) else Receiver(session, inbox)
+        if isinstance(inbox, MaxRateInbox):
+            receiver: Receiver = MaxRateReceiver(session, inbox, self._reopen)
+        else:
+            receiver = Receiver(session, inbox)
         self._receivers.add(receiver)
         if self.closed:  # closed by another thread in the meantime
             receiver.close()

@@ -1,14 +1,10 @@
-"""Discovery of vehicles, services, event reports and rejected messages; peers are untrusted."""
+"""Queries for vehicles, services, event reports and rejected messages; peers are untrusted."""
 
 from __future__ import annotations
 
 import json
 import logging
-import threading
-import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Final
@@ -20,14 +16,12 @@ from pydantic_core import to_json
 from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health import Health
-from nedbus.errors import AddressError, ConnectError
+from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
 from nedbus.samples import LogStreamStatus, UntrustedReply
-from nedbus.transport import MAX_REPLY_BYTES, LivelinessTokens, RawSample, Session, query, translate_zenoh_errors
-from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
-
-from .fleet_tokens import FleetTokens
+from nedbus.transport import MAX_REPLY_BYTES, RawSample, Session, query, translate_zenoh_errors
+from nedbus_msgs import ANY, REJECTED, Address, status_key
 
 _log = logging.getLogger(__name__)
 
@@ -35,12 +29,6 @@ _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rej
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
 _MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
-
-
-class Publishers(Counter[Address]):
-    """The number of publishers of each address; `complete` as in Vehicles."""
-
-    complete = True
 
 
 class Vehicles(dict[str, list[Address]]):
@@ -51,52 +39,6 @@ class Vehicles(dict[str, list[Address]]):
     """
 
     complete = True
-
-
-class VehicleDirectory:
-    """Addresses and their publishers, from the liveliness tokens that `follow` subscribes to on the first call."""
-
-    def __init__(self, follow: Callable[[], LivelinessTokens | FleetTokens], *, prefix: str) -> None:
-        self._prefix, self._follow = prefix, follow
-        self._lock = threading.Lock()
-        self._closed = threading.Event()
-        self._addresses: dict[str, Address] = {}  # by token key
-        self._tokens: LivelinessTokens | FleetTokens | None = None
-        self._logged = False
-
-    def close(self) -> None:
-        """End the subscription."""
-        self._closed.set()  # ends a wait that holds the lock
-        with self._lock, suppress(zenoh.ZError):  # the session is already closed
-            if self._tokens is not None:
-                self._tokens.undeclare()
-
-    def publishers(self, *, timeout: float) -> Publishers:
-        """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete."""
-        end = time.monotonic() + timeout
-        with self._lock:
-            if self._tokens is None and not self._closed.is_set():
-                with suppress(ConnectError):  # try again on the next call
-                    self._tokens = self._follow()
-            while self._tokens is not None:
-                for key, alive in self._tokens.poll():
-                    if not alive:
-                        self._addresses.pop(key, None)
-                        continue
-                    try:
-                        self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
-                    except AddressError:
-                        _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
-                if not self._tokens.is_listing or time.monotonic() >= end or self._closed.wait(0.002):
-                    break
-            publishers = Publishers(self._addresses.values())
-            publishers.complete = self._tokens is not None and self._tokens.complete
-            is_listing = self._tokens is None or self._tokens.is_listing
-            if is_listing and timeout and not self._logged:
-                text = "the router listed only %d stream%s within %g s; it may be slow, or forbid listing others"
-                _log.warning(text, len(publishers), "s" * (len(publishers) != 1), timeout, extra=about("incomplete"))
-            self._logged = is_listing and (self._logged or timeout > 0)
-            return publishers
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,10 +19,9 @@ from nedbus import clock
 from nedbus.errors import ArgumentError, ClosedError, NoDataError
 from nedbus.log_event import about
 from nedbus.samples import Counts, M_co, Sample
-from nedbus.transport import require_unforked
+from nedbus.transport import Publishers, require_unforked
 from nedbus_msgs import ANY, Address, Message, topic_of
 
-from .discovery import Publishers
 from .health import ABSENT, Health, Histogram, StreamHealth, health_of_last, silence_of
 from .receiving import MAX_KEYS, Inbox, Receiver
 from .subscription import AsyncSubscription, Subscription

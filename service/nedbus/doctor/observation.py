@@ -48,7 +48,7 @@ class Observation:
     asked: float = 0.0
     error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
-    alive: client.Publishers = field(default_factory=client.Publishers)
+    alive: transport.Publishers = field(default_factory=transport.Publishers)
     ages: dict[Address, float | None] = field(default_factory=dict)
     delays: dict[Address, float | None] = field(default_factory=dict)
     errors: dict[Address, str] = field(default_factory=dict)

@@ -8,7 +8,7 @@ from typing import Final
 from pydantic import ValidationError
 
 from nedbus.atomic_write import atomic_write
-from nedbus.errors import OutputError
+from nedbus.errors import OutputError, SourceError
 from nedbus.log_event import about
 from nedbus.samples import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
@@ -38,40 +38,45 @@ def convert(
     `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
     `on_progress`: called with the number of messages handled so far.
 
-    Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
+    Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written, SourceError
+    if all messages are rejected.
     """
     check_recording(path)
     try:
-        with atomic_write(path) as part:
-            return _write(messages, part, source=source, boot_utc=boot_utc, on_progress=on_progress)
+        with atomic_write(path) as part, RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer:
+            rejected, reason = _write(messages, writer, source=source, on_progress=on_progress)
+            if rejected and not writer.messages:
+                raise SourceError(str(path), f"not written, because all {rejected} messages are rejected: {reason}")
     except OSError as exc:  # an OutputError names the temporary file
         raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
+    return f"{writer.messages} message{'s' * (writer.messages != 1)}" + (f", {rejected} rejected" if rejected else "")
 
 
 def _write(
-    messages: Iterable[SourceMessage], path: Path, *, source: str, boot_utc: int, on_progress: Callable[[int], object]
-) -> str:
+    messages: Iterable[SourceMessage], writer: RecordingWriter, *, source: str, on_progress: Callable[[int], object]
+) -> tuple[int, str]:
+    """Write the valid messages; return the number of rejected ones, and the reason of the first."""
     pending: list[tuple[Message, Address, Provenance, int]] = []
-    rejected, start = 0, None
-    with RecordingWriter(path, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer:
-        for done, each in enumerate(messages, 1):
-            definition = each.definition or BY_TOPIC[each.address.topic]
-            try:
-                message = upgrade_with(definition, each.fields)
-            except ValidationError as exc:
-                rejected += 1
-                if rejected <= _MAX_LOGGED:
-                    reason = each.error or describe(exc, definition)
-                    extra = about("rejected", each.address, source=source, reason=reason)
-                    _log.warning("%s rejected: %s", each.address, reason, extra=extra)
-                continue
-            if start is None:
-                start = min(message.timestamp * 1000, _MAX_START)
-            provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
-            pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
-            if len(pending) == _CHUNK:
-                writer.write_messages(pending)
-                pending.clear()
-                on_progress(done)
-        writer.write_messages(pending)
-    return f"{writer.messages} message{'s' * (writer.messages != 1)}" + (f", {rejected} rejected" if rejected else "")
+    rejected, first_reason, start = 0, "", None
+    for done, each in enumerate(messages, 1):
+        definition = each.definition or BY_TOPIC[each.address.topic]
+        try:
+            message = upgrade_with(definition, each.fields)
+        except ValidationError as exc:
+            rejected += 1
+            if rejected <= _MAX_LOGGED:
+                reason = each.error or describe(exc, definition)
+                first_reason = first_reason or reason
+                extra = about("rejected", each.address, source=source, reason=reason)
+                _log.warning("%s rejected: %s", each.address, reason, extra=extra)
+            continue
+        if start is None:
+            start = min(message.timestamp * 1000, _MAX_START)
+        provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
+        pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
+        if len(pending) == _CHUNK:
+            writer.write_messages(pending)
+            pending.clear()
+            on_progress(done)
+    writer.write_messages(pending)
+    return rejected, first_reason

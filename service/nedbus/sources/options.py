@@ -37,7 +37,8 @@ _Origin = tuple[
     Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
     Annotated[float, Field(ge=-500, le=1e4)],
 ]  # fmt: skip
-_LAYOUTS: Final = f"^({'|'.join(map(re.escape, (*RELEASES, *DEFAULT.layouts)))})$"
+_LAYOUTS: Final = tuple(dict.fromkeys((*RELEASES, *DEFAULT.layouts)))
+_Layout = Annotated[str, Field(pattern=f"^({'|'.join(map(re.escape, _LAYOUTS))})$")]
 Vehicle = Annotated[str, AfterValidator(check_vehicle)]
 Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
@@ -76,9 +77,9 @@ class RecordedOptions(ReplayOptions):
 class RecordingOptions(RecordedOptions):
     """Options of `mcap:`."""
 
-    layout: Annotated[str, Field(pattern=_LAYOUTS)] | None = Field(
+    layout: _Layout | None = Field(
         None,
-        description="the PX4 release whose layouts the messages have, if the file names another one",
+        description=f"the PX4 release whose layouts the messages have, if not those in the file: {', '.join(_LAYOUTS)}",
     )
 
 
@@ -104,8 +105,8 @@ class Px4ZenohOptions(Options):
         None, description="1 to 64 characters of A-Z a-z 0-9 _ -, for topics without a namespace"
     )
     vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
-    layout: Annotated[str, Field(pattern=_LAYOUTS)] | None = Field(
-        None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(RELEASES)}"
+    layout: _Layout | None = Field(
+        None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(_LAYOUTS)}"
     )
     msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
 

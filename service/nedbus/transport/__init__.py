@@ -2,7 +2,7 @@
 
 from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
 
-from .liveliness import LivelinessTokens, query_tokens, token_keys
+from .liveliness import LivelinessTokens, token_keys
 from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
@@ -30,5 +30,6 @@ from .session import (
     translate_zenoh_errors,
 )
 from .tls import UNKNOWN_CA, Tls, check_pem
+from .vehicle_directory import Publishers, VehicleDirectory
 from .write_probe import Verdict, probe_writes
 from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload

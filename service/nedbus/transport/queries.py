@@ -118,7 +118,7 @@ def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:
         yield from received
         if not received:
             time.sleep(pause)
-            pause = min(2 * pause, longest)
+            pause = min(1.25 * pause, longest)
 
 
 def zenoh_timeout(timeout: float) -> float:

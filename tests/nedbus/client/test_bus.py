@@ -22,9 +22,8 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.client import fleet_tokens
 from nedbus.timings import Timings
-from nedbus.transport import Session, liveliness, open_router
+from nedbus.transport import Session, fleet_tokens, liveliness, open_router
 from nedbus.transport.queries import Replies
 from nedbus_msgs import DEFAULT, Address
 from tests.flights.local_position import encode

@@ -22,12 +22,12 @@ import zenoh
 from pymavlink.dialects.v20 import common as mavlink
 
 import nedbus
-from nedbus.client import QueryServer, fleet_tokens
+from nedbus.client import QueryServer
 from nedbus.doctor import Finding, State, examine
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
-from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router
+from nedbus.transport import NO_HASH, Session, TopicKey, fleet_tokens, open_client, open_router
 from nedbus_msgs import dds_type, status_key
 from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message

@@ -21,7 +21,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import nedbus
 from nedbus import Batch
 from nedbus.cli.follow import write_notice
-from nedbus.client import Recorder, Subscription
+from nedbus.cli.recorder import Recorder
+from nedbus.client import Subscription
 from nedbus.errors import NoDataError, SourceError
 from nedbus.flights import RecordingWriter, convert
 from nedbus.sources import ReplayRun, SourceMessage
@@ -537,6 +538,18 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
     assert convert(run.messages, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
     assert [each.timestamp for *_, each in read_independently(path)] == [1] * 2998 + [2**64 - 1]
     assert done == [1024, 2048]
+
+
+def test_conversion_without_a_valid_message_fails(tmp_path: Path) -> None:
+    """If all messages are rejected, `convert` exits with an error that quotes the first reason, and writes no file."""
+    writer, path = UlogWriter(), tmp_path / "a.mcap"
+    writer.define([VLP])
+    for timestamp in range(0, 20_000, 1000):
+        writer.add(VLP, message(timestamp), xy_valid=True)
+    ended = run_command("convert", str(writer.write(tmp_path / "a.ulg")), str(path))
+    assert ended.exit_code == 1
+    assert "a.mcap: not written, because all 20 messages are rejected: x: must be finite" in ended.err
+    assert [each.name for each in tmp_path.iterdir()] == ["a.ulg"]
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".ulg"])

@@ -46,6 +46,7 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
         ({"kind": "ulog"}, 'it needs file = "..."'),
         ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
         ({"kind": "sim", "speed": 0}, "speed=0 is invalid; expected a factor from 0.001"),
+        ({"kind": "mcap", "file": "a.mcap", "layout": "9.9"}, "if not those in the file: 1.13, 1.14, "),
         ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
     ],
 )

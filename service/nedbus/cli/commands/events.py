@@ -165,6 +165,9 @@ def why(
             continue
         faults += len(verdict.stories)
         texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
+        worst = next((each.what for each in verdict.stories if each.begin is verdict.begin), "")
+        if worst not in verdict.text and not details:  # the verdict abbreviates it
+            texts.append(fold("    ", to_text(worst, _MAX_TEXT)))
         texts += ["\n".join(_describe(name, story, times, end, advice)) for story in verdict.stories if details]
     if texts:
         write(("\n\n" if details else "\n").join(texts))

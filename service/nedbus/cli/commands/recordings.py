@@ -12,8 +12,9 @@ from nedbus.cli.follow import write_notice
 from nedbus.cli.options import ALL, DurationOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.output.table import show_progress
+from nedbus.cli.recorder import Recorder
 from nedbus.cli.run import run_until_stopped
-from nedbus.client import Bus, Recorder
+from nedbus.client import Bus
 from nedbus.errors import NoDataError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection

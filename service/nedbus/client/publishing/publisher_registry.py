@@ -13,11 +13,10 @@ from typing import Any, Final, cast
 import zenoh
 from pydantic_core import to_json
 
-from nedbus.client.discovery import VehicleDirectory
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
-from nedbus.transport import LivelinessTokens, Session, translate_zenoh_errors
+from nedbus.transport import LivelinessTokens, Session, VehicleDirectory, translate_zenoh_errors
 from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
 
 from .downsampler import MatchingListener

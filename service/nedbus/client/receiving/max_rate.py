@@ -6,20 +6,21 @@ If a publisher does not downsample, a warning is logged; the full rate is never 
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final
 
 import zenoh
 
+from nedbus.client.io_thread import CallThread
 from nedbus.client.protocol import LIVE
 from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.samples import Mode
 from nedbus.timings import TIMINGS
-from nedbus.transport import LivelinessTokens, RawSample, Session, send_query
-from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
+from nedbus.transport import Publishers, RawSample, Session, VehicleDirectory, send_query
+from nedbus_msgs import Address, Selection, get_topic
 
 from .arrival import Arrival, detach
 from .decoder import Decoder
@@ -28,9 +29,12 @@ from .receiver import Receiver
 
 _log = logging.getLogger(__name__)
 
-_TIMEOUT: Final = 2.0  # s for the queries of last messages and liveliness tokens
+_TIMEOUT: Final = 2.0  # s for the queries of last messages
+_CHECK: Final = 1.0  # s between checks for publishers that do not downsample
 _LAST_POLL: Final = 0.02  # s between polls for last messages
 _MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
+
+_checks = CallThread("nedbus-publishers")  # listing publishers may open a session, which would block the I/O thread
 
 
 class MaxRateInbox(Inbox):
@@ -92,17 +96,18 @@ class MaxRateInbox(Inbox):
 
 
 class MaxRateReceiver(Receiver):
-    """Put downsampled and last messages into a MaxRateInbox until closed."""
+    """Put downsampled and last messages into a MaxRateInbox until closed; `open_session`: as in FleetTokens."""
 
-    def __init__(self, session: Session, inbox: MaxRateInbox) -> None:
-        self._prefix, self._rate_inbox = inbox.decoder.prefix, inbox
-        self._awaiting: dict[Address, float] = {}  # time at which the token of a stream without a message appeared [s]
-        tokens = [each.alive_key_expr(prefix=self._prefix) for each in inbox.selections]
-        self._tokens = LivelinessTokens(session, *tokens)
-        keys = [each.key_expr(prefix=self._prefix) for each in inbox.selections]
+    def __init__(self, session: Session, inbox: MaxRateInbox, open_session: Callable[[], Session]) -> None:
+        self._rate_inbox, prefix = inbox, inbox.decoder.prefix
+        self._directory = VehicleDirectory.of_fleet(open_session, *inbox.selections, prefix=prefix)
+        self._since: dict[Address, float] = {}  # when a publisher was first seen [s]; infinity once it was checked
+        self._next_check = 0.0
+        _checks.start()
+        keys = [each.key_expr(prefix=prefix) for each in inbox.selections]
         self._last = [send_query(session, key, timeout=_TIMEOUT) for key in keys]
         super().__init__(session, inbox, history=False)
-        self._undeclares.append(self._tokens.undeclare)
+        self._undeclares.append(self._directory.close)
         self.pump()  # last messages bypass the ring, so no reader may block on it
 
     def _poll(self, now: float) -> float:
@@ -112,25 +117,25 @@ class MaxRateReceiver(Receiver):
             # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
                 self._rate_inbox.put_last(live)
-            self._check_publishers(now)
+        if now >= self._next_check:
+            self._next_check = math.inf
+            _checks.put(self._check_publishers)
         return pause if all(each.ended for each in self._last) else min(pause, _LAST_POLL)
 
-    def _check_publishers(self, now: float) -> None:
-        for token, alive in self._tokens.poll():
-            with suppress(AddressError):  # not a nedbus key
-                address = address_of_alive_key(token, prefix=self._prefix)
-                topic = get_topic(address.topic)
-                if not alive:
-                    self._awaiting.pop(address, None)
-                elif topic.rate and not topic.on_change:  # other topics may pause for long
-                    self._awaiting.setdefault(address, now)
-        due = [address for address, since in self._awaiting.items() if now - since >= TIMINGS.downsampled_timeout]
-        for address in due:
-            del self._awaiting[address]
-        if missing := [address for address in due if not self._rate_inbox.has_downsampled(address)]:
-            key, more = missing[0].key(prefix=self._prefix), f" and {len(missing) - 1} more" if missing[1:] else ""
+    def _check_publishers(self) -> None:
+        now, found = time.monotonic(), Publishers()
+        with suppress(NedbusError, zenoh.ZError):  # the session is closed
+            found = self._directory.publishers(timeout=0.0)
+        regular = (each for each in found if (topic := get_topic(each.topic)).rate and not topic.on_change)
+        self._since = {each: self._since.get(each, now) for each in regular}  # other topics may pause for long
+        due = [each for each, since in self._since.items() if now - since >= TIMINGS.downsampled_timeout]
+        self._since.update(dict.fromkeys(due, math.inf))
+        if missing := [each for each in due if not self._rate_inbox.has_downsampled(each)]:
+            key = missing[0].key(prefix=self._rate_inbox.decoder.prefix)
+            more = f" and {len(missing) - 1} more" if missing[1:] else ""
             text = "no downsampled messages of %s%s arrive: subscribe without a maximum rate, or check the access rules"
             _log.warning(text, key, more, extra=about("unsupported"))
+        self._next_check = time.monotonic() + _CHECK
 
 
 def _sent(arrival: Arrival) -> float:

@@ -50,11 +50,12 @@ def echo(endpoint: str, *options: str) -> CommandResult:
 
 
 class Paused(NamedTuple):
-    """`nedbus echo` blocked by a full stdout pipe, which is not read until `resume`."""
+    """`nedbus echo` blocked by a full stdout pipe, which is not read until `resume`; `output`: what was read."""
 
     process: ForkedProcess
     is_full: Callable[[], bool]
     resume: Callable[[], None]
+    output: bytearray
 
 
 @pytest.fixture
@@ -79,14 +80,15 @@ def pause_echo(
             return is_full()
 
         def read_all() -> None:
-            while os.read(output, 65536):
-                pass
+            while part := os.read(output, 65536):
+                content.extend(part)
 
+        content = bytearray()
         reader = threading.Thread(target=read_all)
         try:
             with bus.publisher(VLP, vehicle="filler") as publisher:
                 wait_for(publish_until_full, what="the pipe to be full")
-            yield Paused(process, is_full, reader.start)
+            yield Paused(process, is_full, reader.start, content)
         finally:
             process.kill()
             process.wait(DEADLINE)
@@ -134,6 +136,28 @@ def test_interrupt_exits_with_130(run_nedbus: Start, simulation: str) -> None:
     process.signal(signal.SIGINT)
     assert process.wait() == 130
     assert "Traceback" not in process.err
+
+
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_echo_prints_received_messages_before_a_signal_ends_it(
+    bus: nedbus.Bus,
+    pause_echo: Callable[..., AbstractContextManager[Paused]],
+    number: signal.Signals,
+    exit_code: int,
+) -> None:
+    """Messages that `echo --every` has received, but not printed yet, are printed before it exits."""
+    with pause_echo("--every") as paused:
+        with bus.publisher(VLP, vehicle="last") as publisher:
+            for timestamp in range(1, 51):
+                publisher.publish(message(timestamp))
+            assert publisher.flush(DEADLINE)
+        paused.process.send_signal(number)
+        paused.resume()
+        assert paused.process.wait(DEADLINE) == exit_code
+        wait_for(lambda: paused.output.count(b"\n") >= 50, what="the output")
+        lines = [json.loads(line) for line in paused.output.splitlines()]
+    printed = [each["message"]["timestamp"] for each in lines if each["vehicle"] == "last"]
+    assert printed == [*range(1, 51)]
 
 
 def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> None:

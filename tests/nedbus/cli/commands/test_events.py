@@ -180,6 +180,19 @@ def test_why_prints_verdict_and_faults(log: Path) -> None:
     assert story["lacking"][0] == "vehicle_gps_position"
 
 
+def test_why_prints_a_long_reason_in_full(tmp_path: Path) -> None:
+    """A reason that the verdict abbreviates follows on a line of its own."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for timestamp in range(0, 2_000_000, 100_000):
+        writer.add(VLP, message(timestamp), xy_valid=True, dist_bottom_valid=True)
+    verdict, reason = run_command("why", str(writer.write(tmp_path / "a.ulg"))).out.splitlines()
+    assert f"{VLP} rejected: x: must be finite while xy_valid is true" in verdict
+    assert "... from" in verdict
+    assert reason.startswith(f"    {VLP} rejected: x: must be finite")
+    assert reason.endswith("; dist_bottom: must be finite while dist_bottom_valid is true (is nan)")
+
+
 def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
     """Without UTC in the log, --at accepts seconds since boot or since the start of the recording."""
     for moment in ("10", "+9"):

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 import nedbus
 from nedbus import Counts
-from nedbus.client.recorder import Recorder
+from nedbus.cli.recorder import Recorder
 from nedbus.flights.writer import RecordingWriter
 from nedbus.transport import Session, open_router, query
 from nedbus_msgs import Address, Definition, Provenance, codec_of, define, encoding_of, field_type, short_hash

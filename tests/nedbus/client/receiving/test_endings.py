@@ -12,7 +12,7 @@ import pytest
 
 import nedbus
 from nedbus import Counts
-from nedbus.client.recorder import Recorder
+from nedbus.cli.recorder import Recorder
 from nedbus.errors import ClosedError, NoDataError, ReceiveError
 from tests.flights.messages import VLP
 from tests.nedbus.client.numbered import publish, wait_for_subscriber

@@ -304,6 +304,34 @@ def test_stream_that_is_not_downsampled_is_logged_once(
         assert subscription.counts == nedbus.Counts(received=2)
 
 
+def test_vehicle_with_too_many_tokens_hides_no_stream_without_downsampling(
+    endpoint: str,
+    bus: nedbus.Bus,
+    zenoh_session: Session,
+    clock: Clock,
+    *,
+    timings: Timings,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """2,000 liveliness tokens of one vehicle neither delay the messages of others nor hide that some do not arrive.
+
+    The tokens are listed on another session, without the vehicle that has too many.
+    """
+    keys = [f"nedbus/flood/@alive/{each:x}/{VLP}" for each in range(2000)]
+    tokens = [zenoh_session.liveliness().declare_token(each) for each in keys]
+    tokens.append(zenoh_session.liveliness().declare_token(f"nedbus/8/@alive/1/{VLP}"))
+    publisher = bus.publisher(VLP, vehicle="7")
+    timings.slow_list, timings.downsampled_timeout = 0.1, math.inf
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
+        wait_for_downsampling_reader(publisher)
+        publish(publisher, clock, 1, 20)
+        assert receive_timestamps(subscription, 2) == [1, 11]
+        wait_for(lambda: "the streams of 'flood' are not listed" in caplog.text, what="the exclusion")
+        timings.downsampled_timeout = 0.0
+        wait_for(lambda: "no downsampled messages" in caplog.text, what="the warning")
+    assert f"no downsampled messages of nedbus/8/{VLP} arrive" in caplog.text
+
+
 def test_echo_prints_downsampled_messages(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:
     """`nedbus echo --max-rate 5` prints every 20th message of a 100 Hz stream."""
     publisher = bus.publisher(VLP, vehicle="7")

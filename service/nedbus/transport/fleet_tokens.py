@@ -14,13 +14,17 @@ from collections import Counter
 from collections.abc import Callable, Set
 from contextlib import suppress
 from functools import partial
+from itertools import chain
 from typing import Final
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_REPLIES, LivelinessTokens, Replies, Session, query_tokens
-from nedbus_msgs import ANY
+from nedbus_msgs import ANY, Selection
+
+from .liveliness import LivelinessTokens, query_tokens
+from .queries import MAX_REPLIES, Replies
+from .session import Session
 
 _log = logging.getLogger(__name__)
 
@@ -32,14 +36,14 @@ _QUERY_TIMEOUT: Final = 60.0  # s
 
 
 class FleetTokens:
-    """Like LivelinessTokens, for all vehicles, on a separate session; excludes vehicles with over 1,000 tokens.
+    """Like LivelinessTokens, for selections, on a separate session; excludes vehicles with over 1,000 tokens.
 
     An excluded vehicle is logged, and listed again after ten minutes; until then the list is incomplete.
-    `open_session`: raises NedbusError if no router answers.
+    `open_session`: raises NedbusError if no router answers. `selections`: by default all streams.
     """
 
-    def __init__(self, open_session: Callable[[], Session], *, prefix: str) -> None:
-        self._open_session, self._prefix = open_session, prefix
+    def __init__(self, open_session: Callable[[], Session], *selections: Selection, prefix: str) -> None:
+        self._open_session, self._prefix, self._selections = open_session, prefix, selections or (Selection(),)
         self._keys: set[str] = set()
         self._numbers: Counter[str] = Counter()  # of keys, by vehicle
         self._excluded: set[str] = set()
@@ -68,7 +72,7 @@ class FleetTokens:
         changes = [change for change in (found if self._survey else self._tokens.poll()) if self._apply(*change)]
         now = time.monotonic()
         crowded = {name for name, number in self._numbers.items() if number > _MAX_TOKENS} if changes else set()
-        if crowded and len(key_exprs_without(self._excluded | crowded, prefix="")) <= _MAX_KEY_EXPRS:
+        if crowded and len(self._key_exprs(self._excluded | crowded)) <= _MAX_KEY_EXPRS:
             text = "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
             _log.warning(text, ", ".join(map(repr, sorted(crowded))), _MAX_TOKENS, extra=about("incomplete"))
             self._excluded |= crowded
@@ -99,15 +103,16 @@ class FleetTokens:
     def _subscribe(self, *, is_surveyed: bool = False) -> None:
         self._survey: list[Replies] = []
         self._is_surveyed = is_surveyed  # a query has listed all tokens
-        self._tokens = LivelinessTokens(self._session, *self._key_exprs, known=self._keys)
+        self._tokens = LivelinessTokens(self._session, *self._key_exprs(self._excluded), known=self._keys)
         self._slow = time.monotonic() + TIMINGS.slow_list
 
     def _query(self) -> None:
-        self._survey = [query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in self._key_exprs]
+        key_exprs = self._key_exprs(self._excluded)
+        self._survey = [query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in key_exprs]
 
-    @property
-    def _key_exprs(self) -> list[str]:
-        return key_exprs_without(self._excluded, prefix=self._prefix)
+    def _key_exprs(self, excluded: Set[str]) -> list[str]:
+        of_selection = partial(key_exprs_without, excluded, prefix=self._prefix)
+        return list(chain.from_iterable(map(of_selection, self._selections)))
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
@@ -123,10 +128,13 @@ class FleetTokens:
         return key.removeprefix(f"{self._prefix}/").partition("/")[0][: _LONGEST_NAME + 1]
 
 
-def key_exprs_without(excluded: Set[str], *, prefix: str) -> list[str]:
-    """Return key expressions that match the tokens of all vehicles except the excluded ones."""
+def key_exprs_without(excluded: Set[str], selection: Selection, *, prefix: str) -> list[str]:
+    """Return key expressions that match the tokens of a selection, except those of the excluded vehicles."""
+    tokens = selection.alive_key_expr(prefix=prefix)
+    if selection.vehicle != ANY:
+        return [f"{prefix}/{selection.vehicle}/@alive/-" if selection.vehicle in excluded else tokens]  # or no token
     starts = {name[:length] for name in excluded for length in range(len(name) + 1)}
     short = [each for each in starts if len(each) <= _LONGEST_NAME]
     names = {f"{each}{c}$*" for each in short for c in _CHARACTERS if each + c not in starts}
     names |= starts - excluded - {""}
-    return [f"{prefix}/{name}/@alive/*/**" for name in sorted(names) or [ANY]]
+    return [tokens.replace(f"/{ANY}/", f"/{name}/", 1) for name in sorted(names) or [ANY]]

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from nedbus import clock
+from nedbus.client import Subscription
 from nedbus.errors import ClosedError, NoDataError
 from nedbus.flights import RecordingWriter, check_recording
 from nedbus.samples import Batch
-
-from .subscription import Subscription
 
 _FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
@@ -52,22 +51,16 @@ class Recorder:
         start = now = time.monotonic()
         end = float("inf") if duration is None else now + duration
         next_flush = now + _FLUSH_INTERVAL
-        with RecordingWriter(self._path) as self._writer:
-            while not stop.is_set() and now < end:
-                try:
-                    _write(self._writer, self._subscription.receive_batch(min(_POLL_INTERVAL, end - now)))
-                except NoDataError:
-                    pass
-                except ClosedError:
-                    break
+        with RecordingWriter(self._path) as self._writer, suppress(ClosedError):  # raised once all is written
+            while True:
+                if stop.is_set() or now >= end:
+                    self._subscription.drain()
+                with suppress(NoDataError):
+                    _write(self._writer, self._subscription.receive_batch(max(0.0, min(_POLL_INTERVAL, end - now))))
                 now = time.monotonic()
                 if now >= next_flush:
                     self._writer.flush()
                     next_flush = now + _FLUSH_INTERVAL
-            self._subscription.drain()
-            with suppress(ClosedError):  # all is written
-                while True:
-                    _write(self._writer, self._subscription.receive_batch(0.0))
         if not self.messages:
             self._path.unlink(missing_ok=True)
             raise NoDataError(self._subscription.name, time.monotonic() - start)

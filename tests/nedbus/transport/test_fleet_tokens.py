@@ -6,9 +6,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import nedbus
-from nedbus.client import fleet_tokens
 from nedbus.timings import Timings
-from nedbus.transport import LivelinessTokens, Session
+from nedbus.transport import LivelinessTokens, Session, fleet_tokens
+from nedbus_msgs import ANY, Selection
 from tests.flights.messages import VLP
 from tests.peers.command_line import run_command
 from tests.waits import DEADLINE, wait_for
@@ -104,13 +104,20 @@ def test_slow_list_is_complete(endpoint: str, zenoh_session: Session, timings: T
         assert bus.vehicles().complete
 
 
-@given(st.sets(NAMES, max_size=3), NAMES)
-@example(set(), "a")
-@example({"a", "ab"}, "aba")
-@example({"a" * 65}, "a" * 64)
-@example({"a" * 65}, "a" * 65)
-def test_key_expressions_match_all_names_except_the_excluded_ones(excluded: set[str], name: str) -> None:
-    """Tokens of a vehicle match a key expression exactly if it is not excluded."""
+SELECTIONS = [Selection(), Selection(VLP), Selection(VLP, "a"), Selection("vehicle_attitude")]
+
+
+@given(st.sets(NAMES, max_size=3), NAMES, st.sampled_from(SELECTIONS))
+@example(set(), "a", SELECTIONS[0])
+@example({"a", "ab"}, "aba", SELECTIONS[0])
+@example({"a"}, "a", SELECTIONS[2])
+@example({"a" * 65}, "a" * 64, SELECTIONS[0])
+@example({"a" * 65}, "a" * 65, SELECTIONS[0])
+def test_key_expressions_match_all_names_except_the_excluded_ones(
+    excluded: set[str], name: str, selection: Selection
+) -> None:
+    """Tokens of a selected vehicle match a key expression exactly if it is not excluded."""
     key = zenoh.KeyExpr(f"nedbus/{name}/@alive/1a/{VLP}")
-    found = fleet_tokens.key_exprs_without(excluded, prefix="nedbus")
-    assert any(zenoh.KeyExpr(each).intersects(key) for each in found) == (name not in excluded)
+    found = fleet_tokens.key_exprs_without(excluded, selection, prefix="nedbus")
+    selected = selection.topic in (ANY, VLP) and selection.vehicle in (ANY, name)
+    assert any(zenoh.KeyExpr(each).intersects(key) for each in found) == (selected and name not in excluded)
