@@ -73,6 +73,9 @@ class Guarded(int):
         increased.queue = self.queue
         return increased
 
+    def __sub__(self, other: int) -> Guarded:
+        return self + -other
+
 
 @pytest.mark.parametrize("form", ["models", "batches"])
 def test_counters_are_changed_with_the_lock(form: str) -> None:
@@ -89,6 +92,20 @@ def test_counters_are_changed_with_the_lock(form: str) -> None:
     else:
         drain(inbox)
     assert inbox.counts == Counts(received=2, lost=2, invalid=1)
+
+
+@pytest.mark.parametrize(("before", "after"), [(0, 0), (0, 1), (0, 20), (1, 0), (1, 1), (3, 3), (20, 0)])
+def test_number_from_another_publisher_does_not_continue_a_sequence(before: int, after: int) -> None:
+    """A message of publisher b, with the number that publisher a sends next, leaves the gap of a open."""
+    inbox = make_queue("every")
+    inbox.put([raw(0), raw(0, publisher="b"), raw(1)])
+    assert inbox.counts.discarded == 0
+    stop = 2 + before
+    batch = [raw(number) for number in range(2, stop)] + [raw(stop, publisher="b")]
+    inbox.put([*batch, *(raw(number) for number in range(stop + 1, stop + 1 + after))])
+    requested = {each.name: inbox.next_request(each, 0.0) for each in list(inbox.gaps.requesting)}
+    missed_by_a = {name_of("a"): range(stop, stop + 1)} if after else {}
+    assert requested == {**missed_by_a, name_of("b"): range(1, stop)}
 
 
 def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
