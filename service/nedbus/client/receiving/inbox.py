@@ -90,6 +90,8 @@ class Inbox:
         self._reorder = Reorder(self.streams, self._admit, self._counters, recovers=recovers, clock=clock)
         self.gaps = self._reorder.gaps
         limit = limit or (streams.MAX_KEYS if self.newest_only else CAPACITY)
+        more_keys = f"more keys than the limit of {limit:,} have an unread message, so the oldest messages are dropped"
+        self._limited = more_keys if self.newest_only else _SLOW
         self._unread = Unread(self._counters, newest_only=self.newest_only, limit=limit)
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # the oldest may go unanswered
 
@@ -281,7 +283,7 @@ class Inbox:
         """Make the messages that are in order readable, and return their number."""
         arrivals, self.gaps.delivered = self.gaps.delivered, []
         if self._unread.add(arrivals):
-            self._warn_once(_SLOW)
+            self._warn_once(self._limited)
         if self._discards:
             self._unread.discard()
         return len(arrivals)
@@ -296,7 +298,7 @@ class Inbox:
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            _log.warning("%s: %s", self.name, text, extra=about("dropped" if text == _SLOW else "incomplete"))
+            _log.warning("%s: %s", self.name, text, extra=about("dropped" if "dropped" in text else "incomplete"))
 
 
 def check_count(name: str, count: object) -> None:
