@@ -524,6 +524,19 @@ class LateLookup(LayoutLookup):
         return codec_of(self._definition) if self.waits > wait else None
 
 
+@pytest.mark.parametrize("rows", [False, True])
+def test_message_whose_definition_nobody_sends_is_invalid(rows: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """A reader skips a message of an unknown definition after one wait; the count is exact and the log has the reason."""
+    inbox = make_queue("every")
+    put(inbox, [undefined(number=0), raw(0)])
+    read = inbox.pop(rows)
+    assert read is not None
+    assert read.topic == "vehicle_local_position"
+    assert inbox.pop(rows) is None
+    assert inbox.counts == Counts(received=1, invalid=1)
+    assert ["received no definition of" in text for text in caplog.messages] == [True]
+
+
 def test_definition_that_arrives_while_a_batch_is_decoded_does_not_apply_to_a_part_of_it() -> None:
     """All messages of a batch get the same answer to the lookup of their definition, which is awaited once."""
     definition = nedbus.define_msg("RangeBeacon", "uint64 timestamp\nfloat32 range\n")
