@@ -117,11 +117,9 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
 
     def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
         require_unforked()
+        deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
         if self._inbox.newest_only:
             self._receiver.receive()  # newer samples may be in the ring
-        elif timeout is None and (item := pop()) is not None:  # the usual case at a high rate
-            return item
-        deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
         while True:
             ended = self._inbox.ended  # before `pop`: all that was received is in the inbox then
             item = pop()

@@ -92,13 +92,10 @@ class Decoder:
 
         This is the only wait for a definition, and all arrivals get the same answer.
         """
-        if arrivals[0].stream.codec is not None:  # built in
-            return arrivals
-        unknown = next((each for each in arrivals if each.codec is None), None)
-        if unknown is None:
+        if arrivals[0].stream.codec is not None or all(each.codec for each in arrivals):
             return arrivals
         known = next((each.codec for each in arrivals if each.codec), None)
-        codec = known or self._find_codec(unknown.stream, unknown.raw, wait=True)
+        codec = known or self._find_codec(arrivals[0].stream, arrivals[0].raw, wait=True)
         return [arrival._replace(codec=codec) for arrival in arrivals]
 
     def decode(self, arrival: Arrival, rows: bool, lost: int = 0) -> Sample[Any] | None:

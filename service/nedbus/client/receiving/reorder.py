@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
+import zenoh
+
 from nedbus import clock
 from nedbus.transport import RawSample, entity_name
 
-from .arrival import NO_LAYOUTS, Arrival, Stream, mark_retained
+from .arrival import NO_LAYOUTS, Arrival, DetachedSample, Stream, detach
 from .streams import Streams
 from .writer_proxy import NUMBERS, Gaps, LossCounters, WriterProxy
 
@@ -149,7 +151,8 @@ class Reorder:
     def _accept_one(self, arrival: Arrival, now: float, overflowed: bool) -> None:
         """Accept any message: of a new writer, behind a gap, late, rejected, or without a number."""
         recovers = self._recovers and not overflowed
-        stream, info = arrival.stream, arrival.raw.source_info
+        stream, raw = arrival.stream, arrival.raw
+        info = raw.source_info
         stream.last_active, writer = now, stream.writer
         if info is not None and (writer is None or not writer.is_sender(info)):
             name = entity_name(info.source_id)
@@ -159,7 +162,10 @@ class Reorder:
                 writer = self._add_writer(stream, name, first, history_end=info.source_sn)
             stream.writer = writer
             if writer is not None:
-                arrival = arrival if writer.eid is not None else mark_retained(arrival)
+                # Only replies to queries use BLOCK, such as those to Zenoh's history query; nedbus publishers use DROP.
+                is_live = isinstance(raw, DetachedSample) or raw.congestion_control != zenoh.CongestionControl.BLOCK
+                if not is_live and writer.eid is None:
+                    arrival = detach(arrival, retained=True)
                 writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
         if info is None or writer is None:
             if arrival.payload:

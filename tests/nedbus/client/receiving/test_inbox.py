@@ -526,7 +526,7 @@ class LateLookup(LayoutLookup):
 
 @pytest.mark.parametrize("rows", [False, True])
 def test_message_whose_definition_nobody_sends_is_invalid(rows: bool, caplog: pytest.LogCaptureFixture) -> None:
-    """A reader skips a message of an unknown definition after one wait; the count is exact and the log has the reason."""
+    """A reader skips a message of an unknown definition; it counts as invalid, and the log has the reason."""
     inbox = make_queue("every")
     put(inbox, [undefined(number=0), raw(0)])
     read = inbox.pop(rows)
