@@ -6,7 +6,8 @@ Import this module only where arrays are used: NumPy takes longer to load than e
 
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 from typing import Any, Final, Generic
 
 import numpy as np
@@ -26,7 +27,12 @@ from .model.validation import Values, accessors_of
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
+MAX_FEW: Final = 12
+"""Number of payloads up to which `decode_few` is faster than `decode` in a reader that mostly waits."""
+
 _MIN_COLUMNAR: Final = 20  # messages for which checking rules by column is faster than by message
+
+_WINDOW: Final = 256  # bytes, the length of a table of bytes.translate
 
 
 def _numpy_type(kind: FieldType) -> Any:
@@ -50,6 +56,9 @@ class Arrays(Generic[M]):
             bytes_of = np.arange(offset, offset + types[name].size)
             is_swapped = sys.byteorder == "little" and not types[name].is_text
             self._from_wire = np.append(self._from_wire, bytes_of[::-1] if is_swapped else bytes_of)
+        # The same by windows of the payload: the first byte of the window, and offsets from there.
+        windows = groupby(self._from_wire.tolist(), lambda offset: offset - offset % _WINDOW)
+        self._gathers = [(start, bytes([offset - start for offset in offsets])) for start, offsets in windows]
         self._to_wire = np.zeros(size, np.intp)
         self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
@@ -82,6 +91,22 @@ class Arrays(Generic[M]):
         array = np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
         valid = self.valid_mask(array)
         return array, valid & ~wrong.any(axis=1) if is_damaged else valid
+
+    def decode_few(self, payloads: Iterable[bytes]) -> MessageArray | None:
+        """Decode up to MAX_FEW payloads one by one; return None if one may be invalid."""
+        size, tags, tag_mask = self._size, self._codec.tags, self._codec.tag_mask
+        elements = bytearray()
+        for payload in payloads:
+            if len(payload) != size or (number := int.from_bytes(payload, "big")) & tag_mask != tags:
+                return None
+            wire = (number ^ tags).to_bytes(size, "big")
+            # `translate` maps each offset to the byte of the window at this offset.
+            windows = [offsets.translate(wire[at : at + _WINDOW].ljust(_WINDOW)) for at, offsets in self._gathers]
+            element = b"".join(windows)
+            if not self._passes_rules(self._checked.unpack(element)):
+                return None
+            elements += element
+        return np.frombuffer(elements, self.dtype)
 
     def encode(self, array: MessageArray) -> bytes:
         """Encode messages as concatenated payloads, without validating them."""

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import DecodeError, VehicleLocalPosition
-from nedbus_msgs.arrays import DTYPE, mask_invalid, to_array
+from nedbus_msgs import DEFAULT, DecodeError, VehicleLocalPosition, codec_of
+from nedbus_msgs.arrays import DTYPE, arrays_of, mask_invalid, to_array
 from nedbus_msgs.messages import HomePosition, VehicleAttitude
 from tests.flights.local_position import (
     PAYLOAD_SIZE,
@@ -35,6 +35,7 @@ from tests.nedbus_msgs.strategies import (
 
 # Lengths around those at which the algorithm changes.
 SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
+ARRAYS = arrays_of(DEFAULT)
 Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and values that may break its rules
 CASES = st.lists(st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=2)), min_size=1, max_size=4)
 
@@ -58,6 +59,9 @@ def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Rando
     assert array[valid].tobytes() == np.array([row for payload in payloads if (row := rows[payload])], DTYPE).tobytes()
     assert encode_array(array) == b"".join(payloads)
     assert valid_mask(array).tolist() == valid.tolist()
+    few = ARRAYS.decode_few(payloads)
+    assert (few is None) == (not valid.all())
+    assert few is None or (few.dtype == DTYPE and few.tobytes() == array.tobytes())
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -90,6 +94,9 @@ def test_corrupt_payload_does_not_affect_others(size: int, offset: int, byte: in
         assert encode_row(row) != payloads[size // 2]
     others = np.arange(size) != size // 2
     assert valid[others].all()
+    few = ARRAYS.decode_few(payloads)
+    assert (few is None) == (not valid.all())
+    assert few is None or few.tobytes() == array.tobytes()
     assert array[others].tobytes() == np.array([decode_row(flight)] * (size - 1), DTYPE).tobytes()
     for name in DTYPE.names or ():
         if DTYPE[name] == np.bool_:
@@ -100,11 +107,12 @@ def test_corrupt_payload_does_not_affect_others(size: int, offset: int, byte: in
 def test_decoded_array_is_a_writable_copy(size: int) -> None:
     """Writing to the array does not change the payloads."""
     payloads = REAL[0] * size
-    array, _ = decode_array(payloads)
-    array["x"] = 5.0
-    array["xy_valid"] = False
-    assert payloads == REAL[0] * size
-    assert decode_row(encode_array(array)[-PAYLOAD_SIZE:]).x == 5.0
+    for array in (decode_array(payloads)[0], ARRAYS.decode_few([REAL[0]] * size)):
+        assert array is not None
+        array["x"] = 5.0
+        array["xy_valid"] = False
+        assert payloads == REAL[0] * size
+        assert decode_row(encode_array(array)[-PAYLOAD_SIZE:]).x == 5.0
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -116,6 +124,17 @@ def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> No
     assert encode_array(view) == b"".join(payloads[::step])
     view["eph"][size // 2] = -1.0
     assert np.flatnonzero(~valid_mask(view)).tolist() == [size // 2]
+
+
+@pytest.mark.parametrize("number", ["7fa00001", "ffa00001", "7fc00001", "80000001"])
+def test_bits_of_a_float_are_kept(number: str) -> None:
+    """A signalling NaN, a NaN with a payload and a denormal number are decoded bit for bit."""
+    payload = bytearray(REAL[0])
+    [at] = [offset for name, _, offset in codec_of(DEFAULT).offsets if name == "delta_heading"]
+    payload[at : at + 4] = bytes.fromhex(number)
+    for array in (decode_array(bytes(payload))[0], ARRAYS.decode_few([bytes(payload)])):
+        assert array is not None
+        assert array["delta_heading"].astype(">f4").view("V4").tobytes().hex() == number
 
 
 @pytest.mark.parametrize("excess", [-1, 1])

@@ -30,7 +30,7 @@ class _SubscriptionBase(Generic[M_co]):
     def __init__(self, inbox: Inbox) -> None:
         self.name = inbox.name
         self._inbox = inbox
-        self._pop_row = partial(inbox.pop, rows=True)
+        self._pop_row = partial(inbox.pop, True)
 
     @property
     def closed(self) -> bool:

@@ -110,10 +110,12 @@ def test_limit_below_one_message_raises(client: nedbus.Bus, count: Any) -> None:
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
-def test_unread_messages_beyond_the_limit_are_dropped(mode: Mode) -> None:
-    """Beyond `limit` unread messages, the oldest are dropped and counted."""
+def test_unread_messages_beyond_the_limit_are_dropped(mode: Mode, caplog: pytest.LogCaptureFixture) -> None:
+    """Beyond `limit` unread messages, the oldest are dropped and counted; a warning gives the reason once."""
     inbox = make_queue(mode, limit=1)
     put(inbox, [raw(0), raw(0, key=OTHER_KEY, publisher="b")])
+    reason = {"latest": "more keys than the limit of 1 have an unread message", "every": "slower than the data"}[mode]
+    assert [reason in text for text in caplog.messages] == [True]
     assert [sample.vehicle for sample in drain(inbox)] == ["2"]
     assert inbox.counts == Counts(received=1, dropped=1)
 

@@ -255,6 +255,7 @@ def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[st
     except ValidationError:
         assert not arrays.valid_mask(array).any()
         assert not arrays.valid_mask(array[:1]).any()
+        assert arrays.decode_few([arrays.encode(array[:1])]) is None
         with pytest.raises(InvalidMessageError, match=definition.name):
             codec.encode_fields(fields)
         with pytest.raises(InvalidMessageError):
@@ -269,6 +270,9 @@ def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[st
     decoded, valid = arrays.decode(payload * 21)
     assert valid.all()
     assert arrays.encode(decoded) == arrays.encode(array) == payload * 21
+    few = arrays.decode_few([payload] * 21)
+    assert few is not None
+    assert few.tobytes() == decoded.tobytes()
     cdr = arrays.encode_cdr(array, definition.current)
     again = [decode_with(definition, each.tobytes(), definition.current) for each in cdr]
     assert [codec.encode_fields(upgrade_fields(definition, each)) for each in again] == 21 * [payload]

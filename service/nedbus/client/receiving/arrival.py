@@ -78,16 +78,6 @@ def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:
     )
 
 
-def mark_retained(arrival: Arrival) -> Arrival:
-    """Return the first arrival of a publisher, marked as retained if Zenoh's history query returned it.
-
-    Only replies to queries use congestion control BLOCK; nedbus publishers use DROP.
-    """
-    raw = arrival.raw
-    is_reply = not isinstance(raw, DetachedSample) and raw.congestion_control == zenoh.CongestionControl.BLOCK
-    return detach(arrival, retained=True) if is_reply else arrival
-
-
 def encoding_of(stream: Stream, raw: RawSample | DetachedSample) -> str:
     """Return the encoding of a sample as text; it rarely changes, so the last one is cached and shared."""
     if isinstance(raw, DetachedSample):

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from nedbus.samples import Batch
 from nedbus_msgs import DEFAULT, Provenance, codec_of, provenance_of
-from nedbus_msgs.arrays import arrays_of
+from nedbus_msgs.arrays import MAX_FEW, arrays_of
 
 from .arrival import Arrival, encoding_of
 from .decoder import Decoder
@@ -50,21 +50,26 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> R
     arrivals = decoder.define(arrivals)
     codec = arrivals[0].codec
     definition = codec.definition if codec else DEFAULT
-    blank = bytes(codec_of(definition).size)  # invalid placeholder for payloads of other layouts, decoded below
-    own = codec.size if codec else -1
-    payloads = [each.payload if len(each.payload) == own else blank for each in arrivals]
     arrays = arrays_of(definition)
-    messages, valid = arrays.decode(b"".join(payloads))
-    if not valid.all():
-        for index in np.flatnonzero(~valid).tolist():
-            sample = decoder.decode(arrivals[index], rows=True)
-            if sample is not None:
-                messages[index] = arrays.to_element(sample.message)
-                valid[index] = True
-        messages = messages[valid]
-        arrivals = [arrivals[index] for index in np.flatnonzero(valid).tolist()]
-    keys = [arrival.stream.key for arrival in arrivals]
-    addresses = {arrival.stream.key: arrival.stream.address for arrival in arrivals}
-    indices = {key: index for index, key in enumerate(addresses)}
-    address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
-    return ReceivedBatch(messages, definition.model, tuple(addresses.values()), address_index, lost, arrivals)
+    payloads = [arrival.payload for arrival in arrivals]
+    messages = arrays.decode_few(payloads) if codec and len(payloads) <= MAX_FEW else None
+    if messages is None:
+        own, blank = codec_of(definition).size, bytes(codec_of(definition).size)
+        # Payloads of other layouts are replaced by an invalid placeholder, and decoded below.
+        messages, valid = arrays.decode(b"".join([each if len(each) == own and codec else blank for each in payloads]))
+        if not valid.all():
+            for index in np.flatnonzero(~valid).tolist():
+                sample = decoder.decode(arrivals[index], rows=True)
+                if sample is not None:
+                    messages[index] = arrays.to_element(sample.message)
+                    valid[index] = True
+            messages = messages[valid]
+            arrivals = [arrivals[index] for index in np.flatnonzero(valid).tolist()]
+    streams = {arrival.stream.key: arrival.stream for arrival in arrivals}
+    if len(streams) == 1:
+        address_index = np.zeros(len(arrivals), np.intp)
+    else:
+        indices = {key: index for index, key in enumerate(streams)}
+        address_index = np.array([indices[arrival.stream.key] for arrival in arrivals], np.intp)
+    addresses = tuple([stream.address for stream in streams.values()])
+    return ReceivedBatch(messages, definition.model, addresses, address_index, lost, arrivals)

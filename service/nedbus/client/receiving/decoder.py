@@ -66,7 +66,7 @@ class Decoder:
             except (AddressError, DecodeError) as exc:
                 self.reject(key, exc, stream)
             else:
-                if sample := self.decode(arrival, rows=False):
+                if sample := self.decode(arrival, False):
                     sample.retained = True
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     yield sample
@@ -96,17 +96,18 @@ class Decoder:
 
         This is the only wait for a definition, and all arrivals get the same answer.
         """
-        unknown = next((each for each in arrivals if each.codec is None), None)
-        if unknown is None:
+        if arrivals[0].stream.codec is not None or all(each.codec for each in arrivals):
             return arrivals
         known = next((each.codec for each in arrivals if each.codec), None)
-        codec = known or self._find_codec(unknown.stream, unknown.raw, wait=True)
+        codec = known or self._find_codec(arrivals[0].stream, arrivals[0].raw, wait=True)
         return [arrival._replace(codec=codec) for arrival in arrivals]
 
-    def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
+    def decode(self, arrival: Arrival, rows: bool, lost: int = 0) -> Sample[Any] | None:
         """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
         stream, payload, raw, codec, _, received, newer = arrival
-        encoding = encoding_of(stream, raw)
+        known, encoding = stream.encoding
+        if raw.encoding != known:  # rare
+            encoding = encoding_of(stream, raw)
         if codec is None:
             self.reject(stream.key, DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"), stream)
             return None
@@ -119,11 +120,11 @@ class Decoder:
         except DecodeError as exc:
             self.reject(stream.key, exc, stream)
             return None
-        known, provenance = stream.provenance
-        if known is not encoding:
+        described, provenance = stream.provenance
+        if described is not encoding:
             provenance = provenance_of(codec.definition, encoding)
             stream.provenance = encoding, provenance
-        retained = isinstance(raw, DetachedSample) and raw.retained
+        retained = type(raw) is DetachedSample and raw.retained
         return Sample(message, stream.address, received, raw.timestamp, lost, provenance, retained)
 
     def count_invalid(self, count: int) -> None:

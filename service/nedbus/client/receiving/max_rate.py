@@ -12,6 +12,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus import clock
 from nedbus.client.io_thread import CallThread
 from nedbus.client.protocol import LIVE
 from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
@@ -60,9 +61,11 @@ class MaxRateInbox(Inbox):
 
     def put_last(self, batch: Sequence[RawSample]) -> None:
         """Queue the last messages of streams that have delivered none yet."""
-        last: list[Arrival] = []
+        last, received = list[Arrival](), clock.utc_ns()
         with self._lock:
-            for arrival in self._admit(batch):
+            for raw in batch:
+                if (arrival := self._admit(raw, received)) is None:
+                    continue
                 stream = self.streams.open(self._rate_key(arrival.stream.address), self._clock())
                 if arrival.payload and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)

@@ -76,16 +76,15 @@ class Unread:
         """Remove and return the messages of the same type as the oldest; the others stay in order."""
         every, newest = self._every, self._newest
         count = min(len(self), max_messages or (len(newest) if self.newest_only else MAX_BATCH))
-        oldest = list(newest.values())[:count] or [every.popleft() for _ in range(count)]
-        kinds = [each.codec if each.stream.codec else _identity(each) for each in oldest]
-        taken = [arrival for arrival, kind in zip(oldest, kinds, strict=True) if kind == kinds[0]]
-        if self.newest_only:
-            for arrival in taken:
-                del newest[arrival.stream.key]
-        else:
-            every.extendleft(
-                arrival for arrival, kind in zip(oldest[::-1], kinds[::-1], strict=True) if kind != kinds[0]
-            )
+        taken = list(newest.values())[:count] or [every.popleft() for _ in range(count)]
+        if len({arrival.stream.codec for arrival in taken}) > 1 or taken[0].stream.codec is None:
+            kinds = [each.codec if each.stream.codec else _identity(each) for each in taken]
+            others = [arrival for arrival, kind in zip(taken, kinds, strict=True) if kind != kinds[0]]
+            taken = [arrival for arrival, kind in zip(taken, kinds, strict=True) if kind == kinds[0]]
+            if not self.newest_only:
+                every.extendleft(reversed(others))
+        for arrival in taken if self.newest_only else ():
+            del newest[arrival.stream.key]
         self._bytes -= sum(map(len, map(_PAYLOAD, taken)))
         return taken
 

@@ -18,7 +18,7 @@ import zenoh
 import nedbus
 from nedbus import ClosedError, Counts, Mode
 from nedbus.client import PublisherRegistry, QueryServer, RejectionReport
-from nedbus.client.receiving import Inbox
+from nedbus.client.receiving.reorder import Reorder
 from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.flights.local_position import ENCODING, encode
@@ -228,7 +228,7 @@ def test_samples_are_counted_and_requested_again_after_an_unexpected_error(
     subscription = bus.subscribe(mode="every")
     assert receive_timestamps(subscription, 1) == [1]
     with monkeypatch.context() as patched:
-        patched.setattr(Inbox, "_admit", lambda *_: 1 / 0)
+        patched.setattr(Reorder, "accept", lambda *_, **__: 1 / 0)
         publish(publisher, *range(2, 22))
         wait_for(lambda: subscription.counts.invalid == 20, what="all samples to be counted")
     publish(publisher, 22)
@@ -290,7 +290,7 @@ def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:
 
 
 def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample needs at most 27 Python calls, in six classes, to receive it."""
+    """A reader that waits for each sample needs at most 25 Python calls, in six classes, to receive it."""
     called: list[list[str]] = []
 
     def trace(frame: FrameType, event: str, _: object) -> None:
@@ -308,6 +308,6 @@ def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, 
         names for names in called if any(name.startswith("Receiver.") for name in names)
     ]  # samples received along with an earlier one need no wait
     median = sorted(waited, key=len)[len(waited) // 2]
-    assert len(median) <= 27
+    assert len(median) <= 25
     classes = {name.partition(".")[0] for name in median if name[0].isupper()}
     assert classes == {"Subscription", "Receiver", "Inbox", "Reorder", "Unread", "Decoder"}

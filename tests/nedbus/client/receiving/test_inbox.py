@@ -73,6 +73,9 @@ class Guarded(int):
         increased.queue = self.queue
         return increased
 
+    def __sub__(self, other: int) -> Guarded:
+        return self + -other
+
 
 @pytest.mark.parametrize("form", ["models", "batches"])
 def test_counters_are_changed_with_the_lock(form: str) -> None:
@@ -89,6 +92,20 @@ def test_counters_are_changed_with_the_lock(form: str) -> None:
     else:
         drain(inbox)
     assert inbox.counts == Counts(received=2, lost=2, invalid=1)
+
+
+@pytest.mark.parametrize(("before", "after"), [(0, 0), (0, 1), (0, 20), (1, 0), (1, 1), (3, 3), (20, 0)])
+def test_number_from_another_publisher_does_not_continue_a_sequence(before: int, after: int) -> None:
+    """A message of publisher b, with the number that publisher a sends next, leaves the gap of a open."""
+    inbox = make_queue("every")
+    inbox.put([raw(0), raw(0, publisher="b"), raw(1)])
+    assert inbox.counts.discarded == 0
+    stop = 2 + before
+    batch = [raw(number) for number in range(2, stop)] + [raw(stop, publisher="b")]
+    inbox.put([*batch, *(raw(number) for number in range(stop + 1, stop + 1 + after))])
+    requested = {each.name: inbox.next_request(each, 0.0) for each in list(inbox.gaps.requesting)}
+    missed_by_a = {name_of("a"): range(stop, stop + 1)} if after else {}
+    assert requested == {**missed_by_a, name_of("b"): range(1, stop)}
 
 
 def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -505,6 +522,19 @@ class LateLookup(LayoutLookup):
     def codec(self, *_: object, wait: bool = False, **__: object) -> Codec[Any] | None:
         self.waits += wait
         return codec_of(self._definition) if self.waits > wait else None
+
+
+@pytest.mark.parametrize("rows", [False, True])
+def test_message_whose_definition_nobody_sends_is_invalid(rows: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """A reader skips a message of an unknown definition; it counts as invalid, and the log has the reason."""
+    inbox = make_queue("every")
+    put(inbox, [undefined(number=0), raw(0)])
+    read = inbox.pop(rows)
+    assert read is not None
+    assert read.topic == "vehicle_local_position"
+    assert inbox.pop(rows) is None
+    assert inbox.counts == Counts(received=1, invalid=1)
+    assert ["received no definition of" in text for text in caplog.messages] == [True]
 
 
 def test_definition_that_arrives_while_a_batch_is_decoded_does_not_apply_to_a_part_of_it() -> None:
