@@ -33,7 +33,7 @@ from nedbus_msgs import (
 from .merge import MergedFlights, require_files
 from .readers import ReadOptions
 from .selection import matching
-from .utc import UtcOffset
+from .utc_offset import UtcOffset
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch

@@ -18,7 +18,8 @@ from nedbus.samples import SourceMessage
 from nedbus_msgs import Address, Definition
 
 from .readers import ReadOptions, Replay, open_reader
-from .utc import UtcOffset, estimate_utc
+from .utc import estimate_utc
+from .utc_offset import UtcOffset
 
 LOOKAHEAD: Final = 1000
 """Messages that are read ahead to determine the first streams and the start time of a file."""

@@ -12,12 +12,12 @@ import numpy as np
 
 from nedbus.errors import AddressError, SourceError
 from nedbus.flights import (
-    FIELDS,
     ReadOptions,
     UtcOffset,
     distinct_names,
     matching,
     no_utc,
+    provides_utc,
     renamed,
     require_files,
     require_one_vehicle,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_UTC_TOPICS: Final = {name for name, each in BY_TOPIC.items() if not each.types.keys().isdisjoint(FIELDS)}
+_UTC_TOPICS: Final = {name for name, each in BY_TOPIC.items() if provides_utc(each)}
 
 FlightPath = str | Path
 Files = FlightPath | Sequence[FlightPath]

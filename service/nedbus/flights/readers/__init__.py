@@ -8,4 +8,4 @@ from .formats import (
     open_reader,
 )
 from .order import Replay
-from .reader import FileStream, FlightReader, ReadOptions, Record
+from .reader import FileStream, FlightReader, ReadOptions, Record, Run

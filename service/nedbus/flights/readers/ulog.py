@@ -1,7 +1,7 @@
 """Streaming reader of PX4 .ulg logs."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +10,7 @@ from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import ALL, TOPICS, Address, Definition
 
 from .formats import open_file
-from .reader import FlightReader, ReadOptions, Record
+from .reader import FlightReader, ReadOptions, Record, Run
 
 _CHUNK: Final = 2**17  # bytes read at a time
 _MAX_NAMED: Final = 5  # damaged locations listed in the warnings
@@ -65,7 +65,7 @@ class UlogReader(FlightReader):
 
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
-        plain, merge, data, make, to_int = self._plain, self._texts.merge, ulog.Data, tuple.__new__, int.from_bytes
+        plain, data, make, to_int = self._plain, ulog.Data, tuple.__new__, int.from_bytes
         for records in self._read():
             for record in records:
                 if isinstance(record, data) and record[0] in plain:
@@ -73,21 +73,23 @@ class UlogReader(FlightReader):
                     if mask and to_int(record[1], "little") & mask:
                         self._count_unset_bools(record)
                     yield make(Record, (stream, record[1], None, None))
+                else:
+                    yield from self._select(record)
+
+    def runs(self) -> Iterator[Run]:
+        """Yield the messages stream by stream in parts of the file; messages that need further checks one by one."""
+        found = dict[ulog.Subscription, list[bytes]]()
+        for records in self._read():
+            for record in records:
+                if isinstance(record, ulog.Data) and record.subscription in found:
+                    found[record.subscription].append(record.payload)
                     continue
-                for each in merge((record,)):
-                    if not isinstance(each, data):
-                        self._process(each)
-                    elif (found := self._accept(each)) is not None:
-                        yield make(Record, (found, each.payload, None, None))
-        self.damaged |= any(each.warnings and each.is_loss for each in self._repeated.values())
-        if not self.definitions:
-            topics = self.options.topics
-            what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
-            reason = f"this log has no message of {what}"
-            if topics is not None and self._subscribed:
-                names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
-                reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
-            raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
+                selected = [Run(each.stream, [each.payload], []) for each in self._select(record)]
+                if len(self._plain) != len(found):  # the messages of a stream that needs checks now come first
+                    yield from self._take_runs(found)
+                    found = {each: found[each] if each in found else self._parser.collect(each) for each in self._plain}
+                yield from selected
+            yield from self._take_runs(found)
 
     def layouts(self, definition: Definition[Any]) -> set[str]:
         """Return the names of the layouts of a definition so far."""
@@ -103,10 +105,38 @@ class UlogReader(FlightReader):
             yield self._parser.close()
             self._is_read = True
             self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
+            self.damaged |= any(each.warnings and each.is_loss for each in self._repeated.values())
         except ulog.UlogError as exc:
             raise SourceError(str(self.path), f"not a readable ULog file ({exc})") from exc
         except OSError as exc:
             raise SourceError(str(self.path), (exc.strerror or str(exc)).lower()) from exc
+        if not self.definitions:
+            topics = self.options.topics
+            what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
+            reason = f"this log has no message of {what}"
+            if topics is not None and self._subscribed:
+                names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
+                reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
+            raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
+
+    def _take_runs(self, found: Mapping[ulog.Subscription, list[bytes]]) -> Iterator[Run]:
+        for subscription, collected in found.items():
+            payloads = collected.copy()
+            collected.clear()
+            if mask := subscription.layout.bool_mask:
+                for payload in payloads:
+                    if int.from_bytes(payload, "little") & mask:
+                        self._count_unset_bools(ulog.Data(subscription, payload))
+            if payloads and (stream := self._streams[subscription]) is not None:
+                yield Run(stream, payloads, [])
+
+    def _select(self, record: ulog.Record) -> Iterator[Record]:
+        """Yield the message of a record, and the log message after it, if they are selected; process other records."""
+        for each in self._texts.merge((record,)):
+            if not isinstance(each, ulog.Data):
+                self._process(each)
+            elif (stream := self._accept(each)) is not None:
+                yield Record(stream, each.payload, None)
 
     def _accept(self, record: ulog.Data) -> ulog.LoggedStream | None:
         """Return the stream of a data message, None if the message is not selected or a duplicate."""
@@ -139,6 +169,9 @@ class UlogReader(FlightReader):
         elif isinstance(record, ulog.Subscription):
             self._subscribed[record.name] += 1
             self._subscribers[_instance_of(record)] += 1
+            for first in [each for each in self._plain if _instance_of(each) == _instance_of(record)]:
+                stream, _ = self._plain.pop(first)
+                self._repeated[stream] = _Repetitions(stream)
         elif isinstance(record, ulog.Damage):
             self._damages += not record.is_end
             self.damaged |= not record.is_end
@@ -163,9 +196,8 @@ class UlogReader(FlightReader):
             return None
         self.definitions.setdefault(stream.address, stream.definition)
         first = self._firsts.setdefault(stream.address, stream)
-        if first is not stream or self._subscribers[_instance_of(subscription)] > 1:
+        if self._subscribers[_instance_of(subscription)] > 1:
             self._repeated[stream] = self._repeated.setdefault(first, _Repetitions(first))
-            self._plain.pop(first.subscription, None)
         return stream
 
 
