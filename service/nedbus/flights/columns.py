@@ -37,8 +37,9 @@ class Decoded(NamedTuple):
 
     def utc_columns(self) -> dict[str, npt.NDArray[Any]]:
         """Return the columns of the valid messages for `UtcEstimate`, without the fields that all messages lack."""
-        names = [name for name in self.absent.dtype.names or () if name in UTC_COLUMNS]
-        return {name: self.messages[name][self.valid] for name in names if not self.absent[name].all()}
+        known = [name for name in UTC_COLUMNS if name in (self.absent.dtype.names or ())]
+        names = [name for name in known if name == "timestamp" or not self.absent[name].all()]
+        return {name: self.messages[name][self.valid] for name in names}
 
 
 class Columns:

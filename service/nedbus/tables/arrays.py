@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,6 +53,7 @@ class FlightArrays:
     def __init__(self, path: Path, options: ReadOptions, selects: Callable[[Address], bool]) -> None:
         self.path = path
         self._columns = defaultdict[Address, Columns](Columns)
+        self._utc = dict[str, UtcOffset | str]()
         self._invalid: list[str] = []
         with open_reader(path, options) as reader:
             is_kept = dict[FileStream, bool]()
@@ -61,7 +62,7 @@ class FlightArrays:
                     is_kept[stream] = selects(stream.address) or provides_utc(stream.definition)
                 if is_kept[stream]:
                     self._columns[stream.address].add(run)
-            self._warnings, self.damaged, self.boot_utc = reader.warnings, reader.damaged, reader.boot_utc
+            self._warnings, self.damaged, self._boot_utc = reader.warnings, reader.damaged, reader.boot_utc
             self.definitions = reader.definitions
         self.start = reader.start or self._find_start(selects)
         self.addresses = sorted(self.definitions)
@@ -71,26 +72,12 @@ class FlightArrays:
         """Damage found and messages skipped so far."""
         return [*self._warnings, *self._invalid]
 
-    def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
-        """Return the messages of each address, with a mask of the messages that lack a field, by field.
+    def read(self, address: Address) -> tuple[MessageArray, Absent]:
+        """Return the valid messages of an address, with a mask of the messages that lack a field, by field.
 
-        Raises SourceError if all messages of an address have another layout than the file says.
+        The dtype has the names of these fields. Raises SourceError if all messages have another layout than the file
+        says.
         """
-        return {address: self._read(address) for address in addresses}
-
-    def utc(self, vehicle: str) -> UtcOffset | str:
-        """Return the UTC offset of a vehicle, or why it is unknown."""
-        estimate = UtcEstimate()
-        for address in self.addresses:
-            if address.vehicle == vehicle and address in self._columns:
-                estimate.add(address.stream, self._decode(address).utc_columns())
-        return estimate.result(self.boot_utc)
-
-    def _decode(self, address: Address) -> Decoded:
-        return self._columns[address].decode(self.definitions[address])
-
-    def _read(self, address: Address) -> tuple[MessageArray, Absent]:
-        """Drop invalid messages, and store the names of missing fields in the dtype."""
         messages, valid, absent = self._decode(address)
         if not valid.all():
             reason = self._columns[address].reason
@@ -104,6 +91,19 @@ class FlightArrays:
             types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
             messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
         return messages, masks
+
+    def utc(self, vehicle: str) -> UtcOffset | str:
+        """Return the UTC offset of a vehicle, or why it is unknown."""
+        if vehicle not in self._utc:
+            estimate = UtcEstimate()
+            for address in self.addresses:
+                if address.vehicle == vehicle and address in self._columns:
+                    estimate.add(address.stream, self._decode(address).utc_columns())
+            self._utc[vehicle] = estimate.result(self._boot_utc)
+        return self._utc[vehicle]
+
+    def _decode(self, address: Address) -> Decoded:
+        return self._columns[address].decode(self.definitions[address])
 
     def _find_start(self, selects: Callable[[Address], bool]) -> int:
         """Return the first log time on the clock of the timestamps [us]; 0 without log times."""

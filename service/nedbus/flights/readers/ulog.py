@@ -1,7 +1,7 @@
 """Streaming reader of PX4 .ulg logs."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,8 +39,7 @@ class UlogReader(FlightReader):
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
         self._subscribers: Counter[tuple[str, int]] = Counter()  # subscriptions of each topic and instance
-        self._plain: dict[ulog.Subscription, tuple[ulog.LoggedStream, int]] = {}
-        """The stream and the bool mask of subscriptions whose messages need no further checks."""
+        self._plain: dict[ulog.Subscription, ulog.LoggedStream] = {}  # whose messages need no further checks
         self._repeated: dict[ulog.LoggedStream, _Repetitions] = {}  # of addresses with several subscriptions
         self._firsts: dict[Address, ulog.LoggedStream] = {}
 
@@ -65,29 +64,30 @@ class UlogReader(FlightReader):
 
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
-        plain, data, make, to_int = self._plain, ulog.Data, tuple.__new__, int.from_bytes
+        plain, data, make = self._plain, ulog.Data, tuple.__new__
         for records in self._read():
             for record in records:
                 if isinstance(record, data) and record[0] in plain:
-                    stream, mask = plain[record[0]]
-                    if mask and to_int(record[1], "little") & mask:
-                        self._count_unset_bools(record)
-                    yield make(Record, (stream, record[1], None, None))
+                    self._count_unset_bools(record[0], (record[1],))
+                    yield make(Record, (plain[record[0]], record[1], None, None))
                 else:
                     yield from self._select(record)
 
     def runs(self) -> Iterator[Run]:
         """Yield the messages stream by stream in parts of the file; messages that need further checks one by one."""
-        found = dict[ulog.Subscription, list[bytes]]()
+        found = dict[ulog.Subscription, Run]()
         for records in self._read():
             for record in records:
                 if isinstance(record, ulog.Data) and record.subscription in found:
-                    found[record.subscription].append(record.payload)
+                    found[record.subscription].payloads.append(record.payload)
                     continue
                 selected = [Run(each.stream, [each.payload], []) for each in self._select(record)]
                 if len(self._plain) != len(found):  # the messages of a stream that needs checks now come first
                     yield from self._take_runs(found)
-                    found = {each: found[each] if each in found else self._parser.collect(each) for each in self._plain}
+                    found = {
+                        each: found.get(each) or Run(stream, self._parser.collect(each), [])
+                        for each, stream in self._plain.items()
+                    }
                 yield from selected
             yield from self._take_runs(found)
 
@@ -119,16 +119,12 @@ class UlogReader(FlightReader):
                 reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
             raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
 
-    def _take_runs(self, found: Mapping[ulog.Subscription, list[bytes]]) -> Iterator[Run]:
-        for subscription, collected in found.items():
-            payloads = collected.copy()
-            collected.clear()
-            if mask := subscription.layout.bool_mask:
-                for payload in payloads:
-                    if int.from_bytes(payload, "little") & mask:
-                        self._count_unset_bools(ulog.Data(subscription, payload))
-            if payloads and (stream := self._streams[subscription]) is not None:
-                yield Run(stream, payloads, [])
+    def _take_runs(self, found: Mapping[ulog.Subscription, Run]) -> Iterator[Run]:
+        for subscription, (stream, payloads, _) in found.items():
+            if payloads:
+                self._count_unset_bools(subscription, payloads)
+                yield Run(stream, payloads.copy(), [])
+                payloads.clear()
 
     def _select(self, record: ulog.Record) -> Iterator[Record]:
         """Yield the message of a record, and the log message after it, if they are selected; process other records."""
@@ -146,15 +142,17 @@ class UlogReader(FlightReader):
         stream = self._streams[subscription]
         if stream is None or (stream in self._repeated and self._repeated[stream].add(stream, payload)):
             return None
-        self._count_unset_bools(record)
+        self._count_unset_bools(subscription, (payload,))
         if stream not in self._repeated and subscription.name not in (*self._texts.TOPICS, ulog.LOG_MESSAGE.name):
-            self._plain[subscription] = stream, subscription.layout.bool_mask
+            self._plain[subscription] = stream
         return stream
 
-    def _count_unset_bools(self, record: ulog.Data) -> None:
-        layout = record.subscription.layout
-        if layout.bool_mask & int.from_bytes(record.payload, "little"):
-            self._unset_bools[record.subscription.name] += layout.count_unset_bools(record.payload)
+    def _count_unset_bools(self, subscription: ulog.Subscription, payloads: Iterable[bytes]) -> None:
+        layout, to_int = subscription.layout, int.from_bytes
+        if mask := layout.bool_mask:
+            for payload in payloads:
+                if to_int(payload, "little") & mask:
+                    self._unset_bools[subscription.name] += layout.count_unset_bools(payload)
 
     def _process(self, record: ulog.Record) -> None:
         if isinstance(record, ulog.Header):
@@ -170,7 +168,7 @@ class UlogReader(FlightReader):
             self._subscribed[record.name] += 1
             self._subscribers[_instance_of(record)] += 1
             for first in [each for each in self._plain if _instance_of(each) == _instance_of(record)]:
-                stream, _ = self._plain.pop(first)
+                stream = self._plain.pop(first)
                 self._repeated[stream] = _Repetitions(stream)
         elif isinstance(record, ulog.Damage):
             self._damages += not record.is_end
