@@ -13,19 +13,8 @@ if TYPE_CHECKING:
     from .corrections import UtcEstimate
     from .events import EVENT_OPTIONS, MAX_FILE_EVENTS, FileEvents, follow, read_file_events, times_of
     from .flight import Flight, FlightSamples, open_flight
-    from .merge import LOOKAHEAD, FlightFile, MergedFlights, distinct_names, no_utc, renamed, require_files
-    from .readers import (
-        SUFFIXES,
-        FileStream,
-        FlightReader,
-        ReadOptions,
-        Record,
-        Replay,
-        check_recording,
-        find_format,
-        format_of,
-        open_reader,
-    )
+    from .merge import FlightFile, MergedFlights, distinct_names, no_utc, renamed, require_files
+    from .readers import FileStream, FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
     from .utc import find_utc, utc_of
     from .utc_offset import UtcOffset, provides_utc
@@ -38,9 +27,8 @@ else:
         ("", "corrections"): "UtcEstimate",
         ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow read_file_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight",
-        ("", "merge"): "LOOKAHEAD FlightFile MergedFlights distinct_names no_utc renamed require_files",
-        ("", "readers"): "SUFFIXES FileStream FlightReader ReadOptions Record Replay check_recording find_format"
-        " format_of open_reader",
+        ("", "merge"): "FlightFile MergedFlights distinct_names no_utc renamed require_files",
+        ("", "readers"): "FileStream FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
         ("", "utc_offset"): "UtcOffset provides_utc",

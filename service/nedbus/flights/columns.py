@@ -1,17 +1,19 @@
-"""Messages of a flight as columns: runs of records decoded with NumPy."""
+"""Messages of a flight as columns: runs of records decoded with NumPy, and batches of validated messages."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from nedbus_msgs import Definition, upgrade_with
+from nedbus.samples import Batch
+from nedbus_msgs import Address, Definition, Encoded, Provenance, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .readers import FileStream, Run
@@ -20,6 +22,7 @@ from .utc_offset import UTC_COLUMNS
 _MAX_TIME: Final = 2**62  # us; later log times of a damaged file are of no use
 
 _Mask = npt.NDArray[np.bool_]
+_Message = tuple[Address, Definition[Any], Encoded, int, Provenance]  # with its log time [ns]
 
 
 class Decoded(NamedTuple):
@@ -158,3 +161,44 @@ def _decode_rows(definition: Definition[Any], rows: Collection[Mapping[str, Any]
             for name in definition.all_fields - message.model_fields_set:
                 decoded.absent[name][index] = True
     return decoded
+
+
+@dataclass(eq=False)
+class FlightBatch(Batch):
+    """Valid messages of one type from a flight, in the order of their log times."""
+
+    _received: Sequence[int] = field(repr=False)
+    _provenances: list[Provenance] = field(repr=False)
+
+    @property
+    def received(self) -> npt.NDArray[np.int64]:
+        """Log time of each message [ns]."""
+        return np.array(self._received, np.int64)
+
+    @property
+    def sent(self) -> npt.NDArray[np.int64]:
+        """Zeros: files have no time of sending."""
+        return np.zeros(len(self), np.int64)
+
+    @property
+    def sequence(self) -> npt.NDArray[np.int64]:
+        """Only -1: files have no sequence numbers of a publisher."""
+        return np.full(len(self), -1, np.int64)
+
+    @property
+    def provenances(self) -> list[Provenance]:
+        """Provenance of each message: its source and the fields that the source did not provide."""
+        return self._provenances
+
+
+def make_batches(messages: Iterable[_Message]) -> Iterator[FlightBatch]:
+    """Yield a batch for each type among these messages."""
+    by_definition: dict[Definition[Any], list[_Message]] = {}
+    for each in messages:
+        by_definition.setdefault(each[1], []).append(each)
+    for definition, own in by_definition.items():
+        addresses, _, encoded, received, provenances = zip(*own, strict=True)
+        arrays, _ = arrays_of(definition).decode(b"".join(each.payload for each in encoded))
+        indices = {address: index for index, address in enumerate(dict.fromkeys(addresses))}
+        index = np.fromiter(map(indices.__getitem__, addresses), np.intp, len(own))
+        yield FlightBatch(arrays, definition.model, tuple(indices), index, 0, received, list(provenances))

@@ -242,7 +242,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
     def batches(self) -> Iterator[Batch]:
         """Iterate over messages as NumPy arrays, up to 4096 of one type, with the same validation."""
-        from .batch import make_batches
+        from .columns import make_batches
 
         while ahead := list(islice(self._messages, _BATCH)):
             yield from make_batches(ahead)

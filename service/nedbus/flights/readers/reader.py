@@ -3,7 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import groupby, islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol, Self
 
@@ -109,18 +110,10 @@ class FlightReader(ABC):
     def runs(self) -> Iterator[Run]:
         """Yield the records of `records`, even rejected ones, stream by stream in parts of the file."""
         records = self.records()
-        while part := list(islice(records, _PART)):
-            runs = dict[Address, Run]()
-            for stream, payload, time, _ in part:
-                run = runs.get(stream.address)
-                if run is None or run.stream is not stream:
-                    if run is not None:
-                        yield run
-                    run = runs[stream.address] = Run(stream, [], [])
-                run.payloads.append(payload)
-                if time is not None:
-                    run.times.append(time)
-            yield from runs.values()
+        while part := sorted(islice(records, _PART), key=lambda each: hash(each.stream.address)):
+            for stream, own in groupby(part, attrgetter("stream")):
+                _, payloads, times, _ = zip(*own, strict=True)
+                yield Run(stream, list(payloads), [time for time in times if time is not None])
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in file order, once; raise SourceError if there are none of these topics."""
