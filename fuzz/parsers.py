@@ -17,7 +17,8 @@ from pymavlink.generator.mavcrc import x25crc
 
 from nedbus import ulog
 from nedbus.errors import SourceError
-from nedbus.flights.readers import ReadOptions
+from nedbus.flights.columns import Columns
+from nedbus.flights.readers import ReadOptions, Run
 from nedbus.flights.readers.mcap import McapReader, RecordedStream
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.vehicle import Vehicle
@@ -27,7 +28,6 @@ from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.mavlink.reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from nedbus.sources.mavlink.receive_queue import Received
 from nedbus.sources.options import MavlinkOptions
-from nedbus.tables.arrays import _Buffer
 from nedbus_msgs import (
     BY_TOPIC,
     MESSAGES,
@@ -132,9 +132,10 @@ def parse_cdr(data: bytes) -> int:
     payload = data[2:]
     topic = next(iter(definition.topics))
     address = Address("1", topic, 0 if TOPICS[topic].instances else None)
-    buffer = _Buffer(RecordedStream("", address, definition, layout, frozenset()))
-    buffer.add(payload, 0, None)  # as `nedbus.read` does
-    accepted, valid, _ = buffer.decode(definition)
+    columns = Columns()
+    stream = RecordedStream("", address, definition, layout, frozenset())
+    columns.add(Run(stream, [payload], []))  # as `nedbus.read` does
+    accepted, valid, _ = columns.decode(definition)
     try:
         fields = decode_with(definition, payload, layout)
         message = upgrade_with(definition, fields)

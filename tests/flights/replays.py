@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ def open_replay(text: str) -> ReplayRun:
 def convert_replay(text: str, path: Path) -> str:
     """Convert a replay source to a recording, as `nedbus convert` does; return its summary."""
     run = open_replay(text)
-    source = text.partition(":")[0]
-    return convert(run.messages, path, source=source, boot_utc=run.boot_utc, on_progress=lambda _: None)
+    kind = text.partition(":")[0]
+    messages = (replace(each, source=each.source or kind) for each in run.messages)
+    return convert(messages, path, boot_utc=run.boot_utc, on_progress=lambda _: None)
 
 
 def open_recording(path: str | Path, **options: Any) -> McapReader:

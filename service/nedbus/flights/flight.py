@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from itertools import islice
@@ -33,7 +33,7 @@ from nedbus_msgs import (
 from .merge import MergedFlights, require_files
 from .readers import ReadOptions
 from .selection import matching
-from .utc import UtcOffset
+from .utc_offset import UtcOffset
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
@@ -70,16 +70,6 @@ def open_flight(
     """
     paths = [path] if isinstance(path, str | Path) else path
     return Flight([Path(each).expanduser() for each in paths], vehicle=vehicle_name(vehicle), layout=layout)
-
-
-@dataclass(frozen=True, slots=True)
-class _Index:
-    """What a pass over the complete files has found."""
-
-    definitions: dict[Address, Definition[Any]]
-    duration: float
-    warnings: tuple[str, ...]
-    damaged: bool
 
 
 class Flight(AbstractContextManager["Flight"]):
@@ -142,22 +132,23 @@ class Flight(AbstractContextManager["Flight"]):
     @property
     def definitions(self) -> dict[Address, Definition[Any]]:
         """The definition of each address."""
-        return self._index.definitions
+        found = self._pass[0].definitions
+        return {address: known for address, known in found.items() if self._selection.matches(address)}
 
     @property
     def duration(self) -> float:
         """Seconds from the first to the last message, without pauses of more than a minute."""
-        return self._index.duration
+        return self._pass[1]
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Damage of the files, and what was left out."""
-        return self._index.warnings
+        return self._pass[0].warnings
 
     @property
     def damaged(self) -> bool:
         """True if messages are lost to damage."""
-        return self._index.damaged
+        return self._pass[0].damaged
 
     @property
     def utc(self) -> UtcOffset | None:
@@ -178,15 +169,13 @@ class Flight(AbstractContextManager["Flight"]):
             return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
 
     @cached_property
-    def _index(self) -> _Index:
+    def _pass(self) -> tuple[MergedFlights, float]:
+        """The files after one pass, and the time of their last message."""
         with self._open(_ALL.topics) as flights:
             duration = 0.0
             for message in flights.messages():
                 duration = message.due
-            known = {
-                each: definition for each, definition in flights.definitions.items() if self._selection.matches(each)
-            }
-            return _Index(known, duration, flights.warnings, flights.damaged)
+            return flights, duration
 
     def _open(self, topics: Any) -> MergedFlights:
         if self._is_closed:
@@ -242,7 +231,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
     def batches(self) -> Iterator[Batch]:
         """Iterate over messages as NumPy arrays, up to 4096 of one type, with the same validation."""
-        from .batch import make_batches
+        from .columns import make_batches
 
         while ahead := list(islice(self._messages, _BATCH)):
             yield from make_batches(ahead)

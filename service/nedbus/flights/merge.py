@@ -15,26 +15,29 @@ from typing import Any, Final
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.samples import SourceMessage
+from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import Address, Definition
 
-from .readers import ReadOptions, Replay, open_reader
-from .utc import UtcOffset, estimate_utc
+from .readers import MAX_GAP, Clock, ReadOptions, open_reader, sort_by_time
+from .utc import estimate_utc
+from .utc_offset import UtcOffset
 
 LOOKAHEAD: Final = 1000
 """Messages that are read ahead to determine the first streams and the start time of a file."""
 
 
 class FlightFile:
-    """One pass over one file: its reader, its messages with due times, and its vehicles by their own names.
+    """One pass over one file: its reader, its messages in order of their due times, and its vehicles.
 
-    `names`: the name of each vehicle among several files. `ended`: True once all messages have been read.
+    `names`: the name of each vehicle among several files.
     """
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
-        self.path, self.options, self.ended = path, options, False
-        self.reader = open_reader(path, options)
-        self._replay = Replay(self.reader)
-        messages = self._replay.messages()
+        self.path, self.options = path, options
+        reader = self.reader = open_reader(path, options)
+        self._unordered: Counter[Address] = Counter()
+        self._clock = Clock(lambda: reader.start, max_behind=reader.max_behind)
+        messages = self._replay()
         try:
             self.ahead = list(islice(messages, LOOKAHEAD))
         except BaseException:
@@ -45,8 +48,15 @@ class FlightFile:
 
     @property
     def warnings(self) -> list[str]:
-        """Damage and omissions so far."""
-        return self._replay.warnings
+        """Damage, omissions and times out of order so far."""
+        unordered = self._unordered.copy()
+        if isinstance(self._clock.stray, SourceMessage):
+            unordered[self._clock.stray.address] += 1
+        text = "timestamps of {} are out of order ({}); the order of the file is kept"
+        found = [*self.reader.warnings, *(text.format(*each) for each in unordered.items())]
+        if self._clock.gaps:
+            found.append(f"skipped gaps of more than {MAX_GAP // 1e6:.0f} s in the timestamps ({self._clock.gaps})")
+        return found
 
     @cached_property
     def utc(self) -> Mapping[str, UtcOffset | str]:
@@ -64,6 +74,17 @@ class FlightFile:
         if not found:
             raise no_utc(self.path, next((utc for utc in self.utc.values() if isinstance(utc, str)), ""))
         return median(found)
+
+    def _replay(self) -> Iterator[SourceMessage]:
+        messages, newest = self.reader.messages(), dict[Address, int]()
+        ordered = messages if self.reader.is_sorted else sort_by_time(messages)
+        for due, message in self._clock.pace(ordered, attrgetter("time")):
+            message.due = due / 1e6
+            time, address = message.time, message.address
+            if time < newest.get(address, 0) and address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
+                self._unordered[address] += 1
+            newest[address] = time
+            yield message
 
 
 class MergedFlights(AbstractContextManager["MergedFlights"]):

@@ -109,17 +109,13 @@ def align(
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
-        padded = np.append(messages, np.zeros(1, messages.dtype))  # row -1: no message
-        for field in messages.dtype.names or ():
-            kind = messages.dtype[field].base
-            padded[field][-1] = np.nan if kind.kind == "f" else kind.type()
-        values = padded[rows]
+        values, is_absent = _pick(messages, rows), rows < 0
         if method == "linear":
-            _interpolate(name, values, padded[following], weight)
-        columns[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
+            _interpolate(name, values, _pick(messages, following), weight)
+        columns[f"{name}.age"] = np.where(is_absent, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
         for field in messages.dtype.names or ():
             columns[f"{name}.{field}"] = values[field]
-            absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
+            absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else is_absent
     columns = columns if fields is None else _choose(columns, fields)
     lacked = {f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages)}
     missing = tuple(each for each in columns if each in lacked)
@@ -163,6 +159,16 @@ def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _F
     if method == "nearest":
         before = np.where((before < 0) | (stamps[after] - times < since), after, before)
     return np.where(before < 0, -1, order[before]), order[after], weight
+
+
+def _pick(messages: MessageArray, rows: _Ints) -> MessageArray:
+    """Return a copy of the messages in these rows; without one, in row -1, floats are NaN and other values 0."""
+    values = (messages if len(messages) else np.zeros(1, messages.dtype))[rows]
+    if (is_absent := rows < 0).any():
+        for field in values.dtype.names or ():
+            kind = values.dtype[field].base
+            values[field][is_absent] = np.nan if kind.kind == "f" else kind.type()
+    return values
 
 
 def _interpolate(stream: str, values: MessageArray, following: MessageArray, weight: _Floats) -> None:

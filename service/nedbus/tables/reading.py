@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
@@ -12,12 +12,12 @@ import numpy as np
 
 from nedbus.errors import AddressError, SourceError
 from nedbus.flights import (
-    FIELDS,
     ReadOptions,
     UtcOffset,
     distinct_names,
     matching,
     no_utc,
+    provides_utc,
     renamed,
     require_files,
     require_one_vehicle,
@@ -27,7 +27,7 @@ from nedbus.log_event import about
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name
 from nedbus_msgs.arrays import MessageArray
 
-from .arrays import FlightArrays, Library, Pandas, Polars, Streams, to_dataframe
+from .arrays import Absent, FlightArrays, Library, Pandas, Polars, Streams, to_dataframe
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_UTC_TOPICS: Final = {name for name, each in BY_TOPIC.items() if not each.types.keys().isdisjoint(FIELDS)}
+_UTC_TOPICS: Final = {name for name, each in BY_TOPIC.items() if provides_utc(each)}
 
 FlightPath = str | Path
 Files = FlightPath | Sequence[FlightPath]
@@ -114,41 +114,45 @@ def read_streams(
 
     `topics`: None selects the streams of all topics known to nedbus. `utc`: also find the UTC of a single file.
     """
-    names = [topics] if isinstance(topics, str) else topics
+    names, vehicle = [topics] if isinstance(topics, str) else topics, vehicle_name(vehicle)
     if isinstance(path, FlightPath):
         select = single_match if isinstance(topics, str) else matching
-        selections = [_selection(name, vehicle_name(vehicle), instance) for name in names or [ANY]]
+        selections = [_selection(name, vehicle, instance) for name in names or [ANY]]
         return _read_one(Path(path).expanduser(), _topics(names), selections, select, layout=layout, utc=utc)
     paths = require_files([Path(each).expanduser() for each in path])
-    return _read_several(paths, names, vehicle_name(vehicle), layout)
+    return _read_several(paths, names, vehicle, layout)
 
 
-class Positions:
-    """The streams of positions of one or more files, for a plot; those of several files have Unix times.
+class FlightSet:
+    """Files whose vehicles have distinct names; with `unix_times`, their timestamps become Unix times [us].
 
-    Raises the errors of `read`.
+    `vehicles`: the file of each vehicle, by its name in the set, and its name in the file.
+    `addresses`: with the names in the set.
     """
 
-    def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
-        topics = DEFAULT.topics.keys()
-        options = ReadOptions(topics if len(paths) == 1 else topics | _UTC_TOPICS)
-        self._flights = [FlightArrays(path, options, selection.matches) for path in require_files(paths)]
-        names = distinct_names([(each.path, {one.vehicle for one in each.addresses}) for each in self._flights])
-        self._homes: dict[Address, tuple[FlightArrays, Address]] = {}
-        for flight, known in zip(self._flights, names, strict=True):
-            for address in flight.addresses:
-                self._homes[renamed(address, known)] = flight, address
-        found = matching(paths[0], sorted(self._homes), selection)
-        self.addresses = [address for address in found if address.topic in topics]
+    def __init__(self, flights: Sequence[FlightArrays], *, unix_times: bool) -> None:
+        self._flights, self._unix_times = flights, unix_times
+        names = distinct_names([(each.path, {one.vehicle for one in each.addresses}) for each in flights])
+        self.vehicles: dict[str, tuple[FlightArrays, str]] = {}
+        self.addresses: list[Address] = []
+        for flight, known in zip(flights, names, strict=True):
+            self.vehicles |= {name: (flight, own) for own, name in known.items()}
+            self.addresses += [renamed(each, known) for each in flight.addresses]
 
-    def read(self, addresses: Sequence[Address]) -> Iterator[tuple[Address, MessageArray]]:
-        """Yield the messages of each address."""
-        for address in addresses:
-            flight, own = self._homes[address]
-            messages, _ = flight.read([own])[own]
-            if len(self._flights) > 1:
-                messages["timestamp"] = _utc_of(flight, own.vehicle).unix_us(messages["timestamp"].astype(np.int64))
-            yield address, messages
+    def read(self, address: Address) -> tuple[MessageArray, Absent]:
+        """Return what `FlightArrays.read` does; raise SourceError if Unix times are required, but UTC is unknown."""
+        flight, own = self.vehicles[address.vehicle]
+        messages, absent = flight.read(renamed(address, {address.vehicle: own}))
+        if self._unix_times:
+            messages["timestamp"] = self.utc(address.vehicle).unix_us(messages["timestamp"].astype(np.int64))
+        return messages, absent
+
+    def utc(self, vehicle: str) -> UtcOffset:
+        """Return the UTC offset of a vehicle; raise SourceError if it is unknown."""
+        flight, own = self.vehicles[vehicle]
+        if isinstance(utc := flight.utc(own), str):
+            raise no_utc(flight.path, utc)
+        return utc
 
     @property
     def warnings(self) -> list[str]:
@@ -161,10 +165,21 @@ class Positions:
         return any(each.damaged for each in self._flights)
 
 
-def _utc_of(flight: FlightArrays, vehicle: str) -> UtcOffset:
-    if isinstance(utc := flight.utc(vehicle), str):
-        raise no_utc(flight.path, utc)
-    return utc
+class Positions(FlightSet):
+    """The streams of positions of one or more files, for a plot; those of several files have Unix times.
+
+    Raises the errors of `read`.
+    """
+
+    def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
+        topics, is_single = DEFAULT.topics.keys(), len(paths) == 1
+        options = ReadOptions(topics if is_single else topics | _UTC_TOPICS)
+        selects = Selection(selection.topic, instance=selection.instance).matches  # the set may rename a vehicle
+        super().__init__(
+            [FlightArrays(path, options, selects) for path in require_files(paths)], unix_times=not is_single
+        )
+        found = matching(paths[0], sorted(self.addresses), selection)
+        self.addresses = [address for address in found if address.topic in topics]
 
 
 def _read_one(
@@ -178,13 +193,13 @@ def _read_one(
 ) -> ReadStreams:
     options = ReadOptions(topics if topics is None or not utc else topics | _UTC_TOPICS, layout=layout)
     try:
-        flight = FlightArrays(path, options, lambda each: _matches(selections, each))
+        flight = FlightArrays(path, options, lambda each: any(one.matches(each) for one in selections))
         chosen = dict.fromkeys(each for one in selections for each in select(path, flight.addresses, one))
     except (AddressError, SourceError):
         _explain_absent(path, options, selections, select)
         raise
     require_one_vehicle(path, chosen, selections[0].vehicle)
-    streams = {address.stream: found for address, found in flight.read(chosen).items()}
+    streams = {address.stream: flight.read(address) for address in chosen}
     _log_warnings(flight)
     found = flight.utc(next(iter(chosen)).vehicle) if utc else None
     return ReadStreams(streams, flight.start, found if isinstance(found, UtcOffset) else None)
@@ -197,24 +212,19 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
         Selection(topic)  # raises AddressError for a name that no topic can have
     options = ReadOptions(wanted if wanted is None else wanted | _UTC_TOPICS, layout=layout)
     flights = [_open_for_merge(path, options, wanted) for path in paths]
-    names = distinct_names([(each.path, {one.vehicle for one in each.addresses}) for each in flights])
-    named = [(flight, own, name) for flight, known in zip(flights, names, strict=True) for own, name in known.items()]
-    if vehicle not in (ANY, *(name for _, _, name in named)):
-        raise AddressError("vehicle", vehicle, f"one of {', '.join(sorted(name for _, _, name in named))}")
-    streams, starts = Streams(), list[int]()
-    for flight, own, name in named:
-        others = {each for _, _, each in named if each != name}
+    found, streams, starts = FlightSet(flights, unix_times=True), Streams(), list[int]()
+    if vehicle not in (ANY, *found.vehicles):
+        raise AddressError("vehicle", vehicle, f"one of {', '.join(sorted(found.vehicles))}")
+    for name, (flight, _) in found.vehicles.items():
+        others = found.vehicles.keys() - {name}
         chosen = [each.removeprefix(f"{name}/") for each in topics or [ANY] if each.partition("/")[0] not in others]
         if vehicle not in (ANY, name) or not chosen:
             continue
-        utc = _utc_of(flight, own)
-        available = [each for each in flight.addresses if wanted is None or each.topic in wanted]
-        selections = [_selection(each, own, None) for each in chosen]
-        addresses = dict.fromkeys(each for one in selections for each in matching(flight.path, available, one))
-        for address, (messages, absent) in flight.read(addresses).items():
-            messages["timestamp"] = utc.unix_us(messages["timestamp"].astype(np.int64))
-            streams[f"{name}/{address.stream}"] = messages, absent
-        starts.append(int(utc.unix_us(flight.start)) if flight.start else 0)
+        available = [each for each in found.addresses if each.vehicle == name and (not wanted or each.topic in wanted)]
+        selections = [_selection(each, name, None) for each in chosen]
+        for address in dict.fromkeys(each for one in selections for each in matching(flight.path, available, one)):
+            streams[f"{name}/{address.stream}"] = found.read(address)
+        starts.append(int(found.utc(name).unix_us(flight.start)) if flight.start else 0)
     for flight in flights:
         _log_warnings(flight)
     return ReadStreams(streams, min(starts, default=0), None)
@@ -254,7 +264,3 @@ def _topics(names: Sequence[str] | None) -> Set[str] | None:
         return TOPICS.keys()
     parts = [[part for part in name.split("/") if not part.isdecimal()] or [name] for name in names]
     return None if any(part[-1] == ANY for part in parts) else {part[-1] for part in parts}
-
-
-def _matches(selections: Sequence[Selection], address: Address) -> bool:
-    return any(each.matches(address) for each in selections)

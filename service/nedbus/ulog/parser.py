@@ -68,10 +68,11 @@ class UlogParser:
         self._formats = Formats()
         self.subscriptions: dict[int, Subscription] = {}
         self._ended: dict[tuple[str, int], list[Subscription]] = {}  # by topic and instance
+        self._collected: dict[str, list[int]] = {}  # message ids with a list of payloads, by topic
         self._count = 0  # of subscriptions that do not continue an ended one
-        self._known: dict[bytes, tuple[Subscription | None, int, int]] = {}
-        """By the first five bytes of a data message: its subscription (None: not returned), its length, and the length
-        without padding."""
+        self._known: dict[bytes, tuple[Subscription | None, int, int, list[bytes] | None]] = {}
+        """By the first five bytes of a data message: its subscription (None: not returned), its length, the length
+        without padding, and the list to which payloads are added instead."""
         self._buffer = b""
         self._sync = -1  # position in the buffer of the next sync, or the end; before the current record if unknown
         self._offset = 0  # offset of the buffer in the log
@@ -87,6 +88,17 @@ class UlogParser:
         if self._is_readable:
             self._buffer += data
         return self._parse(is_end=False)
+
+    def collect(self, subscription: Subscription) -> list[bytes]:
+        """Return a list to which the payloads of a subscription are added from now on, instead of being returned.
+
+        This ends with the next subscription to its topic; the messages after that are returned again.
+        """
+        payloads: list[bytes] = []
+        for message_id in [number for number, each in self.subscriptions.items() if each is subscription]:
+            self._collected.setdefault(subscription.name, []).append(message_id)
+            self._route(message_id, payloads)
+        return payloads
 
     def gap(self) -> None:
         """Discard a partial record after a loss of bytes; the next byte must begin a record."""
@@ -156,11 +168,13 @@ class UlogParser:
                 self._sync = len(buffer)
         mark = self._sync
         while found is not None:
-            subscription, length, used = found
+            subscription, length, used, payloads = found
             stop = at + length
             found = None if at < mark < stop else known.get(buffer[stop : stop + _DATA_HEADER])
             if found is not None:
-                if subscription is not None:
+                if payloads is not None:
+                    payloads.append(buffer[at + _DATA_HEADER : at + used])
+                elif subscription is not None:
                     records.append(make(Data, (subscription, buffer[at + _DATA_HEADER : at + used])))
                 at = stop
         return at
@@ -283,9 +297,12 @@ class UlogParser:
             except ValueError as exc:
                 reason = str(exc)
         elif inspected.validity == "valid":
-            subscription, _, used = self._known[self._buffer[at : at + _DATA_HEADER]]
-            if subscription is not None:
-                self._records.append(Data(subscription, self._buffer[at + _DATA_HEADER : at + used]))
+            subscription, _, used, payloads = self._known[self._buffer[at : at + _DATA_HEADER]]
+            payload = self._buffer[at + _DATA_HEADER : at + used]
+            if payloads is not None:
+                payloads.append(payload)
+            elif subscription is not None:
+                self._records.append(Data(subscription, payload))
         elif kind == ord("D"):
             self.undecodable += 1
             message_id = int.from_bytes(self._buffer[at + _HEADER : at + _DATA_HEADER], "little")
@@ -326,9 +343,15 @@ class UlogParser:
             self._count += 1
             self._records.append(subscription)
         self.subscriptions[new.message_id] = subscription
-        used, is_returned = subscription.layout.size + _DATA_HEADER, self._topics is None or new.name in self._topics
-        for length, head in _heads(new.message_id, subscription.layout):
-            self._known[head] = subscription if is_returned else None, length, used
+        for message_id in (new.message_id, *self._collected.pop(new.name, ())):
+            self._route(message_id, None)
+
+    def _route(self, message_id: int, payloads: list[bytes] | None) -> None:
+        """Add the payloads of a message id to a list from now on, or return its messages."""
+        if (subscription := self.subscriptions.get(message_id)) is not None:
+            returned = subscription if self._topics is None or subscription.name in self._topics else None
+            for length, head in _heads(message_id, subscription.layout):
+                self._known[head] = returned, length, subscription.layout.size + _DATA_HEADER, payloads
 
     def _unsubscribe(self, message_id: int) -> None:
         old = self.subscriptions.pop(message_id, None)

@@ -164,6 +164,24 @@ def test_equal_messages_of_two_subscriptions_are_one(tmp_path: Path) -> None:
     assert nedbus.read(path)["x"].tolist() == [float(index) for index in range(20)]
 
 
+@pytest.mark.parametrize("begin", [1, 1000, 1999])
+def test_second_subscription_in_a_log_repeats_no_message(tmp_path: Path, begin: int) -> None:
+    """A second subscription may begin anywhere in a log: all messages are read once, in order."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for index in range(2000):
+        if index == begin:
+            writer.put("A", struct.pack("<BH", 0, 1) + VLP.encode())
+        for number in range(1 + (index >= begin)):
+            writer.add(VLP, message(1_000_000 + index, x=float(index)))
+            writer._ids[VLP, 0] = 1 - number if index >= begin else 0
+    path = writer.write(tmp_path / "a.ulg")
+    assert len(writer.data) > 2 * 2**17, "the reader must need several parts"
+    assert nedbus.read(path)["x"].tolist() == [float(index) for index in range(2000)]
+    with nedbus.open(path) as flight:
+        assert [each.message.x for each in flight()] == [float(index) for index in range(2000)]
+
+
 def test_payload_of_another_release_names_it() -> None:
     """The error for a payload of the wrong size names the release whose layout fits, and the remedy."""
     layouts = DEFAULT.layouts

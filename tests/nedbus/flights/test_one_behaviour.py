@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import shutil
 import struct
+from collections import defaultdict
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ import pytest
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ConfigError, NedbusError, SourceError
 from nedbus.flights.readers import FlightReader, open_reader
+from nedbus_msgs import Address
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import UlogWriter
 from tests.peers.command_line import run_command
@@ -59,16 +62,30 @@ def test_file_is_parsed_once(tmp_path: Path, suffix: str, monkeypatch: pytest.Mo
     path, passes = write_flight(tmp_path / f"a{suffix}"), list[str]()
     with open_reader(path) as reader:
         kind = type(reader)
-    original = kind.records
+    original = kind.runs
 
     def counted(self: FlightReader) -> object:
         passes.append(self.kind)
         return original(self)
 
-    monkeypatch.setattr(kind, "records", counted)
+    monkeypatch.setattr(kind, "runs", counted)
     nedbus.read(path)
     nedbus.read([path], [VLP])
     assert len(passes) == 2
+
+
+@each_format
+def test_runs_contain_the_records_of_each_address_in_order(tmp_path: Path, suffix: str) -> None:
+    """Records and runs are two views of one file: both have the same messages and times per address."""
+    path = write_flight(tmp_path / f"a{suffix}", vehicles=(1,) if suffix == ".ulg" else (1, 2))
+    single, together = defaultdict[Address, list[object]](list), defaultdict[Address, list[object]](list)
+    with open_reader(path) as reader:
+        for record in reader.records():
+            single[record.stream.address].append((record.payload, record.time))
+    with open_reader(path) as reader:
+        for run in reader.runs():
+            together[run.stream.address] += zip_longest(run.payloads, run.times)
+    assert single == together
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".tlog"])

@@ -14,7 +14,9 @@ import pytest
 import nedbus
 from nedbus.errors import SourceError
 from nedbus.flights import read_file_events
+from nedbus.tables import Positions
 from nedbus.web.playback import Recording
+from nedbus_msgs import Selection
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
 from tests.peers.command_line import run_command
@@ -86,6 +88,16 @@ def test_files_of_one_name_have_distinct_vehicles(tmp_path: Path) -> None:
     streams = nedbus.read(paths, [VLP])
     seconds = {name: round(1e-6 * int(own["timestamp"][0] - EPOCH)) for name, own in streams.items()}
     assert seconds == {f"a/{VLP}": 60, f"a_2/{VLP}": 61, f"a_3/{VLP}": 62}
+
+
+def test_plot_of_one_vehicle_among_several_files(swarm: list[str], tmp_path: Path) -> None:
+    """A vehicle that several files have is plotted by the name that the warnings and `read` give it."""
+    positions = Positions([Path(path) for path in swarm], Selection(VLP, vehicle="b"))
+    assert [str(address) for address in positions.addresses] == [f"b/{VLP}"]
+    (messages, _) = positions.read(positions.addresses[0])
+    assert messages["timestamp"][0] == EPOCH + 60_000_000
+    shown = run_command("plot", *swarm, "-v", "b", "-o", str(tmp_path / "b.png"))
+    assert shown.exit_code == 0, shown.err
 
 
 def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def plot(
     selected = positions.addresses
     if len(selected) > limit:
         write_stderr(f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i")
-    streams = [(address, messages) for address, messages in positions.read(selected[:limit]) if len(messages)]
+    streams = [(address, messages) for address in selected[:limit] if len(messages := positions.read(address)[0])]
     for warning in positions.warnings:
         write_stderr(warning)
     if not streams:

@@ -58,14 +58,13 @@ def format_of(path: str | PurePath) -> str:
     return found
 
 
-def open_reader(path: Path, options: ReadOptions = ReadOptions(), *, form: str | None = None) -> FlightReader:  # noqa: B008 - immutable
-    """Open a flight file; `form`: its format, by default that of its content or suffix.
+def open_reader(path: Path, options: ReadOptions = ReadOptions()) -> FlightReader:  # noqa: B008 - immutable
+    """Open a flight file in the format of its content, else of its suffix.
 
     Raises SourceError for a file that cannot be read, ConfigError if it is of another kind, or if the package that
     reads it is not installed, ArgumentError for a layout= that the format does not need.
     """
-    name = form or format_of(path)
-    kind = _FORMATS[name]
+    kind = _FORMATS[format_of(path)]
     if options.layout is not None and kind.extra != "mcap":
         raise ArgumentError("layout", options.layout, f"none, because a {kind.suffix} file defines its own layouts")
     if options.layout not in (known := (None, *RELEASES, *DEFAULT.layouts)):

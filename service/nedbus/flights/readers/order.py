@@ -1,16 +1,10 @@
 """Order and pace of a flight: messages by log time, due times without pauses and without outliers."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from heapq import heappop, heappush
-from operator import attrgetter
 from typing import Final, TypeVar
 
 from nedbus.samples import SourceMessage
-from nedbus.ulog import LOG_MESSAGE
-from nedbus_msgs import Address
-
-from .reader import FlightReader
 
 MAX_GAP: Final = 60_000_000
 """Longest pause of a replay [us]; a longer one, or a damaged time, is skipped."""
@@ -75,40 +69,7 @@ class Clock:
         self._now, self._is_running = time, True
 
 
-class Replay:
-    """The messages of a reader in order of their due times, once; `warnings`: those of the reader and of the order."""
-
-    def __init__(self, reader: FlightReader) -> None:
-        self.reader = reader
-        self._unordered: Counter[Address] = Counter()
-        self._clock = Clock(lambda: reader.start, max_behind=reader.max_behind)
-
-    @property
-    def warnings(self) -> list[str]:
-        """Damage, omissions and times out of order so far."""
-        unordered = self._unordered.copy()
-        if isinstance(self._clock.stray, SourceMessage):
-            unordered[self._clock.stray.address] += 1
-        text = "timestamps of {} are out of order ({}); the order of the file is kept"
-        found = [*self.reader.warnings, *(text.format(*each) for each in unordered.items())]
-        if self._clock.gaps:
-            found.append(f"skipped gaps of more than {MAX_GAP // 1e6:.0f} s in the timestamps ({self._clock.gaps})")
-        return found
-
-    def messages(self) -> Iterator[SourceMessage]:
-        """Yield the messages with their due times; raise the errors of the reader."""
-        messages, newest = self.reader.messages(), dict[Address, int]()
-        ordered = messages if self.reader.is_sorted else _sort(messages)
-        for due, message in self._clock.pace(ordered, attrgetter("time")):
-            message.due = due / 1e6
-            time, address = message.time, message.address
-            if time < newest.get(address, 0) and address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
-                self._unordered[address] += 1
-            newest[address] = time
-            yield message
-
-
-def _sort(messages: Iterable[SourceMessage]) -> Iterator[SourceMessage]:
+def sort_by_time(messages: Iterable[SourceMessage]) -> Iterator[SourceMessage]:
     """Sort messages by log time, because writers batch them by stream; flush if the time goes back by over MAX_GAP."""
     waiting: list[tuple[int, int, SourceMessage]] = []
     newest = 0

@@ -3,20 +3,24 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby, islice
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, Final, NamedTuple, Protocol, Self
 
 from nedbus.errors import ConfigError
 from nedbus.samples import RecordStream, SourceMessage
 from nedbus_msgs import TOPICS, Address, Definition
+
+_PART: Final = 256  # records from which runs are formed
 
 
 class FileStream(RecordStream, Protocol):
     """One stream of records in a file; `lacking`: fields that a record has, but its source did not provide.
 
     `dtype`: argument of `numpy.dtype` for a record; None if payloads are fields by name.
-    `converted`: the type of each field that `decode` converts. `head`: the first bytes of each record.
-    `strict_bools`: the fields whose bytes must be 0 or 1.
+    `converted`: the type of each field that `decode` converts. `strict_bools`: the fields whose bytes must be 0 or 1.
+    `head`: the first bytes of each record; without them, all records have the size of `dtype`.
     """
 
     address: Address
@@ -47,6 +51,14 @@ class Record(NamedTuple):
     payload: Any
     time: int | None
     error: str | None = None
+
+
+class Run(NamedTuple):
+    """Messages of one stream, in file order among those of its address; `times`: as in a record, empty for a log."""
+
+    stream: FileStream
+    payloads: list[Any]
+    times: list[int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +106,14 @@ class FlightReader(ABC):
     @abstractmethod
     def records(self) -> Iterator[Record]:
         """Yield the records in file order, once; raise SourceError if there are none of these topics."""
+
+    def runs(self) -> Iterator[Run]:
+        """Yield the records of `records`, even rejected ones, stream by stream in parts of the file."""
+        records = self.records()
+        while part := sorted(islice(records, _PART), key=lambda each: hash(each.stream.address)):
+            for stream, own in groupby(part, attrgetter("stream")):
+                _, payloads, times, _ = zip(*own, strict=True)
+                yield Run(stream, list(payloads), [time for time in times if time is not None])
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in file order, once; raise SourceError if there are none of these topics."""

@@ -1,7 +1,7 @@
 """Streaming reader of PX4 .ulg logs."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +10,7 @@ from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import ALL, TOPICS, Address, Definition
 
 from .formats import open_file
-from .reader import FlightReader, ReadOptions, Record
+from .reader import FlightReader, ReadOptions, Record, Run
 
 _CHUNK: Final = 2**17  # bytes read at a time
 _MAX_NAMED: Final = 5  # damaged locations listed in the warnings
@@ -39,8 +39,7 @@ class UlogReader(FlightReader):
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
         self._subscribers: Counter[tuple[str, int]] = Counter()  # subscriptions of each topic and instance
-        self._plain: dict[ulog.Subscription, tuple[ulog.LoggedStream, int]] = {}
-        """The stream and the bool mask of subscriptions whose messages need no further checks."""
+        self._plain: dict[ulog.Subscription, ulog.LoggedStream] = {}  # whose messages need no further checks
         self._repeated: dict[ulog.LoggedStream, _Repetitions] = {}  # of addresses with several subscriptions
         self._firsts: dict[Address, ulog.LoggedStream] = {}
 
@@ -65,29 +64,32 @@ class UlogReader(FlightReader):
 
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
-        plain, merge, data, make, to_int = self._plain, self._texts.merge, ulog.Data, tuple.__new__, int.from_bytes
+        plain, data, make = self._plain, ulog.Data, tuple.__new__
         for records in self._read():
             for record in records:
                 if isinstance(record, data) and record[0] in plain:
-                    stream, mask = plain[record[0]]
-                    if mask and to_int(record[1], "little") & mask:
-                        self._count_unset_bools(record)
-                    yield make(Record, (stream, record[1], None, None))
+                    self._count_unset_bools(record[0], (record[1],))
+                    yield make(Record, (plain[record[0]], record[1], None, None))
+                else:
+                    yield from self._select(record)
+
+    def runs(self) -> Iterator[Run]:
+        """Yield the messages stream by stream in parts of the file; messages that need further checks one by one."""
+        found = dict[ulog.Subscription, Run]()
+        for records in self._read():
+            for record in records:
+                if isinstance(record, ulog.Data) and record.subscription in found:
+                    found[record.subscription].payloads.append(record.payload)
                     continue
-                for each in merge((record,)):
-                    if not isinstance(each, data):
-                        self._process(each)
-                    elif (found := self._accept(each)) is not None:
-                        yield make(Record, (found, each.payload, None, None))
-        self.damaged |= any(each.warnings and each.is_loss for each in self._repeated.values())
-        if not self.definitions:
-            topics = self.options.topics
-            what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
-            reason = f"this log has no message of {what}"
-            if topics is not None and self._subscribed:
-                names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
-                reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
-            raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
+                selected = [Run(each.stream, [each.payload], []) for each in self._select(record)]
+                if len(self._plain) != len(found):  # the messages of a stream that needs checks now come first
+                    yield from self._take_runs(found)
+                    found = {
+                        each: found.get(each) or Run(stream, self._parser.collect(each), [])
+                        for each, stream in self._plain.items()
+                    }
+                yield from selected
+            yield from self._take_runs(found)
 
     def layouts(self, definition: Definition[Any]) -> set[str]:
         """Return the names of the layouts of a definition so far."""
@@ -103,10 +105,34 @@ class UlogReader(FlightReader):
             yield self._parser.close()
             self._is_read = True
             self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
+            self.damaged |= any(each.warnings and each.is_loss for each in self._repeated.values())
         except ulog.UlogError as exc:
             raise SourceError(str(self.path), f"not a readable ULog file ({exc})") from exc
         except OSError as exc:
             raise SourceError(str(self.path), (exc.strerror or str(exc)).lower()) from exc
+        if not self.definitions:
+            topics = self.options.topics
+            what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
+            reason = f"this log has no message of {what}"
+            if topics is not None and self._subscribed:
+                names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
+                reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
+            raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
+
+    def _take_runs(self, found: Mapping[ulog.Subscription, Run]) -> Iterator[Run]:
+        for subscription, (stream, payloads, _) in found.items():
+            if payloads:
+                self._count_unset_bools(subscription, payloads)
+                yield Run(stream, payloads.copy(), [])
+                payloads.clear()
+
+    def _select(self, record: ulog.Record) -> Iterator[Record]:
+        """Yield the message of a record, and the log message after it, if they are selected; process other records."""
+        for each in self._texts.merge((record,)):
+            if not isinstance(each, ulog.Data):
+                self._process(each)
+            elif (stream := self._accept(each)) is not None:
+                yield Record(stream, each.payload, None)
 
     def _accept(self, record: ulog.Data) -> ulog.LoggedStream | None:
         """Return the stream of a data message, None if the message is not selected or a duplicate."""
@@ -116,15 +142,17 @@ class UlogReader(FlightReader):
         stream = self._streams[subscription]
         if stream is None or (stream in self._repeated and self._repeated[stream].add(stream, payload)):
             return None
-        self._count_unset_bools(record)
+        self._count_unset_bools(subscription, (payload,))
         if stream not in self._repeated and subscription.name not in (*self._texts.TOPICS, ulog.LOG_MESSAGE.name):
-            self._plain[subscription] = stream, subscription.layout.bool_mask
+            self._plain[subscription] = stream
         return stream
 
-    def _count_unset_bools(self, record: ulog.Data) -> None:
-        layout = record.subscription.layout
-        if layout.bool_mask & int.from_bytes(record.payload, "little"):
-            self._unset_bools[record.subscription.name] += layout.count_unset_bools(record.payload)
+    def _count_unset_bools(self, subscription: ulog.Subscription, payloads: Iterable[bytes]) -> None:
+        layout, to_int = subscription.layout, int.from_bytes
+        if mask := layout.bool_mask:
+            for payload in payloads:
+                if to_int(payload, "little") & mask:
+                    self._unset_bools[subscription.name] += layout.count_unset_bools(payload)
 
     def _process(self, record: ulog.Record) -> None:
         if isinstance(record, ulog.Header):
@@ -139,6 +167,9 @@ class UlogReader(FlightReader):
         elif isinstance(record, ulog.Subscription):
             self._subscribed[record.name] += 1
             self._subscribers[_instance_of(record)] += 1
+            for first in [each for each in self._plain if _instance_of(each) == _instance_of(record)]:
+                stream = self._plain.pop(first)
+                self._repeated[stream] = _Repetitions(stream)
         elif isinstance(record, ulog.Damage):
             self._damages += not record.is_end
             self.damaged |= not record.is_end
@@ -163,9 +194,8 @@ class UlogReader(FlightReader):
             return None
         self.definitions.setdefault(stream.address, stream.definition)
         first = self._firsts.setdefault(stream.address, stream)
-        if first is not stream or self._subscribers[_instance_of(subscription)] > 1:
+        if self._subscribers[_instance_of(subscription)] > 1:
             self._repeated[stream] = self._repeated.setdefault(first, _Repetitions(first))
-            self._plain.pop(first.subscription, None)
         return stream
 
 

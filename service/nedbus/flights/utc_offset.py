@@ -1,0 +1,48 @@
+"""Offset from time since boot to UTC, and the fields from which it is derived."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
+
+from nedbus_msgs import Definition, is_unix_time
+
+FIELDS: Final = ("time_utc_usec", "estimated_offset")
+"""The fields that provide UTC: that of a GNSS receiver, or the offset to a companion's clock."""
+
+RELATIVE: Final = "timestamp_time_relative"
+"""The field with the time from the message's timestamp to the receiver's UTC [us]."""
+
+UTC_COLUMNS: Final = ("timestamp", *FIELDS, RELATIVE)
+"""The fields from which UTC is derived."""
+
+
+@dataclass(frozen=True, slots=True)
+class UtcOffset:
+    """Offset from a vehicle's time since boot to Unix time [us], and its source.
+
+    `source`: the stream, "boot_time_utc_us" of a log, or "timestamp" if timestamps are Unix time already, as uXRCE-DDS
+    sends them once synchronized. The stream timesync_status is as accurate as the clock of the companion computer.
+    `offset_us`: median over the messages of the source; a GNSS fix is a few tenths of a second older than its message.
+    `count`: messages within one second of the median; `spread_us`: their maximum minus minimum.
+    `corrected_us`: by how much the source corrected its time in flight, as a receiver does that has downloaded the leap
+    seconds; the offset after the last correction holds for all messages.
+    """
+
+    source: str
+    offset_us: int
+    count: int
+    spread_us: int
+    corrected_us: int = 0
+
+    def at(self, timestamp: int) -> datetime:
+        """Return the UTC of a `timestamp` from the same boot of this vehicle; Unix time is used as it is."""
+        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(self.unix_us(int(timestamp))))
+
+    def unix_us(self, timestamps: Any) -> Any:
+        """Return the Unix time [us] of a timestamp or an array of timestamps."""
+        return timestamps + self.offset_us * (1 - is_unix_time(timestamps))
+
+
+def provides_utc(definition: Definition[Any]) -> bool:
+    """Return whether messages of a definition may provide UTC."""
+    return not definition.types.keys().isdisjoint(FIELDS)
