@@ -52,7 +52,7 @@ class Job:
     @property
     def due(self) -> float:
         """The monotonic time of the next call [s]."""
-        return min((self._due, *self._requested))
+        return min((self._due, *self._requested)) if self._requested else self._due
 
     def wake(self, at: float = 0.0) -> None:
         """Call the job now, or at the first tick after a monotonic time [s]; any thread may call this."""
@@ -70,10 +70,14 @@ class Job:
 
     def run(self, now: float) -> None:
         """Call the job; only for the I/O thread."""
-        self._requested.difference_update([at for at in tuple(self._requested) if at <= now])
-        pause = _RETRY_PAUSE
-        with suppress(SystemExit, KeyboardInterrupt), self._errors, self._running:  # they must not end this thread
-            pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
+        if self._requested:
+            self._requested.difference_update([at for at in tuple(self._requested) if at <= now])
+        try:  # not `with self._errors`, which costs two calls
+            with self._running:
+                pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
+        except BaseException as exc:  # noqa: BLE001 - not even SystemExit may end this thread
+            self._errors.survives(exc)
+            pause = _RETRY_PAUSE
         self._due = now + pause if pause < TICK or pause == math.inf else math.floor((now + pause) / TICK) * TICK
 
 
