@@ -214,3 +214,22 @@ def test_row_is_a_named_tuple() -> None:
     assert list(row._asdict()) == list(FIELD_TYPES)
     assert repr(pickle.loads(pickle.dumps(row))) == repr(row)
     assert not hasattr(row, "model_dump")
+
+
+@pytest.mark.parametrize(
+    "change", [lambda message, y: message.__dict__.update(y=y), lambda message, y: object.__setattr__(message, "y", y)]
+)
+def test_forced_change_of_a_constructed_message_is_encoded(
+    change: Callable[[VehicleLocalPosition, object], None],
+) -> None:
+    """A message encodes the values that it has, even if a frozen message was changed by force after its construction.
+
+    A value that does not fit its field raises EncodeError.
+    """
+    message = VehicleLocalPosition(timestamp=5, y=1.0)
+    assert decode(encode(message)).y == 1.0
+    change(message, 2.0)
+    assert decode(encode(message)).y == 2.0
+    change(message, "north")
+    with pytest.raises(EncodeError):
+        encode(message)

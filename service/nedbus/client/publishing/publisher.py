@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from .publisher_registry import PublisherRegistry
 
+_GROUP: Final = 64  # messages of `publish_many` between checks for forks and acknowledgements
 FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
@@ -136,8 +137,13 @@ class Publisher(AbstractContextManager["Publisher"]):
             raise TypeError(f"{self.address} needs an array with the dtype of {self.definition.name}: {hint}")
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
-        for start in range(0, len(payloads), size):
-            self.publish_encoded(payloads[start : start + size], self._all)
+        each = [payloads[start : start + size] for start in range(0, len(payloads), size)]
+        sent = 0
+        while sent < len(each):
+            room = self._flow_control.check_at - self.published if self.lossless else _GROUP
+            group = each[sent : sent + max(1, min(_GROUP, room))]
+            self._put(group, self._encoding)
+            sent += len(group)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers in mode "every" have received all messages; return False on timeout.
@@ -175,20 +181,26 @@ class Publisher(AbstractContextManager["Publisher"]):
 
     def publish_encoded(self, payload: bytes, provided: Set[str]) -> None:
         """Publish a payload that a codec has validated and encoded; `provided`: the fields that its source provides."""
-        require_unforked()
         encoding = self._encoding
         if len(provided) != len(self._all):
             known = self._partial[0]
             if provided is not known and provided != known:  # rare: usually the same fields are missing
                 self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
-        writer, downsampler = self._writer, self._downsampler
+        self._put((payload,), encoding)
+
+    def _put(self, payloads: Sequence[bytes], encoding: str) -> None:
+        """Put one message, or several before the next of which flow control has to check, and wait for readers."""
+        require_unforked()
+        writer, downsampler, new_timestamp = self._writer, self._downsampler, self._new_timestamp
+        override = None if encoding is self._declared else encoding
         try:
-            stamp = self._new_timestamp()
-            writer.put(payload, stamp, None if encoding is self._declared else encoding)
-            self.last = payload, stamp, encoding
-            if writer.last_put >= downsampler.due or downsampler.vehicle_listener.matched:
-                downsampler.put(payload, stamp, encoding)
+            for payload in payloads:
+                stamp = new_timestamp()
+                writer.put(payload, stamp, override)
+                self.last = payload, stamp, encoding
+                if writer.last_put >= downsampler.due or downsampler.vehicle_listener.matched:
+                    downsampler.put(payload, stamp, encoding)
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc
         if self.lossless and writer.published >= self._flow_control.check_at:

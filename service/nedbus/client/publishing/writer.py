@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
 from contextlib import suppress
+from time import monotonic
 from typing import Final
 
 import zenoh
@@ -54,11 +54,14 @@ class Writer:
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
         """Put a payload without waiting for readers; `encoding` overrides the writer's."""
-        if self._publisher is None:
+        if (publisher := self._publisher) is None:
             raise ClosedError
-        self._publisher.put(payload, timestamp=stamp, encoding=encoding)
+        if encoding is None:
+            publisher.put(payload, timestamp=stamp)
+        else:
+            publisher.put(payload, timestamp=stamp, encoding=encoding)
         self.published += 1
-        self.last_put = time.monotonic()
+        self.last_put = monotonic()
         if self.is_silent:
             self._heartbeats.resume(self)
 

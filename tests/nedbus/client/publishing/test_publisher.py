@@ -16,7 +16,7 @@ from nedbus.transport import Session, token_keys
 from nedbus_msgs import Address, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.numbered import numbered
+from tests.nedbus.client.numbered import numbered, receive_timestamps, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
 
 
@@ -47,6 +47,30 @@ def test_publish_many_with_invalid_arguments_sends_nothing(bus: nedbus.Bus) -> N
     with pytest.raises(nedbus.ClosedError):
         publisher.publish_many(numbered(1))
     assert publisher.published == 0
+
+
+def test_publish_many_waits_for_credit_at_exactly_the_due_messages(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lossless `publish_many` waits for its readers at the message that is due, whatever is put in one group.
+
+    All messages arrive in order.
+    """
+    publisher, waited = bus.publisher(VLP, vehicle="1", lossless=True), list[int]()
+    control = publisher._flow_control
+
+    def wait_for_credit(published: int) -> None:
+        waited.append(published)
+        control.check_at = published + 37 if len(waited) < 3 else 1000
+
+    monkeypatch.setattr(control, "wait_for_credit", wait_for_credit)
+    control.check_at = 70
+    with bus.subscribe(VLP, vehicle="1", mode="every") as subscription:
+        wait_for_subscriber(publisher)
+        publisher.publish_many(numbered(300))
+        assert receive_timestamps(subscription, 300) == list(range(1, 301))
+    assert waited == [70, 107, 144]
+    assert publisher.published == 300
 
 
 def test_invalid_source_leaves_nothing_behind(bus: nedbus.Bus, zenoh_session: Session) -> None:
