@@ -20,12 +20,12 @@ from functools import partial
 from pathlib import Path
 
 from tests.flights.ulogs import LOGS
-from tests.peers.px4_log_stream import STREAMS, Px4LogStream, is_heartbeat, read_recording
+from tests.peers.px4_log_stream import Px4LogStream
 
 from benchmarks.processes import HERE, Checkout, cpu_seconds, free_port, nedbus_process, wait_for_router
 
 from .files import repeat_log
-from .stream import NATURAL, RATE
+from .stream import FLIGHT, NATURAL, RATE, read_flight
 
 _PUBLISHED = re.compile(r"^nedbus_messages_published\w*\{[^}]*\} (\S+)", re.MULTILINE)
 _HEADER = 4.0  # s in which the definitions are sent
@@ -38,15 +38,18 @@ def main() -> None:
     parser.add_argument("--vs", type=Path, help="a second checkout of nedbus, measured in the same run")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--megabytes", type=int, default=30)
-    parser.add_argument("--seconds", type=float, default=15.0, help="duration of the stream")
+    parser.add_argument("--seconds", type=float, default=15.0, help="longest duration of a stream")
+    parser.add_argument("--stream", type=Path, help="a recording to play at its own speed, instead of one at 200 KB/s")
+    parser.add_argument("--no-logs", action="store_true", help="measure only the stream")
     options = parser.parse_args()
     checkouts = (HERE, Checkout(options.vs)) if options.vs else (HERE,)
     with tempfile.TemporaryDirectory() as folder:
-        for path in options.logs or sorted(LOGS.glob("*.ulg")):
+        for path in [] if options.no_logs else options.logs or sorted(LOGS.glob("*.ulg")):
             big = repeat_log(path, Path(folder) / path.name, options.megabytes * 1_000_000)
             compare(path.name, partial(replay, big), checkouts, options.rounds)
             big.unlink()
-    compare("stream", partial(receive, options.seconds), checkouts, options.rounds)
+    path, speed = (options.stream, 1.0) if options.stream else (FLIGHT, RATE / NATURAL)
+    compare(path.name, partial(receive, path, speed, options.seconds), checkouts, options.rounds)
 
 
 def compare(name: str, measure: Callable[[Checkout], float], checkouts: tuple[Checkout, ...], rounds: int) -> None:
@@ -73,15 +76,10 @@ def replay(log: Path, checkout: Checkout) -> float:
     return 1e6 * seconds / int(found[1])
 
 
-def receive(seconds: float, checkout: Checkout) -> float:
-    """Play a stream at 200 KB/s to a service; return its CPU time per message after the header [us]."""
+def receive(path: Path, speed: float, seconds: float, checkout: Checkout) -> float:
+    """Play a recorded stream to a service; return its CPU time per message after the header [us]."""
     port, endpoint, http = free_port(), free_port(), free_port()
-    recording, speed = read_recording(STREAMS / "ulog_stream_flight1.bin.gz"), RATE / NATURAL
-    recording.entries = [  # telemetry at its natural rate
-        each
-        for number, each in enumerate(recording.entries)
-        if not isinstance(each.content, bytes) or is_heartbeat(each.content) or number % round(speed) == 0
-    ]
+    recording = read_flight(path, speed)
     arguments = ("--http", f"127.0.0.1:{http}", "-s", f"mavlink:udpin:127.0.0.1:{port}?log=1&topics=*")
     with nedbus_process("serve", "-l", f"tcp/127.0.0.1:{endpoint}", *arguments, checkout=checkout) as service:
         wait_for_router(endpoint, service)

@@ -12,11 +12,14 @@ import json
 import struct
 import time
 from functools import cache, partial
+from pathlib import Path
+from typing import Final
 
 from pymavlink.dialects.v20 import common as dialect
 from tests.peers.px4_log_stream import (  # fmt: skip
     STREAMS,
     Px4LogStream,
+    Recording,
     is_heartbeat,
     read_recording,
     stream_message,
@@ -40,6 +43,7 @@ with nedbus.connect(sys.argv[1], timeout=30) as bus, bus.subscribe("*", mode="ev
 print(json.dumps(found), flush=True)
 """
 
+FLIGHT: Final = STREAMS / "ulog_stream_flight1.bin.gz"
 Key = tuple[str, int]
 
 
@@ -73,16 +77,21 @@ def main() -> None:
         print(measure(form, seconds), flush=True)
 
 
+def read_flight(path: Path, speed: float = RATE / NATURAL) -> Recording:
+    """Return a recording whose telemetry is at its natural rate when the stream is played at this speed."""
+    recording, step = read_recording(path), max(1, round(speed))
+    recording.entries = [
+        each
+        for number, each in enumerate(recording.entries)
+        if not isinstance(each.content, bytes) or is_heartbeat(each.content) or number % step == 0
+    ]
+    return recording
+
+
 def measure(form: str, seconds: float) -> str:
     """Run one form of the source and return its line."""
     arrivals, port, endpoint = Arrivals(), free_port(), f"tcp/127.0.0.1:{free_port()}"
-    recording = read_recording(STREAMS / "ulog_stream_flight1.bin.gz")
-    speed = RATE / NATURAL
-    recording.entries = [  # telemetry at its natural rate
-        each
-        for number, each in enumerate(recording.entries)
-        if not isinstance(each.content, bytes) or is_heartbeat(each.content) or number % round(speed) == 0
-    ]
+    recording, speed = read_flight(FLIGHT), RATE / NATURAL
     with nedbus_process("serve", "-l", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}{form}") as service:
         reader = start("-c", READER, endpoint)
         try:

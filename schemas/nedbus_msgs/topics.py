@@ -31,10 +31,9 @@ _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
 class _Hashed:
-    """Slot for a hash that is computed once, because each message looks up its address several times."""
+    """Slot for a hash that is computed once, and read without Python code: each message is looked up several times."""
 
-    __slots__ = ("_hash",)
-    _hash: int
+    __slots__ = ("__hash__",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +53,9 @@ class Address(_Hashed):
     def __post_init__(self) -> None:
         check_vehicle(self.vehicle)
         _check_instance(self.topic, self.instance, required=get_topic(self.topic).instances is True)
-        object.__setattr__(self, "_hash", hash((self.vehicle, self.topic, self.instance)))
+        object.__setattr__(self, "__hash__", hash((self.vehicle, self.topic, self.instance)).__int__)
 
-    def __hash__(self) -> int:
-        return self._hash
+    __hash__ = _Hashed.__hash__  # type: ignore[misc] # the slot, because a dataclass would define a method
 
     def __reduce__(self) -> tuple[object, ...]:
         return Address, (self.vehicle, self.topic, self.instance)  # hashes differ between processes

@@ -75,6 +75,9 @@ class EventLog:
 
         `missing`: names of fields that were not provided. `lost`: messages lost before this one.
         """
+        vehicle = self.vehicles.get(address.vehicle)
+        if vehicle is not None and not lost and vehicle.skips(address, time):  # most messages; needs no lock
+            return
         with self._lock:
             if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
                 vehicle.add(address, message, time, missing, lost)

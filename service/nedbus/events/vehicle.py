@@ -34,6 +34,7 @@ _GROUPS: Final = (rules.POSITIONS, rules.EVIDENCE["GPS"])
 _EVIDENCE_OF: Final = {topic: name for name, topics in rules.EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = FieldReader(_SAMPLE)
+_NEW: Final = ChangeDetector((), (), lambda _, __: iter(()))  # in place of the detector of a new stream
 
 
 class Vehicle:
@@ -78,6 +79,12 @@ class Vehicle:
         self._supplies: dict[str, _Supply] = {}  # by key of EVIDENCE
         self._checked = self._resumed = 0  # time of the last position then, and after its last pause [us since boot]
         self._equal: dict[int, bool] = {}  # by EKF: whether its estimate equals the vehicle's
+
+    def skips(self, address: Address, time: float) -> bool:
+        """Note that a message without a loss before it has arrived; return whether `add` would do no more than that."""
+        self.last_seen = time
+        detector = self._detectors.get(address, _NEW)
+        return detector is None or time < detector.due
 
     def add(self, address: Address, message: object, time: float, missing: frozenset[str], lost: int) -> None:
         """Add a message; `lost`: number of messages lost before it."""

@@ -23,7 +23,7 @@ COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 _MAX_VEHICLES: Final = 100  # per link
 _TICK: Final = 0.05  # s, the longest wait of the thread
-_PAUSE: Final = 0.015  # s between two reads during a stream: several messages at once need less processor time
+_PAUSE: Final = 0.02  # s between two reads during a stream: several messages at once need less processor time
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
