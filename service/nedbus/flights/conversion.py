@@ -28,26 +28,28 @@ def convert(
     messages: Iterable[SourceMessage],
     path: Path,
     *,
+    source: str = "",
     boot_utc: int = 0,
     on_progress: Callable[[int], object],
 ) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
     The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `due`.
-    `boot_utc`: Unix time of the boot [us]. `on_progress`: called with the number of messages handled so far.
+    `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
+    `on_progress`: called with the number of messages handled so far.
 
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
     """
     check_recording(path)
     try:
         with atomic_write(path) as part:
-            return _write(messages, part, boot_utc=boot_utc, on_progress=on_progress)
+            return _write(messages, part, source=source, boot_utc=boot_utc, on_progress=on_progress)
     except OSError as exc:  # an OutputError names the temporary file
         raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
 
 
 def _write(
-    messages: Iterable[SourceMessage], path: Path, *, boot_utc: int, on_progress: Callable[[int], object]
+    messages: Iterable[SourceMessage], path: Path, *, source: str, boot_utc: int, on_progress: Callable[[int], object]
 ) -> str:
     pending: list[tuple[Message, Address, Provenance, int]] = []
     rejected, start = 0, None
@@ -60,12 +62,12 @@ def _write(
                 rejected += 1
                 if rejected <= _MAX_LOGGED:
                     reason = each.error or describe(exc, definition)
-                    extra = about("rejected", each.address, source=each.source, reason=reason)
+                    extra = about("rejected", each.address, source=source, reason=reason)
                     _log.warning("%s rejected: %s", each.address, reason, extra=extra)
                 continue
             if start is None:
                 start = min(message.timestamp * 1000, _MAX_START)
-            provenance = Provenance(each.source, definition.all_fields - message.model_fields_set)
+            provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
             pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
             if len(pending) == _CHUNK:
                 writer.write_messages(pending)
