@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,8 @@ def open_replay(text: str) -> ReplayRun:
 def convert_replay(text: str, path: Path) -> str:
     """Convert a replay source to a recording, as `nedbus convert` does; return its summary."""
     run = open_replay(text)
-    kind = text.partition(":")[0]
-    messages = (replace(each, source=each.source or kind) for each in run.messages)
-    return convert(messages, path, boot_utc=run.boot_utc, on_progress=lambda _: None)
+    source = text.partition(":")[0]
+    return convert(run.messages, path, source=source, boot_utc=run.boot_utc, on_progress=lambda _: None)
 
 
 def open_recording(path: str | Path, **options: Any) -> McapReader:

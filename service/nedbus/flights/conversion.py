@@ -28,13 +28,15 @@ def convert(
     messages: Iterable[SourceMessage],
     path: Path,
     *,
+    source: str = "",
     boot_utc: int = 0,
     on_progress: Callable[[int], object],
 ) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
     The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `due`.
-    `boot_utc`: Unix time of the boot [us]. `on_progress`: called with the number of messages handled so far.
+    `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
+    `on_progress`: called with the number of messages handled so far.
 
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written, SourceError
     if all messages are rejected.
@@ -42,7 +44,7 @@ def convert(
     check_recording(path)
     try:
         with atomic_write(path) as part, RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer:
-            rejected, reason = _write(messages, writer, on_progress=on_progress)
+            rejected, reason = _write(messages, writer, source=source, on_progress=on_progress)
             if rejected and not writer.messages:
                 raise SourceError(str(path), f"not written, because all {rejected} messages are rejected: {reason}")
     except OSError as exc:  # an OutputError names the temporary file
@@ -51,7 +53,7 @@ def convert(
 
 
 def _write(
-    messages: Iterable[SourceMessage], writer: RecordingWriter, *, on_progress: Callable[[int], object]
+    messages: Iterable[SourceMessage], writer: RecordingWriter, *, source: str, on_progress: Callable[[int], object]
 ) -> tuple[int, str]:
     """Write the valid messages; return the number of rejected ones, and the reason of the first."""
     pending: list[tuple[Message, Address, Provenance, int]] = []
@@ -65,12 +67,12 @@ def _write(
             if rejected <= _MAX_LOGGED:
                 reason = each.error or describe(exc, definition)
                 first_reason = first_reason or reason
-                extra = about("rejected", each.address, source=each.source, reason=reason)
+                extra = about("rejected", each.address, source=source, reason=reason)
                 _log.warning("%s rejected: %s", each.address, reason, extra=extra)
             continue
         if start is None:
             start = min(message.timestamp * 1000, _MAX_START)
-        provenance = Provenance(each.source, definition.all_fields - message.model_fields_set)
+        provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
         pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
         if len(pending) == _CHUNK:
             writer.write_messages(pending)

@@ -535,7 +535,7 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
     strange = [{"timestamp": 2**64 - 1}, {"timestamp": 2, "xy_valid": True}]
     messages = [SourceMessage(0.0, ADDRESS, each) for each in [{"timestamp": 1}] * 2998 + strange]
     run = ReplayRun(iter(messages), {}, None, "")
-    assert convert(run.messages, path, on_progress=done.append) == "2999 messages, 1 rejected"
+    assert convert(run.messages, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
     assert [each.timestamp for *_, each in read_independently(path)] == [1] * 2998 + [2**64 - 1]
     assert done == [1024, 2048]
 
