@@ -145,8 +145,9 @@ class FlowControl:
             self._acknowledged[True], self._due, self.check_at = published, published, published + _POLL_EVERY
             return
         if self._wait(published, self._window, read=True, timeout=_TRICKLE_PERIOD):
+            # While a request is open, no other is due: `_due` may have passed.
             next_poll = self._due if self._request is None else published + _POLL_EVERY
-            self.check_at = min(next_poll, self._due, self._acknowledged[True] + self._window)
+            self.check_at = min(next_poll, self._acknowledged[True] + self._window)
             return
         if not self._logged:
             _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow_reader"))
