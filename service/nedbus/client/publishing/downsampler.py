@@ -17,6 +17,7 @@ from nedbus.client.rate_gate import RATES, RateGate
 from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ANY, Address, Topic, get_topic
 
+from .group import Outgoing
 from .writer import Heartbeats, Writer
 
 _CHECK: Final = 0.005  # s between checks whether any downsampled stream of a vehicle has subscribers
@@ -73,7 +74,7 @@ class Downsampler:
         self._streams: list[_Stream] = []
         self.due = 0.0
 
-    def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
+    def put(self, message: Outgoing) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
         if self._address_listener is None:
             if not self.vehicle_listener.is_matched():
@@ -87,7 +88,7 @@ class Downsampler:
             self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES]
         for stream in self._streams:
             if is_matched or stream.writer is not None:
-                stream.put(now, payload, stamp, encoding)
+                stream.put(now, message)
 
     def close(self) -> None:
         """Undeclare all streams and listeners."""
@@ -107,7 +108,7 @@ class _Stream:
         self._rate, self._gate = rate, RateGate(rate)
         self._matched_at = 0
 
-    def put(self, now: int, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
+    def put(self, now: int, message: Outgoing) -> None:
         if self._listener.is_matched():
             self._matched_at = now
             if self.writer is None:
@@ -116,7 +117,7 @@ class _Stream:
             self.writer.close()
             self.writer = None
         if self.writer is not None and self._gate.passes(now):
-            self.writer.put(payload, stamp, encoding)  # if unmatched, this only fills the history cache
+            self.writer.put((message,))  # if unmatched, this only fills the history cache
 
     def close(self) -> None:
         if self.writer is not None:

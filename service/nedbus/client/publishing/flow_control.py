@@ -31,7 +31,8 @@ _RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have drop
 _QUERY_TIMEOUT: Final = 10.0  # s, timeout of each query, and the longest pause before a request is repeated
 _STALE_POLL: Final = 1.0  # s without a poll after which replies are too old to show which readers exist
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
-_POLL_EVERY: Final = 16  # messages between polls
+_POLL_EVERY: Final = 64  # messages between polls for replies
+_MATCH_EVERY: Final = 16  # messages between checks for the first subscriber
 _DROP: Final = CongestionControl.DROP  # blocking on a full queue could make Zenoh close the link
 _UNKNOWN: Final = ""  # a reader that has never replied
 
@@ -142,7 +143,7 @@ class FlowControl:
         Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
         """
         if self._listener and not self._listener.is_matched() and self._readers.is_empty and self._request is None:
-            self._acknowledged[True], self._due, self.check_at = published, published, published + _POLL_EVERY
+            self._acknowledged[True], self._due, self.check_at = published, published, published + _MATCH_EVERY
             return
         if self._wait(published, self._window, read=True, timeout=_TRICKLE_PERIOD):
             # While a request is open, no other is due: `_due` may have passed.

@@ -15,6 +15,7 @@ from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, enco
 
 from .downsampler import Downsampler, MatchingListener
 from .flow_control import CACHE, FlowControl
+from .group import MAX_GROUP, Group, Outgoing
 from .writer import Writer
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
     from .publisher_registry import PublisherRegistry
 
-_GROUP: Final = 64  # messages of `publish_many` between checks for forks and acknowledgements
 FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
@@ -51,7 +51,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         self.key = address.key(prefix=prefix)
         self.source = Provenance(source).source
         self.lossless = lossless
-        self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
+        self.last: Outgoing | None = None
         self._new_timestamp = heartbeats.session.new_timestamp
         self._registry, self._owner = registry, owner  # the owner keeps the bus open
         self.definition = definition
@@ -61,6 +61,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         topic = get_topic(address.topic)
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
+        self._group = Group(self._writer, self._put, heartbeats) if lossless else None
         self._listener: MatchingListener | None = None
         try:
             if lossless and not registry.is_client:
@@ -81,7 +82,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     @property
     def published(self) -> int:
         """The number of messages published."""
-        return self._writer.published
+        return self._writer.published if self._group is None else self._group.published
 
     @property
     def closed(self) -> bool:
@@ -138,11 +139,14 @@ class Publisher(AbstractContextManager["Publisher"]):
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
         each = [payloads[start : start + size] for start in range(0, len(payloads), size)]
+        if self._group is not None:
+            self._group.hand_over()
         sent = 0
         while sent < len(each):
-            room = self._flow_control.check_at - self.published if self.lossless else _GROUP
-            group = each[sent : sent + max(1, min(_GROUP, room))]
-            self._put(group, self._encoding)
+            room = self._flow_control.check_at - self._writer.published if self.lossless else MAX_GROUP
+            group = each[sent : sent + max(1, min(MAX_GROUP, room))]
+            self._put([(payload, self._new_timestamp(), self._encoding) for payload in group])
+            self._wait_for_credit()
             sent += len(group)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
@@ -153,7 +157,9 @@ class Publisher(AbstractContextManager["Publisher"]):
 
         Raises ClosedError once the bus is closed.
         """
-        return self._flow_control.wait_for_reception(self.published, timeout=timeout)
+        if self._group is not None:
+            self._group.hand_over()
+        return self._flow_control.wait_for_reception(self._writer.published, timeout=timeout)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Withdraw the address and free it for another publisher. Idempotent.
@@ -168,6 +174,9 @@ class Publisher(AbstractContextManager["Publisher"]):
                 with suppress(NedbusError):
                     self.flush(timeout)
         finally:
+            if self._group is not None:
+                with suppress(NedbusError):
+                    self._group.hand_over()
             self._writer.close()
             self._registry.forget(self.address)
             self._downsampler.close()
@@ -187,21 +196,27 @@ class Publisher(AbstractContextManager["Publisher"]):
             if provided is not known and provided != known:  # rare: usually the same fields are missing
                 self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
-        self._put((payload,), encoding)
+        message = payload, self._new_timestamp(), encoding
+        if (group := self._group) is None:
+            self._put((message,))
+        elif group.add(message):
+            group.hand_over()
+            self._wait_for_credit()
+            group.begin(self._flow_control.check_at - self._writer.published)
 
-    def _put(self, payloads: Sequence[bytes], encoding: str) -> None:
-        """Put one message, or several before the next of which flow control has to check, and wait for readers."""
+    def _put(self, messages: Sequence[Outgoing]) -> None:
+        """Put messages in order; the last one answers queries from now on."""
         require_unforked()
-        writer, downsampler, new_timestamp = self._writer, self._downsampler, self._new_timestamp
-        override = None if encoding is self._declared else encoding
+        writer, downsampler = self._writer, self._downsampler
         try:
-            for payload in payloads:
-                stamp = new_timestamp()
-                writer.put(payload, stamp, override)
-                self.last = payload, stamp, encoding
-                if writer.last_put >= downsampler.due or downsampler.vehicle_listener.matched:
-                    downsampler.put(payload, stamp, encoding)
+            writer.put(messages)
+            self.last = messages[-1]
+            if writer.last_put >= downsampler.due or downsampler.vehicle_listener.matched:
+                for message in messages:
+                    downsampler.put(message)
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc
-        if self.lossless and writer.published >= self._flow_control.check_at:
-            self._flow_control.wait_for_credit(writer.published)
+
+    def _wait_for_credit(self) -> None:
+        if self.lossless and self._writer.published >= self._flow_control.check_at:
+            self._flow_control.wait_for_credit(self._writer.published)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from time import monotonic
 from typing import Final
@@ -11,9 +12,11 @@ import zenoh
 from zenoh import Priority
 
 from nedbus.client.io_thread import TICK, Job
-from nedbus.errors import ClosedError
+from nedbus.errors import ClosedError, NedbusError
 from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payload, translate_zenoh_errors
 from nedbus_msgs import Topic
+
+from .group import MAX_HOLD, Group, Outgoing
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
 _TURN: Final = 256  # heartbeats per call; more would delay other jobs
@@ -32,7 +35,7 @@ class Writer:
         self.is_silent = True  # before the first message, and once a heartbeat has followed the last one
         self.silent_since, self.sent_heartbeats = 0.0, 0  # time of the last message [s], and heartbeats since then
         self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a check of `last_put` [s]
-        self._heartbeats = heartbeats
+        self._heartbeats, self._encoding = heartbeats, encoding
         with translate_zenoh_errors():
             self._publisher: zenoh.ext.AdvancedPublisher | None = zenoh.ext.declare_advanced_publisher(
                 self.session,
@@ -52,18 +55,23 @@ class Writer:
                 raise
         heartbeats.writers.add(self)
 
-    def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
-        """Put a payload without waiting for readers; `encoding` overrides the writer's."""
+    def put(self, messages: Sequence[Outgoing]) -> None:
+        """Put messages in order without waiting for readers; if that fails, `published` counts those that were put."""
         if (publisher := self._publisher) is None:
             raise ClosedError
-        if encoding is None:
-            publisher.put(payload, timestamp=stamp)
-        else:
-            publisher.put(payload, timestamp=stamp, encoding=encoding)
-        self.published += 1
-        self.last_put = monotonic()
-        if self.is_silent:
-            self._heartbeats.resume(self)
+        sent, declared = 0, self._encoding
+        try:
+            for payload, stamp, encoding in messages:
+                if encoding is declared:
+                    publisher.put(payload, timestamp=stamp)
+                else:
+                    publisher.put(payload, timestamp=stamp, encoding=encoding)
+                sent += 1
+        finally:
+            self.published += sent
+            self.last_put = monotonic()
+            if self.is_silent:
+                self._heartbeats.resume(self)
 
     @property
     def closed(self) -> bool:
@@ -80,11 +88,15 @@ class Writer:
 
 
 class Heartbeats:
-    """Send the heartbeats of all writers of a session; without readers they cause no traffic."""
+    """Send the heartbeats of all writers of a session, and hand over the groups that remain incomplete.
+
+    Without readers, heartbeats cause no traffic.
+    """
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self.writers: set[Writer] = set()
+        self._groups: set[Group] = set()  # changed by single atomic calls
         self._job: Job | None = None
 
     def resume(self, writer: Writer) -> None:
@@ -94,17 +106,37 @@ class Heartbeats:
             self._job = Job(self._run)
         self._job.wake(writer.heartbeat_due)
 
+    def watch(self, group: Group) -> None:
+        """Hand over the messages of a group within MAX_HOLD, now and later."""
+        group.is_watched = True
+        self._groups.add(group)
+        if self._job is not None:  # `resume` has created it for the first message
+            self._job.wake()
+
     def close(self) -> None:
-        """Stop all heartbeats. Idempotent."""
+        """Stop all heartbeats, and hand over all groups. Idempotent."""
+        self._hand_over(wait=True)
         self.writers.clear()
         if self._job is not None:
             self._job.end()
 
     def _run(self, now: float) -> float:
+        self._hand_over(wait=False)
         due = now + self.send_due(now)
         if self._job is not None and due < math.inf:  # without a job yet, `resume` wakes it
             self._job.wake(due)  # at the next tick; a returned pause would end at the tick before
-        return math.inf
+        return MAX_HOLD if self._groups else math.inf
+
+    def _hand_over(self, *, wait: bool) -> None:
+        for group in tuple(self._groups):
+            if not group:  # full speed has ended
+                self._groups.discard(group)
+                group.is_watched = False
+            if group:  # checked again: a message added before `is_watched` was reset
+                self._groups.add(group)
+                group.is_watched = True
+                with suppress(NedbusError):  # the session or the writer is closed
+                    group.hand_over(wait=wait)
 
     def send_due(self, now: float) -> float:
         """Send all heartbeats due at monotonic time `now` [s]; return the seconds until the next call."""
