@@ -40,7 +40,7 @@ _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
-_BUSY_PAUSE: Final = 0.001  # s
+_BUSY_PAUSE: Final = 0.0003  # s
 _MAX_DIGITS: Final = 10  # digits of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
 
