@@ -39,7 +39,7 @@ class MatchingListener:
                 self._probe.undeclare()
                 raise
         self.matched = False
-        self._lock = threading.Lock()  # all publishers of a vehicle share one listener
+        self._lock = threading.RLock()  # all publishers of a vehicle share one listener; reentrant for signal handlers
         self._try_recv = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:

@@ -42,7 +42,7 @@ class SharedWindow:
 
     def __init__(self) -> None:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key
-        self._lock = threading.Lock()  # publishers call `share` on their own threads
+        self._lock = threading.RLock()  # publishers call `share` on their own threads; a signal handler may close one
 
     def share(self, key: str, unread: int, *, now: float) -> int:
         """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
@@ -127,7 +127,7 @@ class FlowControl:
     ) -> None:
         self._writer, self._shared, self._needs_router, self._listener = writer, window, needs_router, listener
         self.cancelled = threading.Event()  # set to end a wait with ClosedError
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # reentrant, because a signal handler may publish or close
         self._readers = ReaderProxies()
         self._request: _Request | None = None
         self._next_request = self._polled = 0.0  # monotonic times [s]

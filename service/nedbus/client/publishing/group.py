@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import TYPE_CHECKING, Final
@@ -36,10 +35,11 @@ class Group:
 
     def __init__(self, writer: Writer, put: Callable[[Sequence[Outgoing]], object], heartbeats: Heartbeats) -> None:
         self._writer, self._put, self._heartbeats = writer, put, heartbeats
-        self._held: deque[Outgoing] = deque()  # each until it has been put
-        self._size = 1  # messages of a complete group
+        self._held: list[Outgoing] = []  # each until it has been put
+        self._left = 1  # messages until the group is complete
         self._successive, self._last = 0, 0.0  # messages since a pause; monotonic time of the last one [s]
         self._lock = threading.RLock()  # held while messages are put, so their order is kept
+        self._is_putting = False  # by the thread that holds the lock; True for a signal handler that interrupts it
         self.is_watched = False  # by `heartbeats`
 
     def __len__(self) -> int:
@@ -53,39 +53,45 @@ class Group:
 
     def add(self, message: Outgoing) -> bool:
         """Add a message; return True if the group is complete, else it is handed over within MAX_HOLD."""
-        now, held = monotonic(), self._held
+        now = monotonic()
         if now - self._last > _QUICK:
-            self._successive, self._size = 0, 1
+            self._successive, self._left = 0, 1
         self._last = now
-        held.append(message)
-        if len(held) >= self._size:
-            return True
-        if not self.is_watched:
-            self._heartbeats.watch(self)
-        return False
+        self._held.append(message)
+        self._successive += 1
+        self._left -= 1  # also if the last messages were handed over meanwhile: flow control must be asked in time
+        return self._left <= 0 or not (self.is_watched or self._heartbeats.watch(self))
 
     def begin(self, room: int) -> None:
         """Begin the next group, of up to `room` messages."""
-        self._successive += self._size
-        self._size = 1 if self._successive < _AT_ONCE else max(1, min(MAX_GROUP, room))
+        self._left = 1 if self._successive < _AT_ONCE else max(1, min(MAX_GROUP, room))
 
-    def hand_over(self, *, wait: bool = True) -> None:
-        """Put all messages. `wait`: also if another thread is doing so. They are discarded if the bus is closed.
+    def hand_over(self) -> None:
+        """Put all messages. They are discarded if the bus is closed. Raises the errors of `put`."""
+        with self._lock:
+            self._put_held()
 
-        Raises the errors of `put`.
-        """
-        if not self._lock.acquire(blocking=wait):
+    def try_hand_over(self) -> None:
+        """Put all messages, unless another thread is doing so; otherwise like `hand_over`."""
+        if self._lock.acquire(blocking=False):
+            try:
+                self._put_held()
+            finally:
+                self._lock.release()
+
+    def _put_held(self) -> None:
+        if self._is_putting:  # this is a signal handler; the interrupted call puts what it has added
             return
         try:
+            self._is_putting = True
             while self._held:
                 before = self._writer.published
                 try:
                     self._put(tuple(self._held))
-                finally:  # Ctrl-C may interrupt it
-                    for _ in range(self._writer.published - before):
-                        self._held.popleft()
+                finally:  # Ctrl-C may have interrupted it; Python handles no signal between here and the deletion
+                    del self._held[: self._writer.published - before]
         except NedbusError:
             self._held.clear()
             raise
         finally:
-            self._lock.release()
+            self._is_putting = False

@@ -62,16 +62,20 @@ class Writer:
         sent, declared = 0, self._encoding
         try:
             for payload, stamp, encoding in messages:
+                sent += 1  # before the put, after which Ctrl-C may be raised
                 if encoding is declared:
                     publisher.put(payload, timestamp=stamp)
                 else:
                     publisher.put(payload, timestamp=stamp, encoding=encoding)
-                sent += 1
+        except zenoh.ZError:
+            sent -= 1
+            raise
         finally:
             self.published += sent
-            self.last_put = monotonic()
-            if self.is_silent:
-                self._heartbeats.resume(self)
+            if sent:
+                self.last_put = monotonic()
+                if self.is_silent:
+                    self._heartbeats.resume(self)
 
     @property
     def closed(self) -> bool:
@@ -98,6 +102,7 @@ class Heartbeats:
         self.writers: set[Writer] = set()
         self._groups: set[Group] = set()  # changed by single atomic calls
         self._job: Job | None = None
+        self._closed = False
 
     def resume(self, writer: Writer) -> None:
         """Schedule the heartbeat of a writer that has put a message after a silence."""
@@ -106,28 +111,36 @@ class Heartbeats:
             self._job = Job(self._run)
         self._job.wake(writer.heartbeat_due)
 
-    def watch(self, group: Group) -> None:
-        """Hand over the messages of a group within MAX_HOLD, now and later."""
+    def watch(self, group: Group) -> bool:
+        """Hand over the messages of a group within MAX_HOLD, now and later; return False once closed."""
         group.is_watched = True
         self._groups.add(group)
         if self._job is not None:  # `resume` has created it for the first message
             self._job.wake()
+        if self._closed:  # checked last: `close` handles the groups added before it is set
+            group.is_watched = False
+        return not self._closed
 
     def close(self) -> None:
-        """Stop all heartbeats, and hand over all groups. Idempotent."""
-        self._hand_over(wait=True)
-        self.writers.clear()
+        """Stop all heartbeats, and hand over all groups: now, and from now on after each message. Idempotent."""
+        self._closed = True
         if self._job is not None:
             self._job.end()
+        for group in tuple(self._groups):
+            group.is_watched = False
+            with suppress(NedbusError):  # the session or the writer is closed
+                group.hand_over()
+        self._groups.clear()
+        self.writers.clear()
 
     def _run(self, now: float) -> float:
-        self._hand_over(wait=False)
+        self._hand_over()
         due = now + self.send_due(now)
         if self._job is not None and due < math.inf:  # without a job yet, `resume` wakes it
             self._job.wake(due)  # at the next tick; a returned pause would end at the tick before
         return MAX_HOLD if self._groups else math.inf
 
-    def _hand_over(self, *, wait: bool) -> None:
+    def _hand_over(self) -> None:
         for group in tuple(self._groups):
             if not group:  # full speed has ended
                 self._groups.discard(group)
@@ -136,7 +149,7 @@ class Heartbeats:
                 self._groups.add(group)
                 group.is_watched = True
                 with suppress(NedbusError):  # the session or the writer is closed
-                    group.hand_over(wait=wait)
+                    group.try_hand_over()
 
     def send_due(self, now: float) -> float:
         """Send all heartbeats due at monotonic time `now` [s]; return the seconds until the next call."""

@@ -29,8 +29,9 @@ class Clock:
         self.writer = SimpleNamespace(published=0)
         self.group = Group(cast("Writer", self.writer), self.put, cast("Heartbeats", SimpleNamespace(watch=self.watch)))
 
-    def watch(self, watched: Group) -> None:
+    def watch(self, watched: Group) -> bool:
         watched.is_watched = True
+        return True
 
     def put(self, messages: Sequence[Outgoing]) -> None:
         self.sizes.append(len(messages))
@@ -76,6 +77,60 @@ def test_group_ends_where_flow_control_is_due(clock: Clock, room: int, size: int
     """A group has no more messages than flow control allows until it is due, but at least one."""
     clock.publish(16 + 2 * size, pause=QUICK, room=room)
     assert clock.sizes[16:] == [size] * 2
+
+
+def test_group_is_complete_though_its_messages_were_handed_over(clock: Clock) -> None:
+    """Flow control is asked after 64 messages even if the I/O thread hands over each group before it is complete."""
+    clock.publish(16, pause=QUICK)
+    complete = list[bool]()
+    for number in range(MAX_GROUP):
+        clock.now += QUICK
+        complete.append(clock.group.add(cast("Outgoing", (str(number).encode(), None, ""))))
+        if number % 10 == 9:
+            clock.group.try_hand_over()
+    assert complete == [False] * (MAX_GROUP - 1) + [True]
+
+
+def test_signal_handler_leaves_the_interrupted_group_to_its_thread(clock: Clock) -> None:
+    """A handler that publishes or closes while messages are put adds none twice, and the order is kept."""
+    clock.publish(16 + 10, pause=QUICK)
+    put = clock.group._put
+
+    def interrupt(messages: Sequence[Outgoing]) -> None:
+        if len(clock.group) == 10:
+            clock.publish(1, pause=1.0)  # at once, as in a handler
+            clock.group.hand_over()
+        put(messages)
+
+    clock.group._put = interrupt
+    clock.group.hand_over()
+    assert clock.numbers == list(range(27))
+    assert clock.group.published == 27
+
+
+def test_flush_waits_for_the_thread_that_is_putting(clock: Clock) -> None:
+    """`hand_over` returns after all messages have been put, also those that another thread is putting."""
+    clock.publish(16 + 10, pause=QUICK)
+    put, began, may_end = clock.group._put, threading.Event(), threading.Event()
+
+    def wait(messages: Sequence[Outgoing]) -> None:
+        began.set()
+        assert may_end.wait(DEADLINE)
+        put(messages)
+
+    clock.group._put = wait
+    calls = clock.group.try_hand_over, clock.group.hand_over
+    threads = [threading.Thread(target=call, daemon=True) for call in calls]
+    threads[0].start()
+    assert began.wait(DEADLINE)
+    clock.group.try_hand_over()  # does not wait
+    threads[1].start()
+    threads[1].join(0.05)
+    assert threads[1].is_alive()
+    may_end.set()
+    for thread in threads:
+        thread.join(DEADLINE)
+    assert clock.numbers == list(range(26))
 
 
 def test_messages_that_cannot_be_put_do_not_count_as_published(clock: Clock) -> None:
@@ -173,6 +228,54 @@ def test_closing_hands_over_what_is_held_back(
         close = {"publisher": lambda: publisher.close(0.0), "bus": lambda: other.close(0.0)}
         close.get(closing, publisher.flush)()
         assert receive_timestamps(subscription, 30) == list(range(1, 31))
+
+
+def test_ctrl_c_in_zenoh_repeats_no_message(
+    bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A Ctrl-C that arrives while Zenoh takes a message is raised after it: the message counts, and is put once."""
+    writer = cast("Any", publisher)._writer
+    zenoh_put = writer._publisher.put
+    with bus.subscribe(VLP, vehicle="1", mode="every") as subscription:
+        wait_for_subscriber(publisher)
+        publish(publisher, 1, 30)
+
+        def put(*arguments: object, **options: object) -> None:
+            monkeypatch.undo()
+            zenoh_put(*arguments, **options)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(writer, "_publisher", SimpleNamespace(put=put))
+        with pytest.raises(KeyboardInterrupt):
+            publish(publisher, 31, MAX_GROUP)
+        published = publisher.published
+        assert publisher.flush(DEADLINE)
+        assert publisher.published == published
+        assert receive_timestamps(subscription, published) == list(range(1, published + 1))
+        assert subscription.counts == nedbus.Counts(received=published)
+
+
+def test_signal_handler_may_flush_while_flow_control_is_asked(publisher: nedbus.Publisher) -> None:
+    """A signal handler that flushes or closes a publisher does not wait for a lock of the call that it interrupts."""
+    publish(publisher, 1, 30)
+
+    def flush() -> None:
+        with cast("Any", publisher)._flow_control._lock:
+            publisher.flush(0.0)
+
+    handler = threading.Thread(target=flush, daemon=True)
+    handler.start()
+    handler.join(DEADLINE)
+    assert not handler.is_alive()
+
+
+def test_publish_raises_at_once_after_the_bus_is_closed(publisher: nedbus.Publisher, bus: nedbus.Bus) -> None:
+    """Once another thread has closed the bus, the next message raises, however quickly it follows the last one."""
+    publish(publisher, 1, 30)
+    bus.close(0.0)
+    with pytest.raises(nedbus.ClosedError):
+        publish(publisher, 31, 1)
+    assert publisher.published == 30
 
 
 def test_idle_publisher_costs_no_polls(publisher: nedbus.Publisher) -> None:
