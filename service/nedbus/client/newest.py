@@ -64,7 +64,7 @@ class _View:
 
 @dataclass(slots=True, eq=False)
 class NewestMessage(Generic[M_co]):
-    """The newest message of a stream; the object follows its stream.
+    """The newest message of a stream; `view[address]` returns one, which follows its stream.
 
     `sample`: the message with its metadata.
     """
@@ -311,7 +311,7 @@ class Newest(_NewestBase):
 
 
 class AsyncNewest(_NewestBase):
-    """The asyncio version of Newest: `await update()`, `await close()`; it opens on first use."""
+    """The asyncio version of Newest; `bus.newest(...)` returns one, which opens on first use."""
 
     def __init__(
         self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox, topics: Iterable[str], *, owner: Bus
