@@ -41,7 +41,6 @@ if TYPE_CHECKING:
         AsyncSubscription,
         Bus,
         Newest,
-        NewestMessage,
         Publisher,
         Subscription,
         connect,
@@ -93,7 +92,6 @@ __all__ = [
     "Mode",
     "NedbusError",
     "Newest",
-    "NewestMessage",
     "NoDataError",
     "Provenance",
     "Publisher",
@@ -128,8 +126,8 @@ __all__ = [
 # By module; a module is imported on first use of one of its names: those for files load no Zenoh, and few load NumPy.
 _MODULES = {
     "nedbus.samples": "Batch Counts Mode Sample",
-    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest NewestMessage Publisher"
-    " Subscription connect connect_async",
+    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest Publisher Subscription connect"
+    " connect_async",
     "nedbus.flights": "Flight FlightSamples UtcOffset open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.transport": "Session Tls",

@@ -1,10 +1,11 @@
-"""Stream health, and the status types that a bus returns: services, publishers, vehicles, events, rejections."""
+"""The newest message and health of a stream, and status types: services, publishers, vehicles, events, rejections."""
 
 from .client import (
     Health,
     Histogram,
     LogStreamStatus,
     Monitor,
+    NewestMessage,
     Publishers,
     RejectionReport,
     Rejections,
@@ -17,7 +18,7 @@ from .client import (
 from .events import AccountReport, Condition, Event, VehicleReport
 
 __all__ = [
-    "AccountReport", "Condition", "Event", "Health", "Histogram", "LogStreamStatus", "Monitor", "Publishers",
-    "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamStatus", "VehicleReport",
-    "Vehicles",
+    "AccountReport", "Condition", "Event", "Health", "Histogram", "LogStreamStatus", "Monitor", "NewestMessage",
+    "Publishers", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamStatus",
+    "VehicleReport", "Vehicles",
 ]  # fmt: skip

@@ -67,8 +67,8 @@ def subscribe_by_class_and_topic(bus: nedbus.Bus, any_topic: str) -> None:
     bus.on_link(3)  # type: ignore[arg-type] # not a function
     view = bus.newest(nedbus.VehicleAttitude, any_topic, vehicle=7)
     assert_type(view[nedbus.VehicleAttitude].message.q, tuple[float, float, float, float])
-    assert_type(view.get(nedbus.SensorGps), nedbus.NewestMessage[nedbus.SensorGps] | None)
-    assert_type(view[any_topic], nedbus.NewestMessage[nedbus.Message])
+    assert_type(view.get(nedbus.SensorGps), nedbus.health.NewestMessage[nedbus.SensorGps] | None)
+    assert_type(view[any_topic], nedbus.health.NewestMessage[nedbus.Message])
     assert_type([each.alive for each in view.update(0.1)], list[bool])
     assert_type(bus.subscribe(any_topic).receive().message.timestamp, int)
     bus.subscribe(any_topic).receive().message.x  # type: ignore[attr-defined] # unknown message type
@@ -113,7 +113,7 @@ async def read_and_publish() -> None:
             assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
         assert_type(bus.subscribe(max_rate=0.5), nedbus.AsyncSubscription)
         assert_type(bus.newest("*"), nedbus.AsyncNewest)
-        assert_type(await bus.newest().update(), list[nedbus.NewestMessage[nedbus.Message]])
+        assert_type(await bus.newest().update(), list[nedbus.health.NewestMessage[nedbus.Message]])
         async for attitude in bus.subscribe(nedbus.VehicleAttitude):
             assert_type(attitude.message.q, tuple[float, float, float, float])
             attitude.message.x  # type: ignore[attr-defined] # VehicleAttitude has no x

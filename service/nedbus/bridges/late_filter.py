@@ -10,6 +10,7 @@ from nedbus_msgs import Address
 DRIFT: Final = 60 * 10**9
 """Nanoseconds for which the fastest sample is the reference; limited, because the two clocks drift apart."""
 
+_MAX_CLOCKS: Final = 10_000  # addresses with a clock; beyond that the oldest is forgotten
 _STALLED: Final = 1000  # ns; timestamps closer together come from a stalled clock
 
 
@@ -33,6 +34,8 @@ class LateFilter:
         if not sample.retained:
             session = str(stamp.get_id())  # a restarted publisher may have another clock
             if self._clocks.get(address, ("",))[0] != session:
+                if len(self._clocks) >= _MAX_CLOCKS:
+                    self.forget(next(iter(self._clocks)))
                 self._clocks[address] = session, _PublisherClock(sent, arrived)
             late = self._clocks[address][1].lateness(sent, arrived)
             if late <= self._limit:

@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 
 _MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; longer than the 20 s of loss recovery
 _MAX_UNSUPPORTED: Final = 1000  # addresses that are logged as unsupported
+_MAX_HELD: Final = 10_000  # held messages; beyond that the oldest is dropped
 _REFUSALS: Final = {
     "conflict": "%s is not published to ROS 2, because %s already uses the topic /%s: set --namespace",
     "defer": "%s is not published to ROS 2, because node %s already publishes /%s",
@@ -144,7 +145,14 @@ class Ros2Bridge:
             if sample.address in self._arbiter.published:
                 self._put(sample)
             elif not has_rate and sample.topic in self._types:
-                self._held[sample.address] = sample
+                self._hold(sample)
+
+    def _hold(self, sample: Sample[Any]) -> None:
+        if len(self._held) >= _MAX_HELD and sample.address not in self._held:
+            address = next(iter(self._held))
+            _log.debug("%s: dropped a message that waits for its ROS 2 topic", address)
+            del self._held[address]
+        self._held[sample.address] = sample
 
     def _poll(self) -> None:
         """Report late samples, query the bus and the ROS 2 nodes, and apply the decisions."""

@@ -9,10 +9,9 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, ItemsView, Iterable, Iterator, Mapping, ValuesView
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar, overload
 
 from nedbus import clock
@@ -64,7 +63,7 @@ class _View:
 
 @dataclass(slots=True, eq=False)
 class NewestMessage(Generic[M_co]):
-    """The newest message of a stream; the object follows its stream.
+    """The newest message of a stream; `view[address]` returns one, which follows its stream.
 
     `sample`: the message with its metadata.
     """
@@ -186,8 +185,8 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
         """Return the health of each measured stream, by address, now or at `now` [ns] of the clock used in `add`."""
-        streams = sorted(self.items(), key=itemgetter(0))
-        return {address: each._measured.snapshot(now) for address, each in streams if each._measured}
+        streams = self._copy()
+        return {each: health.snapshot(now) for each in sorted(streams) if (health := streams[each]._measured)}
 
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latency histogram of a stream since the start [s]; None if it is not measured."""
@@ -275,7 +274,7 @@ class _NewestBase(Monitor):
         return [stream for sample in arrived if (stream := self._add(sample)).updated]
 
 
-class Newest(_NewestBase):
+class Newest(_NewestBase, AbstractContextManager["Newest"]):
     """View of the newest message of each stream; `bus.newest(...)` returns one. Read it after each `update`.
 
     It needs no thread unless `update` has a timeout. Call `update` from one thread; any thread may read the messages.
@@ -303,15 +302,12 @@ class Newest(_NewestBase):
         """Close the view; its messages remain. A second call does nothing."""
         self._subscription.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         self.close()
 
 
 class AsyncNewest(_NewestBase):
-    """The asyncio version of Newest: `await update()`, `await close()`; it opens on first use."""
+    """The asyncio version of Newest; `bus.newest(...)` returns one, which opens on first use."""
 
     def __init__(
         self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox, topics: Iterable[str], *, owner: Bus

@@ -36,6 +36,8 @@ class VehicleDirectory:
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._addresses: dict[str, Address] = {}  # by token key
+        self._known = Publishers()  # the last list
+        self._known.complete = False
         self._tokens: LivelinessTokens | FleetTokens | None = None
         self._logged = False
 
@@ -53,28 +55,41 @@ class VehicleDirectory:
                 tokens.undeclare()
 
     def publishers(self, *, timeout: float) -> Publishers:
-        """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete."""
+        """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete.
+
+        The first call connects. If another thread is listing for longer, its last list is returned.
+        """
         end = time.monotonic() + timeout
-        with self._lock:
-            if self._tokens is None and not self._closed.is_set():
-                with suppress(ConnectError):  # try again on the next call
-                    self._tokens = self._follow()
-            while self._tokens is not None:
-                for key, alive in self._tokens.poll():
-                    if not alive:
-                        self._addresses.pop(key, None)
-                        continue
-                    try:
-                        self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
-                    except AddressError:
-                        _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
-                if not self._tokens.is_listing or time.monotonic() >= end or self._closed.wait(0.002):
-                    break
-            publishers = Publishers(self._addresses.values())
-            publishers.complete = self._tokens is not None and self._tokens.complete
-            is_listing = self._tokens is None or self._tokens.is_listing
-            if is_listing and timeout and not self._logged:
-                text = "the router listed only %d stream%s within %g s; it may be slow, or forbid listing others"
-                _log.warning(text, len(publishers), "s" * (len(publishers) != 1), timeout, extra=about("incomplete"))
-            self._logged = is_listing and (self._logged or timeout > 0)
-            return publishers
+        if self._lock.acquire(timeout=min(max(0.0, timeout), threading.TIMEOUT_MAX)):
+            try:
+                self._known = self._list(timeout, end)
+            finally:
+                self._lock.release()
+        known = self._known
+        publishers = Publishers(known)
+        publishers.complete = known.complete
+        return publishers
+
+    def _list(self, timeout: float, end: float) -> Publishers:
+        if self._tokens is None and not self._closed.is_set():
+            with suppress(ConnectError):  # try again on the next call
+                self._tokens = self._follow()
+        while self._tokens is not None:
+            for key, alive in self._tokens.poll():
+                if not alive:
+                    self._addresses.pop(key, None)
+                    continue
+                try:
+                    self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
+                except AddressError:
+                    _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
+            if not self._tokens.is_listing or time.monotonic() >= end or self._closed.wait(0.002):
+                break
+        publishers = Publishers(self._addresses.values())
+        publishers.complete = self._tokens is not None and self._tokens.complete
+        is_listing = self._tokens is None or self._tokens.is_listing
+        if is_listing and timeout and not self._logged:
+            text = "the router listed only %d stream%s within %g s; it may be slow, or forbid listing others"
+            _log.warning(text, len(publishers), "s" * (len(publishers) != 1), timeout, extra=about("incomplete"))
+        self._logged = is_listing and (self._logged or timeout > 0)
+        return publishers

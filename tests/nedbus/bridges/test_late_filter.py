@@ -118,3 +118,13 @@ def test_report_names_one_address_and_counts_the_others() -> None:
     for name in "abc":
         assert not late.admits(sample(NOW, address=Address(name, ONE.topic), retained=True), arrived=0)
     assert late.report() == "held back 3 old messages of a/vehicle_local_position and 2 more"
+
+
+def test_number_of_clocks_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the limit the oldest clock is forgotten, so a late sample of its address counts as current."""
+    monkeypatch.setattr("nedbus.bridges.late_filter._MAX_CLOCKS", 2)
+    late, addresses = LateFilter(), [Address(str(number), ONE.topic) for number in range(3)]
+    assert all(late.admits(sample(NOW, address=each), arrived=0) for each in addresses)
+    assert len(late._clocks) == 2
+    assert not late.admits(sample(NOW + SECOND, address=addresses[1]), arrived=60 * SECOND)
+    assert late.admits(sample(NOW + SECOND, address=addresses[0]), arrived=60 * SECOND)

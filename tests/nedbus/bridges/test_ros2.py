@@ -227,6 +227,19 @@ def test_first_home_position_of_a_new_vehicle_is_bridged(
     assert "wheel_encoders" not in caplog.text
 
 
+def test_number_of_held_messages_is_bounded(
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beyond the limit the oldest held message is dropped; a newer one of the same stream replaces it."""
+    monkeypatch.setattr("nedbus.bridges.ros2._MAX_HELD", 2)
+    bridge = Ros2Bridge(bus, zenoh_session)
+    for timestamp, vehicle in enumerate("1223"):
+        home = nedbus.HomePosition(timestamp=timestamp)
+        bridge._hold(nedbus.Sample(home, Address(vehicle, "home_position"), received=0))
+    held = {address.vehicle: each.message.timestamp for address, each in bridge._held.items()}
+    assert held == {"2": 2, "3": 3}
+
+
 def test_retained_message_is_not_bridged(
     run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -220,11 +220,14 @@ class Inbox:
                 stream, lost = arrival.stream, arrival.lost
                 if stream.unreported:
                     lost, stream.unreported = lost + stream.unreported, 0
-                self._counters.received += 1  # here, to lock only once per sample
+                if arrival.codec is not None:
+                    self._counters.received += 1  # here, to lock only once per sample
             if self._ack_requests:
                 self.acknowledge(drained=False)
-            if arrival.codec is None:
+            if arrival.codec is None:  # counted after the wait for its definition
                 [arrival] = self.decoder.define([arrival])
+                with self._lock:
+                    self._counters.received += 1
             sample = self.decoder.decode(arrival, rows, lost)
             if sample is not None:
                 return sample

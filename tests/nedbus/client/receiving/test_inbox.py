@@ -30,7 +30,7 @@ from nedbus_msgs import Codec, Definition, codec_of
 from nedbus_msgs import encoding_of as provenance_encoding
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.local_position import encode, encoding_of
-from tests.waits import DEADLINE
+from tests.waits import DEADLINE, wait_for
 
 from .raw_samples import (
     INVALID,
@@ -572,8 +572,9 @@ def test_definition_is_requested_again_for_another_publisher() -> None:
         assert len(queried) == count
 
 
-def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -> None:
-    """While `pop_batch` waits for a definition, arriving samples are queued without delay."""
+@pytest.mark.parametrize("form", ["sample", "batch"])
+def test_samples_are_queued_while_a_reader_waits_for_a_lookup(timings: Timings, form: str) -> None:
+    """While a reader waits for a definition, arriving samples are queued without delay, and its own does not count."""
     timings.definition_timeout = DEADLINE
     queried, answered = threading.Event(), threading.Event()
 
@@ -584,9 +585,11 @@ def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -
 
     inbox = Inbox("every", Decoder(LayoutLookup(find), prefix="nedbus"))
     inbox.put([undefined()])
-    reader = threading.Thread(target=inbox.pop_batch)
+    reader = threading.Thread(target=inbox.pop if form == "sample" else inbox.pop_batch)
     reader.start()
     assert queried.wait(DEADLINE)
+    wait_for(lambda: inbox.waiting == 0, what="the reader")
+    assert inbox.counts == Counts()
     inbox.put([raw(0)])
     assert not answered.is_set()
     assert reader.is_alive()
