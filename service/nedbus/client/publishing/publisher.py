@@ -61,7 +61,9 @@ class Publisher(AbstractContextManager["Publisher"]):
         topic = get_topic(address.topic)
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
-        self._group = Group(self._writer, self._put, heartbeats) if lossless else None
+        # Not beside a router in this process: its session hands messages over without waking a thread.
+        groups = lossless and registry.is_client
+        self._group = Group(self._writer, self._put, heartbeats) if groups else None
         self._listener: MatchingListener | None = None
         try:
             if lossless and not registry.is_client:
@@ -199,6 +201,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         message = payload, self._new_timestamp(), encoding
         if (group := self._group) is None:
             self._put((message,))
+            self._wait_for_credit()
         elif group.add(message):
             group.hand_over()
             self._wait_for_credit()
