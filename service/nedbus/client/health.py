@@ -123,17 +123,6 @@ class _Window:
         squares += sum([(interval - own) ** 2 for interval in intervals]) + (own - mean) ** 2 * number * added / total
         self.intervals = total, mean + (own - mean) * added / total, squares
 
-    @property
-    def mean(self) -> float:
-        """Mean interval [s]; 0 without intervals."""
-        return self.intervals[1]
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the intervals [s]."""
-        number, _, squares = self.intervals
-        return math.sqrt(squares / number)
-
 
 class Histogram:
     """Histogram of measurements; `limits` are the upper bounds of all buckets but the last, which is unbounded.
@@ -234,7 +223,8 @@ class StreamHealth:
     def _begin_window(self, received: int) -> None:
         if self._window.messages:
             self._last_window = self._window
-        if (mean := self._window.mean) > 0:  # capped against bursts, such as recovered messages
+        _, mean, _ = self._window.intervals
+        if mean > 0:  # capped against bursts, such as recovered messages
             usual = self._usual_rate or 1 / mean
             self._usual_rate = usual + _SMOOTHING * (min(1 / mean, 2 * usual) - usual)
         self._window = _Window(received)
@@ -273,12 +263,12 @@ class StreamHealth:
         now = time.monotonic_ns() if now is None else now
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
-        latencies, mean = sorted(window.latencies), window.mean
+        latencies, (number, mean, squares) = sorted(window.latencies), window.intervals
         is_live = mean > 0 and age is not None and age < max(TIMINGS.stale, 2 * mean)
         return Health(
             rate=1 / mean if is_live else None,
             nominal=self._topic.rate,
-            jitter=window.deviation if is_live else None,
+            jitter=math.sqrt(squares / number) if is_live else None,
             latency=latencies[len(latencies) // 2] if latencies else None,
             latency_max=latencies[-1] if latencies else None,
             age=age,
