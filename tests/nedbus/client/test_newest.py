@@ -261,7 +261,7 @@ def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: n
 
 
 def test_invalid_arguments_raise_at_once(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Neither opens a view; a topic that nobody publishes has no message, and does not delay the others."""
+    """An invalid name or class opens no view; a topic without a publisher has no message and delays no other."""
     for wrong in ("two words", 3):
         with pytest.raises(AddressError):
             client.newest(wrong)  # type: ignore[arg-type] # neither a class nor a topic

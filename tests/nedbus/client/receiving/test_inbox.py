@@ -525,7 +525,7 @@ class LateLookup(LayoutLookup):
 
 
 @pytest.mark.parametrize("rows", [False, True])
-def test_message_whose_definition_nobody_sends_is_invalid(rows: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_message_without_an_available_definition_is_invalid(rows: bool, caplog: pytest.LogCaptureFixture) -> None:
     """A reader skips a message of an unknown definition; it counts as invalid, and the log has the reason."""
     inbox = make_queue("every")
     put(inbox, [undefined(number=0), raw(0)])
