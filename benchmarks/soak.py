@@ -73,7 +73,7 @@ from nedbus_msgs import Selection
 session, ring = open_client([sys.argv[1]], timeout=10.0), zenoh.handlers.RingChannel(16384)
 history = zenoh.ext.HistoryConfig(max_samples=1)
 subscriber = zenoh.ext.declare_advanced_subscriber(session, "nedbus/**", ring, history=history)
-alive = session.liveliness().declare_subscriber(Selection().alive_key_expr(prefix="nedbus"), ring, history=True)
+alive = session.liveliness().declare_subscriber(Selection().alive_key_exprs(prefix="nedbus")[0], ring, history=True)
 print("ready", flush=True)
 while subscriber.handler.recv():
     pass

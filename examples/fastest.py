@@ -1,6 +1,7 @@
 """Print the highest speed of each vehicle: of live vehicles, or of files given as arguments."""
 
 import math
+import signal
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
@@ -18,6 +19,7 @@ def show_highest_speeds(samples: Iterable[nedbus.Sample]) -> None:
             print(f"{sample.vehicle}: {speed:.1f} m/s", flush=True)
 
 
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt):
         if files := sys.argv[1:]:

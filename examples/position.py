@@ -1,7 +1,9 @@
+import signal
 from contextlib import suppress
 
 import nedbus
 
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus:
         for sample in bus.subscribe():  # vehicle_local_position of all vehicles, by default

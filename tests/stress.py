@@ -137,7 +137,9 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
         actions: dict[str, Callable[[], object]] = {
             "closed": open_and_close,
             "put": put,
-            "vehicles": lambda: token_keys(bus._session, Selection().alive_key_expr(prefix=bus.prefix), timeout=1.0),
+            "vehicles": lambda: token_keys(
+                bus._session, Selection().alive_key_exprs(prefix=bus.prefix)[0], timeout=1.0
+            ),
             "followed": lambda: (bus.vehicles(timeout=1.0), stop.wait(0.01)),
             "latest": lambda: bus.latest(timeout=1.0),
             "subscribed": receive_some,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
-from typing import Final, cast
+from typing import Final, TypeAlias, cast
 
 from .errors import AddressError
 from .model.declaration import Topic
@@ -15,6 +16,9 @@ from .model.message import Message
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"
+VehicleNames: TypeAlias = str | int | Sequence[str | int]
+"""One vehicle or several, each by name or by number; "*" matches any."""
+
 RATE: Final = "/@rate/"
 """Separator between the key of a stream and its downsampled rate [messages per second]."""
 REJECTED: Final = "/@rejected"
@@ -100,46 +104,92 @@ class Address(_Hashed):
         return f"{self.vehicle}/{self.stream}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Selection:
-    """The addresses with this topic, vehicle and instance; "*" and None match any.
+    """The addresses with one of these topics, one of these vehicles, and this instance; "*" and None match any.
 
-    Raises AddressError for a vehicle, topic or instance that no address can have.
+    `topic`, `vehicle`: one name or several; a vehicle may be a number, such as a MAVLink system id. "*" includes all
+    others, and a name counts once. `topics`, `vehicles`: the names that remain.
+
+    Raises AddressError for a vehicle, topic or instance that no address can have, and for an empty list of names.
     """
 
-    topic: str = ANY
-    vehicle: str = ANY
-    instance: int | None = None
+    topics: tuple[str, ...]
+    vehicles: tuple[str, ...]
+    instance: int | None
 
-    def __post_init__(self) -> None:
-        if self.vehicle != ANY:
-            check_vehicle(self.vehicle)
-        if self.topic != ANY:
-            get_topic(self.topic)
-            _check_instance(self.topic, self.instance)
-        elif self.instance is not None:
-            raise AddressError("instance", self.instance, "none without a topic")
+    def __init__(
+        self, topic: str | Sequence[str] = ANY, vehicle: VehicleNames = ANY, instance: int | None = None
+    ) -> None:
+        topics = _distinct("topic", topic)
+        vehicles = _distinct("vehicle", vehicle)
+        object.__setattr__(self, "topics", topics)
+        object.__setattr__(self, "vehicles", vehicles)
+        object.__setattr__(self, "instance", instance)
+        if vehicles != (ANY,):
+            for name in vehicles:
+                check_vehicle(name)
+        if topics != (ANY,):
+            for name in topics:
+                get_topic(name)
+                _check_instance(name, instance)
+        elif instance is not None:
+            raise AddressError("instance", instance, "none without a topic")
 
     def matches(self, address: Address) -> bool:
         """Return whether an address is selected."""
-        is_match = self.topic in (ANY, address.topic) and self.vehicle in (ANY, address.vehicle)
-        return is_match and self.instance in (None, address.instance)
+        return (
+            (self.topics == (ANY,) or address.topic in self.topics)
+            and self.matches_vehicle(address.vehicle)
+            and self.instance in (None, address.instance)
+        )
 
-    def key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the Zenoh key expression that matches the keys of these addresses."""
-        if self.topic == ANY:
-            return f"{prefix}/{self.vehicle}/**"
-        any_instance = {True: f"/{ANY}", False: "", None: "/**"}[get_topic(self.topic).instances]
-        instance = any_instance if self.instance is None else f"/{self.instance}"
-        return f"{prefix}/{self.vehicle}/{self.topic}{instance}"
+    def matches_vehicle(self, vehicle: str) -> bool:
+        """Return whether a vehicle is selected."""
+        return self.vehicles == (ANY,) or vehicle in self.vehicles
 
-    def alive_key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression that matches the liveliness tokens of these addresses."""
-        return f"{prefix}/{self.vehicle}/@alive/*/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
+    def key_exprs(self, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
+        """Return the Zenoh key expressions that match the keys of these addresses: one per vehicle and topic."""
+        streams = self._streams
+        return [f"{prefix}/{vehicle}/{stream}" for vehicle in self.vehicles for stream in streams]
 
-    def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of these streams downsampled to `rate` messages/s; "*" matches any rate."""
-        return f"{self.key_expr(prefix=prefix)}{RATE}{rate}"
+    def alive_key_exprs(self, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
+        """Return the key expressions that match the liveliness tokens of these addresses."""
+        streams = self._streams
+        return [f"{prefix}/{vehicle}/@alive/*/{stream}" for vehicle in self.vehicles for stream in streams]
+
+    def rate_key_exprs(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
+        """Return the key expressions of these streams downsampled to `rate` messages/s; "*" matches any rate."""
+        return [f"{key}{RATE}{rate}" for key in self.key_exprs(prefix=prefix)]
+
+    @property
+    def _streams(self) -> list[str]:
+        """The part of a key expression after the vehicle, for each topic."""
+        if self.topics == (ANY,):
+            return ["**"]
+        any_instance = {True: f"/{ANY}", False: "", None: "/**"}
+        if self.instance is None:
+            return [f"{topic}{any_instance[get_topic(topic).instances]}" for topic in self.topics]
+        return [f"{topic}/{self.instance}" for topic in self.topics]
+
+    def __str__(self) -> str:
+        parts = []
+        if self.vehicles != (ANY,):
+            parts.append(f"vehicle {' or '.join(self.vehicles)}")
+        if self.topics != (ANY,):
+            parts.append(" or ".join(self.topics))
+        if self.instance is not None:
+            parts.append(f"instance {self.instance}")
+        return ", ".join(parts) or "all streams"
+
+
+def _distinct(what: str, given: object) -> tuple[str, ...]:
+    """Return the distinct names in one name or several, only "*" if it is among them; the caller checks them."""
+    several = given if isinstance(given, Iterable) and not isinstance(given, str) else [given]
+    names = tuple(dict.fromkeys(map(vehicle_name, several)))
+    if not names:
+        raise AddressError(what, given, f'at least one {what}, or "*" for all')
+    return (ANY,) if ANY in names else names
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -172,7 +222,7 @@ def get_topic(name: object) -> Topic:
     Raises AddressError for a name that is not lower_snake_case, or looks like a misspelling of a built-in topic.
     """
     if not isinstance(name, str):
-        raise AddressError("topic", name, 'one topic name (call once per topic), or "*" for all')
+        raise AddressError("topic", name, 'a topic name, or "*" for all')
     return TOPICS.get(name) or _other_topic(name)
 
 
@@ -243,7 +293,7 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 def check_vehicle(vehicle: object) -> str:
     """Return a valid vehicle name; raise AddressError for any other."""
     if not isinstance(vehicle, str):
-        raise AddressError("vehicle", vehicle, 'one name, such as "7" (call once per vehicle), or "*" for all')
+        raise AddressError("vehicle", vehicle, 'a name, such as "7", a list of names, or "*" for all')
     if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _MAX_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_MAX_LENGTH} of A-Z a-z 0-9 _ -")
     return vehicle

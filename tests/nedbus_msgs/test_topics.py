@@ -55,12 +55,12 @@ def test_keys_match_the_documentation() -> None:
     assert estimator.key(prefix="fleet/a") == "fleet/a/7/estimator_local_position/2"
     assert estimator.alive_key("1a") == "nedbus/7/@alive/1a/estimator_local_position/2"
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
-    assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
-    assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
+    assert Selection("estimator_local_position", instance=1).key_exprs()[0] == "nedbus/*/estimator_local_position/1"
+    assert Selection("estimator_local_position", vehicle="7").key_exprs()[0] == "nedbus/7/estimator_local_position/*"
     assert schema_key("VehicleLocalPosition") == "nedbus/@schema/*/VehicleLocalPosition"
     assert schema_key("VehicleStatus", vehicle="7", prefix="a/b") == "a/b/@schema/7/VehicleStatus"
     assert status_key("a-1") == "nedbus/@service/a-1/status"
-    assert ack_key(Selection("vehicle_local_position").key_expr()) == "nedbus/*/vehicle_local_position/@ack"
+    assert ack_key(Selection("vehicle_local_position").key_exprs()[0]) == "nedbus/*/vehicle_local_position/@ack"
 
 
 def test_selection_of_an_unknown_topic_matches_all_instances() -> None:
@@ -68,7 +68,7 @@ def test_selection_of_an_unknown_topic_matches_all_instances() -> None:
     alone, second = Address("7", "wheel_encoders"), Address("7", "wheel_encoders", 1)
     assert (alone.key(), second.key()) == ("nedbus/7/wheel_encoders", "nedbus/7/wheel_encoders/1")
     selection = Selection("wheel_encoders")
-    key_expr = zenoh.KeyExpr(selection.key_expr())
+    key_expr = zenoh.KeyExpr(selection.key_exprs()[0])
     for address in (alone, second):
         assert Address.from_key(address.key()) == address
         assert selection.matches(address)
@@ -109,7 +109,7 @@ def selections(draw: st.DrawFn, near: Address) -> Selection:
 def test_selection_matches_what_its_key_expression_includes(address: Address, prefix: str, data: st.DataObject) -> None:
     """A selection matches exactly the addresses whose keys are included in its key expression, as Zenoh decides."""
     selection = data.draw(selections(address))
-    key_expr = zenoh.KeyExpr(selection.key_expr(prefix=prefix))
+    key_expr = zenoh.KeyExpr(selection.key_exprs(prefix=prefix)[0])
     assert selection.matches(address) == key_expr.includes(address.key(prefix=prefix))
     acknowledgements = zenoh.KeyExpr(ack_key(str(key_expr)))
     assert acknowledgements.includes(ack_key(address.key(prefix=prefix))) == selection.matches(address)
@@ -118,8 +118,8 @@ def test_selection_matches_what_its_key_expression_includes(address: Address, pr
 @given(addresses(), PREFIXES)
 def test_selection_excludes_tokens_rejections_and_acknowledgements(address: Address, prefix: str) -> None:
     """A subscription to all messages does not receive liveliness tokens, rejections or acknowledgements."""
-    assert zenoh.KeyExpr(Selection().alive_key_expr(prefix=prefix)).includes(address.alive_key("1a", prefix=prefix))
-    key_expr = zenoh.KeyExpr(Selection().key_expr(prefix=prefix))
+    assert zenoh.KeyExpr(Selection().alive_key_exprs(prefix=prefix)[0]).includes(address.alive_key("1a", prefix=prefix))
+    key_expr = zenoh.KeyExpr(Selection().key_exprs(prefix=prefix)[0])
     assert not key_expr.intersects(address.alive_key("1a", prefix=prefix))
     assert not key_expr.intersects(address.rejected_key(prefix=prefix))
     assert not key_expr.intersects(ack_key(address.key(prefix=prefix)))

@@ -69,7 +69,7 @@ class FoxgloveServer:
     def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
         """Serve the selected addresses, by default all, until `stop` is set; raise ClosedError if the bus is closed."""
         of = selection or Selection()
-        with self._bus.newest(of.topic, vehicle=of.vehicle, instance=of.instance) as self._newest:
+        with self._bus.newest(*of.topics, vehicle=of.vehicles, instance=of.instance) as self._newest:
             next_poll = time.monotonic() + TIMINGS.bridge_poll
             while not stop.is_set():
                 if time.monotonic() >= next_poll:

@@ -108,7 +108,12 @@ class Ros2Bridge:
         try:
             if self._observer is not None:
                 self._require_visible(self._observer, key, stop)
-            with self._bus.subscribe_to(self._selection, mode="every") as subscription:
+            with self._bus.subscribe(
+                *self._selection.topics,
+                vehicle=self._selection.vehicles,
+                instance=self._selection.instance,
+                mode="every",
+            ) as subscription:
                 self._forward(subscription, stop)
         finally:
             for address in list(self._publishers):

@@ -11,6 +11,7 @@ from nedbus import __version__
 from .options import command
 from .output.logs import LogFormat, LogLevel, log_to_stderr
 from .output.streams import write
+from .parsing import Command, Group
 
 _COMMANDS: Final[Mapping[str, str]] = {
     "serve": "serve", "router": "serve", "list": "query", "echo": "echo", "hz": "hz", "get": "query", "info": "query",
@@ -25,6 +26,7 @@ def make_app(arguments: Sequence[str] = ()) -> typer.Typer:
     """Return the application; import only the commands in `arguments`, or all if there are none."""
     app = typer.Typer(
         name="nedbus",
+        cls=Group,
         help="PX4's messages, validated, on every host of a Zenoh network.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -36,9 +38,11 @@ def make_app(arguments: Sequence[str] = ()) -> typer.Typer:
         if name in given:
             function = getattr(commands := import_module(f"{__package__}.commands.{module}"), name, None)
             if isinstance(function, typer.Typer):
-                app.add_typer(function, name=name)
+                for each in function.registered_commands:
+                    each.cls = Command
+                app.add_typer(function, name=name, cls=Group)
             else:
-                app.command(name)(function or getattr(commands, f"{name}_"))
+                app.command(name, cls=Command)(function or getattr(commands, f"{name}_"))
     return app
 
 

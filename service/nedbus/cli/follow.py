@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import ClosedError, NoDataError
@@ -19,8 +20,8 @@ _log = logging.getLogger("nedbus")
 
 def follow(
     bus: Bus,
-    subscription: Subscription,
-    handle: Callable[[Sample], bool | None],
+    subscription: Subscription[Any],
+    handle: Callable[[Sample[Any]], bool | None],
     *,
     count: int | None,
     duration: float | None,
@@ -68,6 +69,6 @@ def follow(
     each_second()
 
 
-def write_notice(subscription: Subscription) -> None:
+def write_notice(subscription: Subscription[Any]) -> None:
     """Notify the user on stderr that a subscription has not received a message yet."""
     write_stderr(f"no message on {subscription.name} yet, still waiting; 'nedbus list' shows the published streams")

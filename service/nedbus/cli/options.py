@@ -6,10 +6,10 @@ import itertools
 import logging
 import re
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 
@@ -32,18 +32,20 @@ _log = logging.getLogger("nedbus")
 _ROUTER: Final = f"Router to connect to; repeatable (default: {DEFAULT_ENDPOINT})"
 _ADDRESS: Final = "TOPIC, or VEHICLE/TOPIC/INSTANCE as printed by nedbus list"
 _FILES: Final = "Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"
-_TOPIC: Final = f'Topic, "*" for all (default: {DEFAULT_TOPIC} for echo and get, else all)'
+_TOPIC: Final = f'Topic, "*" for all; repeatable (default: {DEFAULT_TOPIC} for echo and get, else all)'
+_TOPICS: Final = "Topic; repeatable (default: all)"
+_VEHICLES: Final = "Vehicle; repeatable (default: all)"
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: ./nedbus.toml)")]
 ConnectOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ROUTER)]
 PrefixOption = Annotated[str | None, typer.Option(help=f"Key prefix (default: {DEFAULT_PREFIX})")]
 TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="CA certificate for tls/ routers, PEM")]
 TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="Client certificate, PEM")]
 TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of the client certificate, PEM")]
-TopicArgument = Annotated[str | None, typer.Argument(metavar="TOPIC", help=_ADDRESS, show_default=False)]
+TopicsArgument = Annotated[list[str] | None, typer.Argument(metavar="TOPIC", help=_ADDRESS, show_default=False)]
 FilesArgument = Annotated[list[Path] | None, typer.Argument(metavar="FILE", help=_FILES)]
-TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
-DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]
-VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
+TopicsOption = Annotated[list[str] | None, typer.Option("--topic", "-t", metavar="TOPIC", help=_TOPICS)]
+DefaultTopicsOption = Annotated[list[str] | None, typer.Option("--topic", "-t", metavar="TOPIC", help=_TOPIC)]
+VehiclesOption = Annotated[list[str] | None, typer.Option("--vehicle", "-v", metavar="VEHICLE", help=_VEHICLES)]
 InstanceOption = Annotated[int | None, typer.Option("--instance", "-i", help="Instance of the topic (default: all)")]
 FieldOption = Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Fields to show: x,y,z")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Write JSON")]
@@ -73,7 +75,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             for name, factory in factories.items():
                 make = functools.partial(factory, **{each.name: values.pop(each.name) for each in expanded[name]})
                 if name == "selection":
-                    values[name] = make(default=parameters[name].default.topic)
+                    values[name] = make(default=parameters[name].default.topics)
                 else:
                     values[name] = stack.enter_context(make()) if name == "bus" else make
             function(**values)
@@ -152,24 +154,49 @@ def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> AbstractC
 
 
 def _select(
-    topic: TopicArgument = None,
+    topics: TopicsArgument = None,
     *,
-    topic_option: DefaultTopicOption = None,
-    vehicle: VehicleOption = ANY,
+    topic_option: DefaultTopicsOption = None,
+    vehicle: VehiclesOption = None,
     instance: InstanceOption = None,
-    default: str,
+    default: Sequence[str],
 ) -> Selection:
-    """Return the selection of the options, or of an argument [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints it."""
-    if topic is None:
-        return Selection(default if topic_option is None else topic_option, vehicle, instance)
-    if topic_option is not None:
-        raise ConfigError("--topic", f"the argument already names the topic {topic!r}: remove one of the two")
-    chunks = topic.strip("/").split("/")
+    """Return the selection of the options, or of arguments [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints them.
+
+    Raises ConfigError for arguments of different vehicles or instances.
+    """
+    if not topics:
+        return Selection(topic_option or default, vehicle or ANY, instance)
+    if topic_option:
+        raise ConfigError("--topic", f"the argument already names the topic {topics[0]!r}: remove one of the two")
+    streams = [_split_stream(text) for text in topics]
+    first = streams[0]
+    for text, stream in zip(topics, streams, strict=True):
+        if (stream.vehicle, stream.instance) != (first.vehicle, first.instance):
+            reason = f"{topics[0]!r} and {text!r} differ in vehicle or instance: name them with --vehicle and --topic"
+            raise ConfigError("TOPIC", reason)
+    chosen = vehicle or ANY if first.vehicle is None else first.vehicle
+    return Selection(
+        [stream.topic for stream in streams], chosen, instance if first.instance is None else first.instance
+    )
+
+
+class _Stream(NamedTuple):
+    """A stream as an argument; None for the parts that it does not name."""
+
+    topic: str
+    vehicle: str | None
+    instance: int | None
+
+
+def _split_stream(text: str) -> _Stream:
+    chunks = text.strip("/").split("/")
+    vehicle = instance = None
     if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1 and chunks[1] not in ("in", "out"):
         vehicle = chunks.pop(0)
     if len(chunks) == 2 and chunks[1].isdecimal():
         instance = int(chunks.pop())
-    return Selection("/".join(chunks), vehicle, instance)
+    return _Stream("/".join(chunks), vehicle, instance)
 
 
 _FACTORIES: Final[Mapping[str, Callable[..., Any]]] = {
@@ -187,10 +214,11 @@ def allow_one(flags: Mapping[str, bool]) -> None:
 def parse_fields(text: str | None, selection: Selection) -> list[str]:
     """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
-    known = list(MESSAGES.values()) if selection.topic == ANY else [BY_TOPIC.get(selection.topic)]
+    topics = selection.topics
+    known = list(MESSAGES.values()) if topics == (ANY,) else [BY_TOPIC.get(topic) for topic in topics]
     for name in names:
-        first = known[0]  # None for an undeclared message, which may have any field
-        if first is not None and not any(each and name in each.types for each in known):
+        first = known[0]
+        if first is not None and None not in known and not any(each and name in each.types for each in known):
             raise ConfigError("--field", first.explain_unknown_field(name))
     return names
 

@@ -16,7 +16,7 @@ from nedbus.errors import ClosedError
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, Definition, Message, Selection
+from nedbus_msgs import ANY, Definition, Message, Selection, VehicleNames
 
 from .bus import Bus, require_callable, select
 from .newest import AsyncNewest
@@ -96,34 +96,31 @@ class AsyncBus:
     def subscribe(self, *messages: type[Message] | str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
-        return Bus.subscribe(cast("Bus", self), *message, **options)  # uses only `subscribe_to` of `self`
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # uses only `_subscribe` of `self`
 
-    def subscribe_to(
-        self, *selections: Selection, mode: Mode = "latest", max_rate: float | None = None, limit: int | None = None
+    def _subscribe(
+        self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None
     ) -> AsyncSubscription[Any]:
-        """Subscribe to selections of addresses; see `subscribe`."""
         bus = self._blocking
-        inbox = bus._make_inbox(selections, mode, max_rate, limit)
+        inbox = bus._make_inbox(selection, mode, max_rate, limit)
         return AsyncSubscription(partial(self._in_thread, bus._open_receiver, inbox), inbox)
 
     def newest(
         self,
         *messages: type[Message] | str,
-        vehicle: str | int = ANY,
+        vehicle: VehicleNames = ANY,
         instance: int | None = None,
         max_rate: float | None = None,
     ) -> AsyncNewest:
         """Return a view of the newest message of each stream; see `Bus.newest`. It opens on first use."""
-        bus, selections = self._blocking, select(messages, vehicle, instance)
-        inbox = bus._make_inbox(selections, "latest", max_rate, None)
+        bus, selection = self._blocking, select(messages, vehicle, instance)
+        inbox = bus._make_inbox(selection, "latest", max_rate, None)
 
         def open_receiver() -> Receiver:
             bus.publishers(timeout=0.0)  # connects for the list of publishers, which would block the event loop
             return bus._open_receiver(inbox)
 
-        return AsyncNewest(
-            partial(self._in_thread, open_receiver), inbox, (each.topic for each in selections), owner=bus
-        )
+        return AsyncNewest(partial(self._in_thread, open_receiver), inbox, selection.topics, owner=bus)
 
     def on_link(self, call: Callable[[bool], object]) -> None:
         """Call a function in the running event loop when the link to the router is lost or up; see `Bus.on_link`."""
@@ -132,10 +129,14 @@ class AsyncBus:
 
     @overload
     async def latest(
-        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Query]
+        self, message: type[M_co] = ..., /, *, topic: str = ..., **options: Unpack[Query]
     ) -> list[Sample[M_co]]: ...
     @overload
-    async def latest(self, message: str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
+    async def latest(
+        self, message: type[M_co], other: type[M2], /, **options: Unpack[Query]
+    ) -> list[Sample[M_co | M2]]: ...
+    @overload
+    async def latest(self, *messages: type[Message] | str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
     async def latest(self, *message: Any, **options: Any) -> Any:
         """Query the last sample of each key; see `Bus.latest`."""
         return await self._in_thread(self._blocking.latest, *message, **options)

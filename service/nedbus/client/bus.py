@@ -22,7 +22,17 @@ from nedbus.transport import (
     require_unforked,
     token_keys,
 )
-from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
+from nedbus_msgs import (
+    ANY,
+    Address,
+    Definition,
+    Message,
+    Selection,
+    VehicleLocalPosition,
+    VehicleNames,
+    topic_of,
+    vehicle_name,
+)
 
 from .closing import Finalizer
 from .discovery import Rejections, ServiceStatus, Vehicles, find_reports, find_services
@@ -38,8 +48,9 @@ from .subscription import Subscription
 class Bus(AbstractContextManager["Bus"]):
     """A connection to a router, from `connect`.
 
-    Topics are selected by message class or name, vehicles by name (7 means "7"), instances by number. "*" matches any
-    topic or vehicle, None any instance. The default is VehicleLocalPosition on vehicle_local_position.
+    Topics are selected by message class or name, one or several; vehicles by name (7 means "7") or a list of names;
+    instances by number. "*" matches any topic or vehicle, None any instance. The default is VehicleLocalPosition on
+    vehicle_local_position.
     Thread-safe. Methods raise AddressError for an invalid name, and ClosedError once the bus is closed.
     """
 
@@ -52,7 +63,7 @@ class Bus(AbstractContextManager["Bus"]):
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
         self._reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
-        self._directory = VehicleDirectory.of_fleet(self._reopen, prefix=prefix)
+        self._directory = VehicleDirectory.of_fleet(self._reopen, Selection(), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         self._links: list[LinkWatch] = []
@@ -92,7 +103,7 @@ class Bus(AbstractContextManager["Bus"]):
         self,
         *messages: type[Message] | str,
         topic: str | None = None,
-        vehicle: str | int = ANY,
+        vehicle: VehicleNames = ANY,
         instance: int | None = None,
         mode: Mode = "latest",
         max_rate: float | None = None,
@@ -102,6 +113,7 @@ class Bus(AbstractContextManager["Bus"]):
 
         `messages`: message classes such as VehicleAttitude, for typed samples of their first topic or, with one class,
         of `topic`, such as "estimator_attitude"; or names of topics; or "*" for all topics.
+        `vehicle`: one or several; each pair of a vehicle and a topic is a subscription of Zenoh.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which caches
         about 20 s of messages.
@@ -115,22 +127,18 @@ class Bus(AbstractContextManager["Bus"]):
         Raises ArgumentError for an invalid `mode` or `limit`, if `max_rate` is not a finite number above 0, and for
         `topic` with several messages.
         """
-        if topic is not None and len(messages) > 1:
-            raise ArgumentError("topic", topic, "None with several messages: pass the names of the topics instead")
-        selections = select(messages, vehicle, instance, topic)
-        return self.subscribe_to(*selections, mode=mode, max_rate=max_rate, limit=limit)
+        return self._subscribe(select(messages, vehicle, instance, topic), mode, max_rate, limit)
 
-    def subscribe_to(
-        self, *selections: Selection, mode: Mode = "latest", max_rate: float | None = None, limit: int | None = None
+    def _subscribe(
+        self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None
     ) -> Subscription[Any]:
-        """Subscribe to selections of addresses; see `subscribe`."""
-        inbox = self._make_inbox(selections, mode, max_rate, limit)
+        inbox = self._make_inbox(selection, mode, max_rate, limit)
         return Subscription(self._open_receiver(inbox), inbox, owner=self)
 
     def newest(
         self,
         *messages: type[Message] | str,
-        vehicle: str | int = ANY,
+        vehicle: VehicleNames = ANY,
         instance: int | None = None,
         max_rate: float | None = None,
     ) -> Newest:
@@ -140,34 +148,37 @@ class Bus(AbstractContextManager["Bus"]):
         it is `updated` and its stream `alive`. It starts with the last message of each stream.
         Arguments and errors as in `subscribe`.
         """
-        selections = select(messages, vehicle, instance)
-        inbox = self._make_inbox(selections, "latest", max_rate, None)
-        return Newest(self._open_receiver(inbox), inbox, (each.topic for each in selections), owner=self)
+        selection = select(messages, vehicle, instance)
+        inbox = self._make_inbox(selection, "latest", max_rate, None)
+        return Newest(self._open_receiver(inbox), inbox, selection.topics, owner=self)
 
     @overload
     def latest(
-        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Query]
+        self, message: type[M_co] = ..., /, *, topic: str = ..., **options: Unpack[Query]
     ) -> list[Sample[M_co]]: ...
     @overload
-    def latest(self, message: str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
+    def latest(self, message: type[M_co], other: type[M2], /, **options: Unpack[Query]) -> list[Sample[M_co | M2]]: ...
+    @overload
+    def latest(self, *messages: type[Message] | str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
     def latest(
         self,
-        message: type[Message] | str = VehicleLocalPosition,
-        *,
+        *messages: type[Message] | str,
         topic: str | None = None,
-        vehicle: str | int = ANY,
+        vehicle: VehicleNames = ANY,
         instance: int | None = None,
         timeout: float = 2.0,
     ) -> list[Sample[Any]]:
-        """Query the last sample of each key, sorted by address; `latency` is a sample's age. Topics as in `subscribe`.
+        """Query the last sample of each key, sorted by address; `latency` is a sample's age.
+
+        Topics and vehicles as in `subscribe`.
 
         Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and omitted.
         Beyond 10,000 replies or 64 MB, the vehicles that use most of these limits lose samples first.
         A sample from a storage has `stored` set; it is returned only if the publisher does not reply.
         """
-        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        key_expr, start = selection.key_expr(prefix=self.prefix), f"{self.prefix}/"
-        answers = query(self._session, key_expr, timeout=timeout, group_of=partial(_vehicle_of, start))
+        key_exprs = select(messages, vehicle, instance, topic).key_exprs(prefix=self.prefix)
+        group_of = partial(_vehicle_of, f"{self.prefix}/")
+        answers = query(self._session, *key_exprs, timeout=timeout, group_of=group_of)
         samples = list(Decoder(self._layouts, prefix=self.prefix).read(answers))
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
         newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
@@ -286,17 +297,13 @@ class Bus(AbstractContextManager["Bus"]):
         if self.closed:
             raise ClosedError
 
-    def _make_inbox(
-        self, selections: Sequence[Selection], mode: Mode, max_rate: float | None, limit: int | None
-    ) -> Inbox:
+    def _make_inbox(self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None) -> Inbox:
         """Return the inbox of a new subscription; also used by AsyncBus."""
         self._require_open()
         decoder = Decoder(self._layouts, prefix=self.prefix)
-        everything = [each for each in selections if each.topic == ANY]  # includes the other topics
-        wanted = everything[:1] if len({each.vehicle for each in selections}) == 1 and everything else selections
         if max_rate is None:
-            return Inbox(mode, decoder, key_exprs=[each.key_expr(prefix=self.prefix) for each in wanted], limit=limit)
-        return MaxRateInbox(mode, decoder, wanted, max_rate=max_rate, limit=limit)
+            return Inbox(mode, decoder, key_exprs=selection.key_exprs(prefix=self.prefix), limit=limit)
+        return MaxRateInbox(mode, decoder, selection, max_rate=max_rate, limit=limit)
 
     def _open_receiver(self, inbox: Inbox) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
@@ -340,11 +347,13 @@ def require_callable(call: object) -> None:
 
 
 def select(
-    messages: Sequence[type[Message] | str], vehicle: str | int, instance: int | None, topic: str | None = None
-) -> list[Selection]:
-    """Return the selections of the arguments of `subscribe`."""
+    messages: Sequence[type[Message] | str], vehicle: VehicleNames, instance: int | None, topic: str | None = None
+) -> Selection:
+    """Return the selection of the arguments of `subscribe`; raise ArgumentError for `topic` with several messages."""
+    if topic is not None and len(messages) > 1:
+        raise ArgumentError("topic", topic, "None with several messages: pass the names of the topics instead")
     topics = [topic_of(message, topic) for message in messages or (VehicleLocalPosition,)]
-    return [Selection(each, vehicle_name(vehicle), instance) for each in dict.fromkeys(topics)]
+    return Selection(topics, vehicle, instance)
 
 
 def _vehicle_of(start: str, key: str) -> str:

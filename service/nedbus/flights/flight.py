@@ -24,6 +24,7 @@ from nedbus_msgs import (
     Provenance,
     Selection,
     VehicleLocalPosition,
+    VehicleNames,
     codec_of,
     is_unix_time,
     topic_of,
@@ -45,7 +46,7 @@ _ALL: Final = ReadOptions(topics=None)
 class Select(TypedDict, total=False):
     """Options of the call of a flight."""
 
-    vehicle: str | int
+    vehicle: VehicleNames
     instance: int | None
     start: float | datetime
     end: float | datetime | None
@@ -100,7 +101,7 @@ class Flight(AbstractContextManager["Flight"]):
         message: type[Message] | str = VehicleLocalPosition,
         *more: type[Message] | str,
         topic: str | None = None,
-        vehicle: str | int = ANY,
+        vehicle: VehicleNames = ANY,
         instance: int | None = None,
         start: float | datetime = 0.0,
         end: float | datetime | None = None,
@@ -117,12 +118,11 @@ class Flight(AbstractContextManager["Flight"]):
         name. Iterating raises SourceError if a file has none of these topics.
         """
         names = [topic_of(message, topic), *(topic_of(each) for each in more)]
-        vehicle = vehicle_name(vehicle)
-        chosen = self._vehicle if vehicle == ANY else vehicle
-        selections = [Selection(name, chosen, instance) for name in names]
-        topics = None if ANY in names else {each.topic for each in selections}
+        chosen: VehicleNames = self._vehicle if Selection(vehicle=vehicle).vehicles == (ANY,) else vehicle
+        selection = Selection(names, chosen, instance)
+        topics = None if selection.topics == (ANY,) else set(selection.topics)
         period = self._seconds(start, "start"), None if end is None else self._seconds(end, "end")
-        return FlightSamples(self._open(topics), selections, period, rows=rows)
+        return FlightSamples(self._open(topics), selection, period, rows=rows)
 
     @property
     def addresses(self) -> list[Address]:
@@ -201,13 +201,13 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
     """
 
     def __init__(
-        self, flights: MergedFlights, selections: Sequence[Selection], period: tuple[float, float | None], *, rows: bool
+        self, flights: MergedFlights, selection: Selection, period: tuple[float, float | None], *, rows: bool
     ) -> None:
-        self._flights, self._selections, self._rows = flights, selections, rows
+        self._flights, self._selection, self._rows = flights, selection, rows
         self._start, self._end = period
         self.skipped: Counter[Address] = Counter()
         self._reasons: dict[Address, str] = {}
-        self._matches = lru_cache(10_000)(lambda address: any(each.matches(address) for each in selections))
+        self._matches = lru_cache(10_000)(selection.matches)
         self._messages = self._select()
 
     @property
@@ -280,7 +280,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         if not is_found:
             files = flights.files
             where = files[0].path if len(files) == 1 else f"any of the {len(files)} files"
-            matching(where, sorted(flights.definitions), self._selections[0])  # raises an AddressError
+            matching(where, sorted(flights.definitions), self._selection)  # raises an AddressError
 
 
 @lru_cache(1024)

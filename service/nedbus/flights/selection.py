@@ -36,12 +36,15 @@ def _topics_of(name: str) -> Set[str]:
 
 def matching(where: Path | str, addresses: Sequence[Address], selection: Selection) -> list[Address]:
     """Return the selected addresses of a flight; raise AddressError if there are none."""
-    topic, vehicle = selection.topic, selection.vehicle
-    steps = {"vehicle": Selection(vehicle=vehicle), "topic": Selection(topic, vehicle), "instance": selection}
-    for part, step in steps.items():
+    topics, vehicles = selection.topics, selection.vehicles
+    steps: list[tuple[str, object, Selection]] = [
+        ("vehicle", " or ".join(vehicles), Selection(vehicle=vehicles)),
+        ("topic", " or ".join(topics), Selection(topics, vehicles)),
+        ("instance", selection.instance, selection),
+    ]
+    for part, value, step in steps:
         if not any(map(step.matches, addresses)):
-            expected = f"one of {_list(addresses)}"
-            raise AddressError(part, getattr(selection, part), expected, problem=f"is not in {where}")
+            raise AddressError(part, value, f"one of {_list(addresses)}", problem=f"is not in {where}")
     return list(filter(selection.matches, addresses))
 
 
@@ -56,7 +59,12 @@ def single_match(path: Path, addresses: Sequence[Address], selection: Selection)
     lacking = [part for part in ("topic", "vehicle", "instance") if len({getattr(each, part) for each in found}) > 1]
     if lacking:
         problem = f"one stream of {path}, but several match; set {' and '.join(lacking)} to one of {_list(found)}"
-        raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
+        given = {
+            "topic": " or ".join(selection.topics),
+            "vehicle": " or ".join(selection.vehicles),
+            "instance": selection.instance,
+        }
+        raise AddressError(lacking[0], given[lacking[0]], problem)
     return found
 
 

@@ -45,7 +45,9 @@ class Observer:
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
         self.event_log = EventLog()
-        self.subscription = bus.subscribe_to(selection, mode="every")
+        self.subscription = bus.subscribe(
+            *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode="every"
+        )
         self._bus, self._selection = bus, selection
         self.monitor = Monitor()
         self._rejections = bus.rejections()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Generic, Literal, TypedDict
 
 from typing_extensions import TypeVar
 
-from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition
+from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition, VehicleNames
 
 if TYPE_CHECKING:
     import zenoh
@@ -22,7 +22,7 @@ M3 = TypeVar("M3", bound=Message)
 class Query(TypedDict, total=False):
     """Options of `latest`."""
 
-    vehicle: str | int
+    vehicle: VehicleNames
     instance: int | None
     timeout: float
 
@@ -30,7 +30,7 @@ class Query(TypedDict, total=False):
 class Subscribe(TypedDict, total=False):
     """Options of `subscribe`."""
 
-    vehicle: str | int
+    vehicle: VehicleNames
     instance: int | None
     mode: Mode
     max_rate: float | None

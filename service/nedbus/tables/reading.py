@@ -174,7 +174,7 @@ class Positions(FlightSet):
     def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
         topics, is_single = DEFAULT.topics.keys(), len(paths) == 1
         options = ReadOptions(topics if is_single else topics | _UTC_TOPICS)
-        selects = Selection(selection.topic, instance=selection.instance).matches  # the set may rename a vehicle
+        selects = Selection(selection.topics, instance=selection.instance).matches  # the set may rename a vehicle
         super().__init__(
             [FlightArrays(path, options, selects) for path in require_files(paths)], unix_times=not is_single
         )
@@ -198,7 +198,7 @@ def _read_one(
     except (AddressError, SourceError):
         _explain_absent(path, options, selections, select)
         raise
-    require_one_vehicle(path, chosen, selections[0].vehicle)
+    require_one_vehicle(path, chosen, selections[0].vehicles[0])
     streams = {address.stream: flight.read(address) for address in chosen}
     _log_warnings(flight)
     found = flight.utc(next(iter(chosen)).vehicle) if utc else None

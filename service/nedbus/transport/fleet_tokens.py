@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Callable, Set
 from contextlib import suppress
 from functools import partial
-from itertools import chain
 from typing import Final
 
 from nedbus.errors import NedbusError
@@ -36,14 +35,14 @@ _QUERY_TIMEOUT: Final = 60.0  # s
 
 
 class FleetTokens:
-    """Like LivelinessTokens, for selections, on a separate session; excludes vehicles with over 1,000 tokens.
+    """Like LivelinessTokens, for a selection, on a separate session; excludes vehicles with over 1,000 tokens.
 
     An excluded vehicle is logged, and listed again after ten minutes; until then the list is incomplete.
-    `open_session`: raises NedbusError if no router answers. `selections`: by default all streams.
+    `open_session`: raises NedbusError if no router answers.
     """
 
-    def __init__(self, open_session: Callable[[], Session], *selections: Selection, prefix: str) -> None:
-        self._open_session, self._prefix, self._selections = open_session, prefix, selections or (Selection(),)
+    def __init__(self, open_session: Callable[[], Session], selection: Selection, *, prefix: str) -> None:
+        self._open_session, self._prefix, self._selection = open_session, prefix, selection
         self._keys: set[str] = set()
         self._numbers: Counter[str] = Counter()  # of keys, by vehicle
         self._excluded: set[str] = set()
@@ -111,8 +110,7 @@ class FleetTokens:
         self._survey = [query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in key_exprs]
 
     def _key_exprs(self, excluded: Set[str]) -> list[str]:
-        of_selection = partial(key_exprs_without, excluded, prefix=self._prefix)
-        return list(chain.from_iterable(map(of_selection, self._selections)))
+        return key_exprs_without(excluded, self._selection, prefix=self._prefix)
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
@@ -130,11 +128,17 @@ class FleetTokens:
 
 def key_exprs_without(excluded: Set[str], selection: Selection, *, prefix: str) -> list[str]:
     """Return key expressions that match the tokens of a selection, except those of the excluded vehicles."""
-    tokens = selection.alive_key_expr(prefix=prefix)
-    if selection.vehicle != ANY:
-        return [f"{prefix}/{selection.vehicle}/@alive/-" if selection.vehicle in excluded else tokens]  # or no token
+    if selection.vehicles != (ANY,):
+        kept = [vehicle for vehicle in selection.vehicles if vehicle not in excluded]
+        if not kept:
+            return [f"{prefix}/{selection.vehicles[0]}/@alive/-"]  # no token
+        return Selection(selection.topics, kept, selection.instance).alive_key_exprs(prefix=prefix)
     starts = {name[:length] for name in excluded for length in range(len(name) + 1)}
     short = [each for each in starts if len(each) <= _LONGEST_NAME]
     names = {f"{each}{c}$*" for each in short for c in _CHARACTERS if each + c not in starts}
     names |= starts - excluded - {""}
-    return [tokens.replace(f"/{ANY}/", f"/{name}/", 1) for name in sorted(names) or [ANY]]
+    return [
+        tokens.replace(f"/{ANY}/", f"/{name}/", 1)
+        for tokens in selection.alive_key_exprs(prefix=prefix)
+        for name in sorted(names) or [ANY]
+    ]

@@ -65,20 +65,22 @@ def send_query(session: Session, selector: str, *, timeout: float, capacity: int
 
 
 def query(
-    session: Session, selector: str, *, timeout: float, group_of: Callable[[str], str] = lambda _: ""
+    session: Session, *selectors: str, timeout: float, group_of: Callable[[str], str] = lambda _: ""
 ) -> list[RawSample]:
-    """Return the replies received within `timeout` seconds, possibly several per key.
+    """Return the replies to all selectors received within `timeout` seconds, possibly several per key.
 
     At most 10,000 replies and 64 MB in total are accepted; the number of replies beyond that is logged.
     `group_of`: return the group of a key. Beyond the limits, the group that uses most of them loses replies first.
     """
     accepted = _Accepted()
-    replies = wait_for_replies([send_query(session, selector, timeout=timeout)])
+    replies = wait_for_replies([send_query(session, selector, timeout=timeout) for selector in selectors])
     for sample in filter(None, (reply.ok for reply in replies)):
         accepted.add(group_of(str(sample.key_expr)), sample)
     if accepted.dropped:
         text = "%s: dropped %d of %d replies beyond the limits of a query, so the result is incomplete"
-        _log.warning(text, selector, accepted.dropped, accepted.count + accepted.dropped, extra=about("incomplete"))
+        _log.warning(
+            text, ", ".join(selectors), accepted.dropped, accepted.count + accepted.dropped, extra=about("incomplete")
+        )
     return [sample for samples in accepted.groups.values() for sample in samples]
 
 

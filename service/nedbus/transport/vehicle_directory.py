@@ -42,9 +42,9 @@ class VehicleDirectory:
         self._logged = False
 
     @classmethod
-    def of_fleet(cls, open_session: Callable[[], Session], *selections: Selection, prefix: str) -> Self:
-        """Return a directory of selected streams, by default all; arguments as in FleetTokens."""
-        return cls(partial(FleetTokens, open_session, *selections, prefix=prefix), prefix=prefix)
+    def of_fleet(cls, open_session: Callable[[], Session], selection: Selection, *, prefix: str) -> Self:
+        """Return a directory of the selected streams; arguments as in FleetTokens."""
+        return cls(partial(FleetTokens, open_session, selection, prefix=prefix), prefix=prefix)
 
     def close(self) -> None:
         """End the subscription."""

@@ -108,7 +108,7 @@ class LiveFleet(Exporter):
         self.fleet = Fleet(self.monitor)
         now = clock.utc()
         before = (event for report in bus.accounts(within=PAST) for event in report.events if event.time < now)
-        remembered = [each for each in before if each.vehicle != ALL and selection.vehicle in ("*", each.vehicle)]
+        remembered = [each for each in before if each.vehicle != ALL and selection.matches_vehicle(each.vehicle)]
         self.timeline = EventTimeline(self.event_log, before=remembered)
 
     def add(self, sample: Sample[Any]) -> None:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from collections.abc import Iterator
+from typing import Any
 
+import pytest
+import typer
+
+from nedbus.cli.app import make_app
 from tests.peers.command_line import run_command
 
 
@@ -31,3 +36,30 @@ def test_end_of_data_with_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPa
     assert "in fail\n" in ended.err
     assert "EOFError: marshal data too short" in ended.err
     assert "Aborted" not in ended.err
+
+
+def options(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield every option of every command that takes one value, after the words of its command."""
+    for option in command.params:
+        if option.param_type_name == "option" and not (option.multiple or option.is_flag):
+            yield path, option
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from options(inner, (*path, name))
+
+
+@pytest.mark.parametrize(("path", "option"), list(options(typer.main.get_command(make_app()))))
+def test_option_given_twice_is_a_usage_error(path: tuple[str, ...], option: Any) -> None:
+    """An option that takes one value and is given twice ends every command with 2, and is named."""
+    name = option.opts[0]
+    ended = run_command(*path, name, "1", name, "2", COLUMNS="200")
+    assert ended.exit_code == 2
+    assert name in ended.err
+    assert "given 2 times, but it takes one value" in ended.err
+
+
+def test_limit_proposes_count() -> None:
+    """For a name that other tools use, the option of like meaning is proposed."""
+    ended = run_command("echo", "--limit", "5", COLUMNS="200")
+    assert ended.exit_code == 2
+    assert "--count" in ended.err
+    assert "--wait" not in ended.err

@@ -43,6 +43,23 @@ def test_several_topics_are_received_in_one_loop(
             assert subscription.waiting == 0
 
 
+@pytest.mark.parametrize("max_rate", [None, 5])
+def test_several_vehicles_are_received_in_one_loop(bus: nedbus.Bus, endpoint: str, max_rate: float | None) -> None:
+    """`vehicle=["a", "b"]` selects both vehicles and no other, in subscriptions, views and queries."""
+    for vehicle in ("a", "b", "c"):
+        bus.publisher(VLP, vehicle=vehicle).publish(message(1))
+    with nedbus.connect(endpoint) as reader:
+        with reader.subscribe(VLP, vehicle=["a", "b"], max_rate=max_rate) as subscription:
+            assert sorted(subscription.receive(DEADLINE).vehicle for _ in range(2)) == ["a", "b"]
+            assert subscription.waiting == 0
+        assert [sample.vehicle for sample in reader.latest(VLP, vehicle=["a", "b"])] == ["a", "b"]
+        with reader.newest(VLP, vehicle=["b", "c"]) as view:
+            wait_for(lambda: bool(view.update()) or len(view) == 2, what="two vehicles")
+            assert {address.vehicle for address in view} <= {"b", "c"}
+        with pytest.raises(AddressError, match="at least one vehicle"):
+            reader.subscribe(vehicle=[])
+
+
 def test_gaps_of_several_topics_are_counted_exactly(bus: nedbus.Bus, endpoint: str) -> None:
     """A reader of several topics receives every message of each, in order."""
     with (

@@ -52,7 +52,7 @@ class World:
         bus = SimpleNamespace(
             connected=True,
             routers=("tcp/127.0.0.1:7447",),
-            subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
+            subscribe=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
             rejections=lambda: SimpleNamespace(take=list),
             publishers=lambda **_: Publishers((*ADDRESSES, GPS)),
         )

@@ -37,7 +37,7 @@ class World:
         self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.event_log)
         bus = SimpleNamespace(
             connected=True,
-            subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
+            subscribe=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
             rejections=lambda: SimpleNamespace(take=list),
             publishers=lambda **_: self.alive,
         )

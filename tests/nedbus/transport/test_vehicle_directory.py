@@ -19,7 +19,7 @@ def test_look_does_not_wait_for_a_thread_that_lists(zenoh_session: Session, time
     def follow() -> LivelinessTokens:
         listing.set()
         assert connected.wait(DEADLINE)
-        return LivelinessTokens(zenoh_session, Selection().alive_key_expr(prefix="nedbus"))
+        return LivelinessTokens(zenoh_session, *Selection().alive_key_exprs(prefix="nedbus"))
 
     token = zenoh_session.liveliness().declare_token(f"nedbus/1/@alive/0/{VLP}")
     directory = VehicleDirectory(follow, prefix="nedbus")

@@ -12,7 +12,7 @@ import typer
 from nedbus import __version__, bridges, monitoring
 from nedbus import web as page
 from nedbus.bridges import FOXGLOVE_PORT
-from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicOption, VehicleOption, command
+from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicsOption, VehiclesOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
@@ -40,8 +40,8 @@ def web(
     open_bus: Callable[[], Bus],
     files: FilesArgument = None,
     *,
-    topic_option: TopicOption = ANY,
-    vehicle: VehicleOption = ANY,
+    topic_option: TopicsOption = None,
+    vehicle: VehiclesOption = None,
     instance: InstanceOption = None,
     http: HttpOption = "127.0.0.1:8420",
     origin: Annotated[list[str] | None, typer.Option(metavar="HOST:PORT", help=_ORIGIN)] = None,
@@ -51,7 +51,7 @@ def web(
     host, port = _split_http("--http", http)
     for name in origin or ():
         _split_http("--origin", name)
-    selection = Selection(topic_option, vehicle, instance)
+    selection = Selection(topic_option or ANY, vehicle or ANY, instance)
     options = page.PageOptions(host, port, tuple(origin or ()), background)
 
     def on_listening(url: str) -> None:
@@ -82,7 +82,7 @@ def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: Htt
 
 @command
 def foxglove(
-    open_bus: Callable[[], Bus], *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
+    open_bus: Callable[[], Bus], *, vehicle: VehiclesOption = None, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
 ) -> None:
     """Serve live vehicles to Foxglove until Ctrl-C.
 
@@ -91,7 +91,7 @@ def foxglove(
     host, port = _split_http("--http", http)
     with open_bus() as bus, bridges.FoxgloveServer(bus, host=host, port=port) as server:
         write_stderr(f"in Foxglove, choose Open connection > Foxglove WebSocket, and enter {server.url}")
-        run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
+        run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle or ANY)))
 
 
 @command

@@ -66,7 +66,12 @@ def echo(
         return True
 
     mode: Mode = "every" if every else "latest"
-    with open_bus() as bus, bus.subscribe_to(selection, mode=mode, max_rate=max_rate) as subscription:
+    with (
+        open_bus() as bus,
+        bus.subscribe(
+            *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode=mode, max_rate=max_rate
+        ) as subscription,
+    ):
         try:
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:

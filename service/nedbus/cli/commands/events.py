@@ -17,7 +17,7 @@ from nedbus.cli.options import (
     FilesArgument,
     JsonOption,
     OpenBus,
-    VehicleOption,
+    VehiclesOption,
     allow_one,
     command,
 )
@@ -57,7 +57,7 @@ def events(
     open_bus: OpenBus,
     files: FilesArgument = None,
     *,
-    vehicle: VehicleOption = ANY,
+    vehicle: VehiclesOption = None,
     within: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help=_WITHIN)] = None,
     severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
     origin: Annotated[str, typer.Option(metavar="px4|nedbus", help=_ORIGIN)] = ANY,
@@ -73,6 +73,7 @@ def events(
     condition is still active. Live events are shown until Ctrl-C.
     """
     allow_one({"--json": json_output, "--csv": csv_output})
+    selection = Selection(ANY, vehicle or ANY)
     for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):
         if value not in choices:
             raise ConfigError(option, f"{value!r}: expected {' or '.join(choices)}")
@@ -87,7 +88,7 @@ def events(
 
     def select(found: Iterable[Event]) -> list[Event]:
         chosen = [event for event in found if event.severity in severities and origin in (ANY, event.origin)]
-        return [event for event in chosen if vehicle in (ANY, event.vehicle) or event.vehicle == ANY]
+        return [event for event in chosen if event.vehicle == ANY or selection.matches_vehicle(event.vehicle)]
 
     def show(found: Iterable[Event], times: Times) -> None:
         for event in select(found):
@@ -98,17 +99,17 @@ def events(
         with open_bus() as bus:
             if within is not None:
                 show(_in_order(each for report in bus.accounts(within=within) for each in report.events), times)
-            _follow(bus, Selection(ANY, vehicle), lambda found: show(found, times), duration)
+            _follow(bus, selection, lambda found: show(found, times), duration)
         return
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(files)
-    _require_vehicle(_name(files), read.event_log.vehicles, vehicle)
+    _require_vehicles(_name(files), read.event_log.vehicles, vehicle or ())
     found = select(found)
     unknown = {"boot"} if read.times.remarks.keys() - read.times.offsets.keys() else set()
     begin(read.times, {read.times.clock(event) for event in found} or unknown)
     show(found, read.times)
-    vehicles = sorted(each for each in read.event_log.vehicles.items() if vehicle in (ANY, each[0]))
+    vehicles = sorted(each for each in read.event_log.vehicles.items() if selection.matches_vehicle(each[0]))
     if texts := [f"{name}: {held}, throughout the file" for name, each in vehicles if (held := each.held_from_start)]:
         write_stderr("\n".join(texts))
     elif not found:
@@ -121,7 +122,7 @@ def why(
     open_bus: OpenBus,
     files: FilesArgument = None,
     *,
-    vehicle: VehicleOption = ANY,
+    vehicle: VehiclesOption = None,
     at: Annotated[str | None, typer.Option(metavar="TIME", help=_AT)] = None,
     details: Annotated[bool, typer.Option("--all", help="Show all faults with their evidence")] = False,
     json_output: JsonOption = False,
@@ -144,13 +145,14 @@ def why(
         found = _in_order(event for report in reports for event in report.events)
         times, where, advice = Times(is_live=True), "the history of the services", _LIVE_ADVICE
     reporting, faults, texts = by_vehicle(reports), 0, list[str]()
-    if not files and vehicle in published and vehicle not in reporting:
-        hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
-        raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its event history: {hint}")
+    for name in vehicle or ():
+        if not files and name in published and name not in reporting:
+            hint = f"follow it with 'nedbus events --vehicle {name}'"
+            raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
     if not files and not reporting:
         raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: start one with 'nedbus serve'")
-    _require_vehicle(where, reporting, vehicle)
-    for name in reporting if vehicle == ANY else [vehicle]:
+    _require_vehicles(where, reporting, vehicle or ())
+    for name in vehicle or reporting:
         events = [event for event in found if event.vehicle in (name, ANY)]
         known, end = reporting[name].vehicles[name], reporting[name].now
         try:
@@ -295,8 +297,10 @@ def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
     return {"verdict": head, "faults": faults}
 
 
-def _require_vehicle(where: object, names: Collection[str], vehicle: str) -> None:
-    if vehicle != ANY and vehicle not in names:
+def _require_vehicles(where: object, names: Collection[str], vehicles: Collection[str]) -> None:
+    for vehicle in vehicles:
+        if vehicle in names:
+            continue
         check_vehicle(vehicle)
         known = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT)
         raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}{known and f': choose one of {known}'}")

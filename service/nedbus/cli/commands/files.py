@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import typer
 
 from nedbus import flights, tables
-from nedbus.cli.options import InstanceOption, VehicleOption, command
+from nedbus.cli.options import InstanceOption, VehiclesOption, command
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.output.table import show_progress
 from nedbus.errors import ConfigError, SourceError
@@ -51,12 +51,12 @@ def plot(
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.png", help=_IMAGE)] = None,
     topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
-    vehicle: VehicleOption = ANY,
+    vehicle: VehiclesOption = None,
     instance: InstanceOption = None,
 ) -> None:
     """Plot flights: track, altitude, speed, flags, resets and events."""
     draw, limit = tables.draw, tables.MAX_STREAMS
-    selection, name = Selection(topic, vehicle, instance), ", ".join(map(str, sources))
+    selection, name = Selection(topic, vehicle or ANY, instance), ", ".join(map(str, sources))
     if topic not in (ANY, *DEFAULT.topics):
         table = f'nedbus.read("{sources[0]}", "{topic}", dataframe="pandas")'
         raise ConfigError("--topic", f"{topic} has no track; plot {' or '.join(DEFAULT.topics)}, or read it: {table}")

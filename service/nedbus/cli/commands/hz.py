@@ -40,7 +40,12 @@ def hz(
     allow_one({"--json": json_output, "--csv": csv_output})
     monitor = Monitor()
     written: dict[Address, tuple[int, str]] = {}
-    with bus.subscribe_to(selection, mode="every") as subscription, live_table(_HEAD, _OPTIONAL) as show_table:
+    with (
+        bus.subscribe(
+            *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode="every"
+        ) as subscription,
+        live_table(_HEAD, _OPTIONAL) as show_table,
+    ):
         if csv_output:
             write(csv_line(_CSV_HEAD))
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption, command, parse_fields
+from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
@@ -30,14 +30,14 @@ _MAX_WARNINGS: Final = 5  # shown per source: damage of its file, or the first r
 
 
 @command
-def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
+def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption = False) -> None:
     """List the published streams with the state of each and the age of its last message.
 
     Exits with 1 if the given vehicle is not published, or if the router is too slow or refuses the query.
     """
-    selection = Selection(ANY, vehicle)
+    selection = Selection(ANY, vehicle or ANY)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
-    newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
+    newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=selection.vehicles)}
     rows = []
     for address in sorted({*filter(selection.matches, everything), *newest}):
         sample = newest.get(address)
@@ -59,10 +59,10 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
             hint = f"choose one of {to_text(', '.join(others[:20]))}"
         elif bus.services():
             hint = "a service answers: see 'nedbus info' and the access rules for it and this client (docs/security.md)"
-        what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
+        what = f"no vehicle {' or '.join(vehicle)}" if vehicle else "no vehicle"
         known = "is published" if everything.complete else "is known yet"
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
-    if not everything.complete or (not rows and vehicle != ANY):
+    if not everything.complete or (not rows and vehicle):
         raise typer.Exit(1)
 
 
@@ -75,11 +75,11 @@ def get(
     Messages that only a storage still has are marked. Exits with 1 if no publisher answers.
     """
     fields = parse_fields(field, selection)
-    samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
+    samples = bus.latest(*selection.topics, vehicle=selection.vehicles, instance=selection.instance)
     for sample in samples:
         write(to_json(sample, fields) if json_output else to_fields(sample, fields))
     if all(sample.stored for sample in samples):
-        expression = selection.key_expr(prefix=bus.prefix)
+        expression = ", ".join(selection.key_exprs(prefix=bus.prefix))
         nothing = f"nothing is published on {expression}: 'nedbus list' shows the published streams"
         write_stderr("no publisher answers: these messages are from a storage" if samples else nothing)
         raise typer.Exit(1)

@@ -33,7 +33,9 @@ def record(
     A crash loses about the last second.
     """
     notice = time.monotonic() + TIMINGS.first_sample
-    with bus.subscribe_to(selection, mode="every") as subscription:
+    with bus.subscribe(
+        *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode="every"
+    ) as subscription:
         recorder = Recorder(subscription, output)
 
         def tick() -> None:

@@ -93,12 +93,12 @@ def _to_state(sample: Sample[Any]) -> str:
 
 
 def _to_summary(message: Message) -> str:
-    """Return the numbers of a message by name, then its true flags; unknown values are omitted."""
+    """Return the numbers of a message by name, then its flags, false ones with their value; omit unknown numbers."""
     numbers, flags = [], []
     for name, kind in message.DEFINITION.types.items():
         value = getattr(message, name)
         if kind.base == "bool":
-            flags += [name] if value is True else []
+            flags.append(name if value is True else f"{name} {_to_number(value, None)}")
         elif name not in _TIMES and value != kind.absent and repr(value) != repr(kind.absent):
             numbers.append(f"{name} {_to_number(value, _SUMMARY_DIGITS.get(kind.base))}")
     return "  ".join([*numbers, *flags])

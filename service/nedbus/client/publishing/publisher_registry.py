@@ -137,9 +137,9 @@ class PublisherRegistry:
         prefix, selection = self.prefix, Selection(vehicle=vehicle)
         schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
         self._directories[vehicle] = VehicleDirectory(
-            partial(LivelinessTokens, self._session, selection.alive_key_expr(prefix=prefix)), prefix=prefix
+            partial(LivelinessTokens, self._session, *selection.alive_key_exprs(prefix=prefix)), prefix=prefix
         )
-        self._rate_listeners[vehicle] = MatchingListener(self._session, selection.rate_key_expr(ANY, prefix=prefix))
+        self._rate_listeners[vehicle] = MatchingListener(self._session, *selection.rate_key_exprs(ANY, prefix=prefix))
         self._queries.answer(f"{prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
         # One key per vehicle, for the access rules: a vehicle may answer for its own messages only.
         self._queries.answer(schema(ANY), partial(_reply_schemas, schema, self._definitions))

@@ -48,16 +48,16 @@ class MaxRateInbox(Inbox):
         self,
         mode: Mode,
         decoder: Decoder,
-        selections: Sequence[Selection],
+        selection: Selection,
         *,
         max_rate: float,
         limit: int | None = None,
     ) -> None:
         check_max_rate(max_rate)
         self.rate = rate_step(max_rate)  # requested from publishers
-        key_exprs = [each.rate_key_expr(self.rate, prefix=decoder.prefix) for each in selections]
+        key_exprs = selection.rate_key_exprs(self.rate, prefix=decoder.prefix)
         super().__init__(mode, decoder, key_exprs=key_exprs, limit=limit)
-        self.selections, self._max_rate = selections, max_rate
+        self.selection, self._max_rate = selection, max_rate
 
     def put_last(self, batch: Sequence[RawSample]) -> None:
         """Queue the last messages of streams that have delivered none yet."""
@@ -103,11 +103,11 @@ class MaxRateReceiver(Receiver):
 
     def __init__(self, session: Session, inbox: MaxRateInbox, open_session: Callable[[], Session]) -> None:
         self._rate_inbox, prefix = inbox, inbox.decoder.prefix
-        self._directory = VehicleDirectory.of_fleet(open_session, *inbox.selections, prefix=prefix)
+        self._directory = VehicleDirectory.of_fleet(open_session, inbox.selection, prefix=prefix)
         self._since: dict[Address, float] = {}  # when a publisher was first seen [s]; infinity once it was checked
         self._next_check = 0.0
         _checks.start()
-        keys = [each.key_expr(prefix=prefix) for each in inbox.selections]
+        keys = inbox.selection.key_exprs(prefix=prefix)
         self._last = [send_query(session, key, timeout=_TIMEOUT) for key in keys]
         super().__init__(session, inbox, history=False)
         self._undeclares.append(self._directory.close)

@@ -24,7 +24,7 @@ DOWNSAMPLED = f"{KEY}/@rate/5"
 
 def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateInbox:
     """Return an empty queue."""
-    return MaxRateInbox(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), [Selection()], max_rate=max_rate)
+    return MaxRateInbox(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate)
 
 
 class Clock:

@@ -66,7 +66,7 @@ def test_invalid_max_rate_raises(client: nedbus.Bus) -> None:
     with pytest.raises(nedbus.ArgumentError, match="max_rate 0 is not valid: expected messages per second"):
         client.subscribe(max_rate=0)
     with pytest.raises(nedbus.ArgumentError, match="max_rate nan is not valid"):
-        client.subscribe_to(Selection(VLP), max_rate=math.nan)
+        client.subscribe(VLP, max_rate=math.nan)
 
 
 def test_each_stream_is_downsampled_separately(bus: nedbus.Bus, clock: Clock) -> None:
@@ -352,12 +352,12 @@ def test_key_of_a_downsampled_stream_ends_with_its_rate() -> None:
     address = Address("7", "estimator_local_position", 1)
     assert address.rate_key(5) == "nedbus/7/estimator_local_position/1/@rate/5"
     assert Address.from_key(address.rate_key(5).partition(RATE)[0]) == address
-    assert Selection().rate_key_expr(5) == "nedbus/*/**/@rate/5"
-    assert Selection(VLP, "7").rate_key_expr("*", prefix="a/b") == f"a/b/7/{VLP}/@rate/*"
-    assert Selection(VLP, "7").alive_key_expr(prefix="a/b") == f"a/b/7/@alive/*/{VLP}"
-    assert Selection().alive_key_expr() == "nedbus/*/@alive/*/**"
-    assert Selection("estimator_local_position").alive_key_expr() == "nedbus/*/@alive/*/estimator_local_position/*"
+    assert Selection().rate_key_exprs(5)[0] == "nedbus/*/**/@rate/5"
+    assert Selection(VLP, "7").rate_key_exprs("*", prefix="a/b")[0] == f"a/b/7/{VLP}/@rate/*"
+    assert Selection(VLP, "7").alive_key_exprs(prefix="a/b")[0] == f"a/b/7/@alive/*/{VLP}"
+    assert Selection().alive_key_exprs()[0] == "nedbus/*/@alive/*/**"
+    assert Selection("estimator_local_position").alive_key_exprs()[0] == "nedbus/*/@alive/*/estimator_local_position/*"
     assert not zenoh.KeyExpr("nedbus/**").intersects(address.rate_key(5))
-    assert zenoh.KeyExpr(Selection().rate_key_expr(5)).intersects(address.rate_key(5))
+    assert zenoh.KeyExpr(Selection().rate_key_exprs(5)[0]).intersects(address.rate_key(5))
     with pytest.raises(AddressError):
         Address.from_key(address.rate_key(5))
