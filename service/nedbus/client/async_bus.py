@@ -18,11 +18,11 @@ from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
 from nedbus_msgs import ANY, Definition, Message, Selection
 
+from .async_newest import AsyncNewest
+from .async_subscription import AsyncSubscription
 from .bus import Bus, require_callable, select
-from .newest import AsyncNewest
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .receiving import Receiver
-from .subscription import AsyncSubscription
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")

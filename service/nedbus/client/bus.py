@@ -1,15 +1,16 @@
 """The blocking API: connect, subscribe, query, publish."""
 
+from __future__ import annotations
+
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack, overload
+from typing import TYPE_CHECKING, Any, Unpack, overload
 
 from nedbus.errors import ArgumentError, ClosedError, NedbusError
-from nedbus.events import AccountReport
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import (
@@ -33,6 +34,9 @@ from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiver, Receiver, find_schemas
 from .subscription import Subscription
+
+if TYPE_CHECKING:
+    from nedbus.events import AccountReport
 
 
 class Bus(AbstractContextManager["Bus"]):

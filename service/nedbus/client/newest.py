@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, ItemsView, Iterable, Iterator, Mapping, ValuesView
+from collections.abc import Callable, ItemsView, Iterable, Iterator, Mapping, ValuesView
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
 from nedbus import clock
 from nedbus.errors import ArgumentError, ClosedError, NoDataError
@@ -23,7 +22,7 @@ from nedbus_msgs import ANY, Address, Message, topic_of
 
 from .health import ABSENT, Health, Histogram, StreamHealth, health_of_last, silence_of
 from .receiving import MAX_KEYS, Inbox, Receiver
-from .subscription import AsyncSubscription, Subscription
+from .subscription import Subscription
 
 if TYPE_CHECKING:
     from .bus import Bus
@@ -243,7 +242,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
             del self._by_topic[address.topic]
 
 
-class _NewestBase(Monitor):
+class NewestBase(Monitor):
+    """The view of a bus, blocking or asynchronous."""
+
     def __init__(self, inbox: Inbox, topics: Iterable[str], ask: Callable[[], tuple[bool, Publishers]]) -> None:
         super().__init__()
         self._inbox, self._wanted, self._view.ask = inbox, frozenset(topics), ask
@@ -274,7 +275,7 @@ class _NewestBase(Monitor):
         return [stream for sample in arrived if (stream := self._add(sample)).updated]
 
 
-class Newest(_NewestBase, AbstractContextManager["Newest"]):
+class Newest(NewestBase, AbstractContextManager["Newest"]):
     """View of the newest message of each stream; `bus.newest(...)` returns one. Read it after each `update`.
 
     It needs no thread unless `update` has a timeout. Call `update` from one thread; any thread may read the messages.
@@ -304,34 +305,3 @@ class Newest(_NewestBase, AbstractContextManager["Newest"]):
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-
-class AsyncNewest(_NewestBase):
-    """The asyncio version of Newest; `bus.newest(...)` returns one, which opens on first use."""
-
-    def __init__(
-        self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox, topics: Iterable[str], *, owner: Bus
-    ) -> None:
-        super().__init__(inbox, topics, owner._network)
-        self._subscription = AsyncSubscription[Message](open_receiver, inbox)
-
-    async def update(self, timeout: float | None = 0.0) -> list[NewestMessage[Message]]:
-        """Read what has arrived, or wait for a message; see `Newest.update`."""
-        await self._subscription._open()
-        await asyncio.sleep(0)  # otherwise a loop that never waits would starve other tasks
-        news = self._read()
-        if not news and timeout != 0:
-            with suppress(NoDataError):
-                news = self._read(await self._subscription.receive(timeout))
-        return news
-
-    async def close(self) -> None:
-        """Close the view; its messages remain. A second call does nothing."""
-        await self._subscription.close()
-
-    async def __aenter__(self) -> Self:
-        await self._subscription._open()
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        await self.close()
