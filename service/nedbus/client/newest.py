@@ -80,7 +80,7 @@ class NewestMessage(Generic[M_co]):
 
     @property
     def updated(self) -> bool:
-        """True if the message arrived in the last update of its view."""
+        """True if the message arrived in the last update of its view, or in the last `add` of its Monitor."""
         return self._number == self._view.number
 
     @property
@@ -139,7 +139,11 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         self._by_topic: defaultdict[str, dict[Address, NewestMessage[Any]]] = defaultdict(dict)
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`."""
+        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`.
+
+        Each call is an update of the view: afterwards, only the stream of this sample is `updated`.
+        """
+        self._view.number += 1
         self._add(sample, received)
         return not sample.retained
 
@@ -272,7 +276,8 @@ class NewestBase(Monitor):
         arrived = [*samples, *(each for each in popped if each is not None)]
         if ended and not arrived:
             raise self._inbox.end_error
-        return [stream for sample in arrived if (stream := self._add(sample)).updated]
+        streams = dict.fromkeys(map(self._add, arrived))  # two samples of a stream are one piece of news
+        return [stream for stream in streams if stream.updated]
 
 
 class Newest(NewestBase, AbstractContextManager["Newest"]):

@@ -245,3 +245,17 @@ def test_error_is_raised_after_the_last_message() -> None:
     assert next(host.queue.read(DEADLINE, lost_by_host=0))
     with pytest.raises(OSError, match="gone"):
         list(host.queue.read(DEADLINE, lost_by_host=0))
+
+
+def test_rejections_beyond_the_limit_are_counted_apart(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the limit of different rejections, further ones are counted together, and not for an unrelated place."""
+    monkeypatch.setattr(receive_queue, "_MAX_REJECTIONS", 3)
+    host.queue.put(*(Rejection(f"{number} x", "bad") for number in range(3)))
+    host.queue.put(*(Rejection("99 y", "worse", count=2) for _ in range(5)), Rejection("1 x", "bad"))
+    host.read()
+    assert [(each.where, each.count) for each in host.rejections] == [
+        ("0 x", 1), ("1 x", 2), ("2 x", 1), ("further places", 10),
+    ]  # fmt: skip
+    host.queue.put(Rejection("99 y", "worse"))
+    host.read()
+    assert host.rejections[-1] == Rejection("99 y", "worse")
