@@ -15,9 +15,11 @@ LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-hea
 
 .PHONY: run check api api-baseline generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
 
+# The shell waits for a service in the background: only then does a trap run at once, when make is killed and kills it.
 run: $(READY)  ## run the service with a simulated flight, or with ARGS; it prints a command for a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
-	@trap : INT; $(BIN)/nedbus serve $(ARGS); code=$$?; case $$code in \
+	@$(BIN)/nedbus serve $(ARGS) & service=$$!; trap : INT; trap 'kill $$service' TERM; \
+	while wait $$service; code=$$?; kill -0 $$service 2>/dev/null; do :; done; case $$code in \
 	130) exit 0 ;; \
 	1) echo 'for other options: make run ARGS="--source sim: --vehicle 2 --connect tcp/127.0.0.1:7447"' >&2 ;; \
 	esac; exit $$code
@@ -44,10 +46,10 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from other hosts
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## run the tests without routers or processes: under a minute on two cores
+quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
-test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two cores
+test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two idle cores
 
 behaviour: $(DEV)
 	$(BIN)/pytest -q -n 6 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
