@@ -47,7 +47,7 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
 quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
-	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
+	$(BIN)/pytest -q -n 2 -m "quick or not (slow or router or process or compose)"
 
 test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two idle cores
 
