@@ -80,6 +80,10 @@ wheel: $(DEV)  ## build the wheel, install it in a clean environment, use it, an
 	$(PYTHON) -m venv --without-pip build/wheel-venv
 	$(BIN)/pip --python build/wheel-venv install -q "$$(echo dist/nedbus-*.whl)[all]"
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
+	for extras in "" metrics; do \
+	$(PYTHON) -m venv --without-pip --clear build/bare-venv && \
+	$(BIN)/pip --python build/bare-venv install -q "$$(echo dist/nedbus-*.whl)$${extras:+[$$extras]}" && \
+	(cd build && bare-venv/bin/python ../tests/release/every_command.py $$extras) || exit 1; done
 	rm -rf build/pki build/vehicle-1
 	cd build && wheel-venv/bin/nedbus pki ca pki && wheel-venv/bin/nedbus pki enroll pki 1 -r tls/127.0.0.1:7447
 	PATH=$(abspath $(BIN)):$$PATH packaging/sbom build/wheel-venv "$$(echo dist/nedbus-*.whl | sed 's/-py3.*/.cdx.json/')"

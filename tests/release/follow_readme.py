@@ -1,4 +1,4 @@
-"""Follow README.md literally in a fresh clone, with nothing but Python and make: `python -m tests.release.follow_readme`.
+"""Follow README.md literally in a fresh clone: `python -m tests.release.follow_readme`.
 
 Each command of "Start", "Your vehicle", "Everyday commands" and "Other hosts" runs in the environment that the page
 has made so far. A block, or a command in the text, without a handler here is an error. The ports of the page must be
@@ -130,9 +130,9 @@ def _start(clone: Clone, blocks: list[Block], service: ExitStack) -> None:
     clone.run_until(command, _POSITION.pattern)
     (command,) = web.commands
     address = "http://127.0.0.1:8420"
-    with clone.running(command, f"open {address}", seconds=_INSTALL):
-        with urllib.request.urlopen(address, timeout=_WAIT) as page:
-            check(b"nedbus" in page.read(), f"{address} is not the page")
+    opened = clone.running(command, f"open {address}", seconds=_INSTALL)
+    with opened, urllib.request.urlopen(address, timeout=_WAIT) as page:
+        check(b"nedbus" in page.read(), f"{address} is not the page")
 
 
 def _your_vehicle(clone: Clone, blocks: list[Block], _: ExitStack) -> None:
@@ -158,6 +158,11 @@ def _everyday_commands(clone: Clone, blocks: list[Block], service: ExitStack) ->
     for command in commands:
         if command in endless:
             clone.run_until(activated(command), endless[command])
+        elif command == "nedbus check":  # the settings of a host: those of `make run` are options
+            clone.run(activated(command), codes=frozenset({2}))
+            (clone.path / "nedbus.toml").write_text('source = ["sim:"]\n')
+            clone.run(activated(command))
+            (clone.path / "nedbus.toml").unlink()
         else:
             clone.run(activated(command))
     clone.run_until(activated("nedbus echo --csv"), "timestamp")
