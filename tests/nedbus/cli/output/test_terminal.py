@@ -495,8 +495,11 @@ def test_second_signal_exits_at_once(start: Start, number: signal.Signals, exit_
 
 SLOW = """
 import sys, time
+from nedbus.cli import run
 from nedbus.cli.app import make_app
 from nedbus.daemon import daemon
+
+run._END_TIMEOUT = 100.0
 
 def open_slowly(**settings):
     print("opening", flush=True)
