@@ -20,6 +20,7 @@ from .discovery import (
     reply_parts,
 )
 from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
+from .link import LinkCallback
 from .newest import Monitor, Newest, NewestMessage
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
