@@ -193,7 +193,7 @@ class Comparison:
         share = (stamp - before.stamp) / (after.stamp - before.stamp)
         motion = [old + share * (new - old) for old, new in zip(first[:5], second[:5], strict=True)]
         z_valid, xy_valid = min(first.z_valid, second.z_valid), min(first.xy_valid, second.xy_valid)
-        return _Estimate(*motion, z_valid, xy_valid, *second[7:])
+        return _Estimate._make([*motion, z_valid, xy_valid, *second[7:]])
 
     def _error_of_barometer(self, measurement: _Measurement, estimate: _Estimate) -> _Error:
         """Return the change of the height difference, which a standard atmosphere and dynamic pressure limit."""

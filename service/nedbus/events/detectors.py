@@ -191,10 +191,10 @@ class AidDetector(ChangeDetector):
 class VisionDetector(ChangeDetector):
     """Detector for positions sent into the vehicle that its EKF does not fuse at all.
 
-    `is_fused`: returns whether the EKF fuses any vision now, None if unknown.
+    `is_fused`: returns whether the EKF fuses any vision, None if unknown, and since when it says so [us].
     """
 
-    def __init__(self, is_fused: Callable[[], bool | None]) -> None:
+    def __init__(self, is_fused: Callable[[], tuple[bool | None, int]]) -> None:
         super().__init__((), (), detect_nothing)
         self._is_fused = is_fused
         self.since = 0  # first message that was not fused [us]
@@ -208,8 +208,9 @@ class VisionDetector(ChangeDetector):
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding]:
         """Return the findings in a message."""
         super().add(message, missing)
-        if self._is_fused() is not False:
-            return self._end("the EKF fuses vision")
+        is_fused, stamp = self._is_fused()
+        if is_fused is not False:
+            return self._end("the EKF fuses vision", age=max(0, self.stamp - stamp) / 1e6)
         if not self.since or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
             self.since = self.stamp
         return self._begin((self.stamp - self.since) / 1e6)
@@ -223,11 +224,11 @@ class VisionDetector(ChangeDetector):
             self.is_unused = True
             yield Finding("vision_unused", "begin", "vision arrives, but the EKF does not fuse it", age=age)
 
-    def _end(self, text: str) -> Iterator[Finding]:
+    def _end(self, text: str, *, age: float = 0.0) -> Iterator[Finding]:
         self.since = 0
         if self.is_unused:
             self.is_unused = False
-            yield Finding("vision_unused", "end", text)
+            yield Finding("vision_unused", "end", text, age=age)
 
 
 def detection_of(message: str) -> Detection | None:
@@ -334,7 +335,6 @@ def _detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
         names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
         yield Finding("mode", "once", f"mode changed from {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
-
     yield from _detect_transition(before, after)
 
 
@@ -404,7 +404,9 @@ _FURTHER: Final[Mapping[str, Detection]] = {
     "LogMessage": (("severity", "text"), (), _detect_text),
     "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), _detect_gps),
     "VehicleStatus": (
-        ("arming_state", "nav_state", "in_transition_mode", "vehicle_type"), ("in_transition_to_fw",), _detect_status,
+        ("arming_state", "nav_state", "in_transition_mode", "vehicle_type"),
+        ("in_transition_to_fw",),
+        _detect_status,
     ),
     "BatteryStatus": (("warning", "connected"), ("remaining",), _detect_battery),
     "VehicleLandDetected": (("landed",), (), _detect_landing),

@@ -68,8 +68,11 @@ class Event:
 
     @property
     def is_minor(self) -> bool:
-        """True if it concerns only minor flags of its kind; it explains nothing."""
-        return bool(self.names) and KINDS[self.kind].minor.issuperset(self.names)
+        """True if it concerns only minor flags of its kind, or is a small correction; it explains nothing."""
+        kind = KINDS[self.kind]
+        if kind.correction and kind.severity != "info":
+            return self.severity == "info"
+        return bool(self.names) and kind.minor.issuperset(self.names)
 
     @property
     def words(self) -> str:

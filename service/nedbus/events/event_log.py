@@ -70,18 +70,22 @@ class EventLog:
         return self._common.conditions.get(("overload", ""))
 
     def add(
-        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0
-    ) -> None:
+        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0,
+        is_estimate: bool = False,
+    ) -> None:  # fmt: skip
         """Add a message: a model, a row, or a dict of fields.
 
-        `missing`: names of fields that were not provided. `lost`: messages lost before this one.
+        `missing`: names of fields that were not provided. `lost`: messages lost before this one; with `is_estimate`
+        about as many, of any topic, as in the vehicle's ULog stream.
         """
         vehicle = self.vehicles.get(address.vehicle)
         if vehicle is not None and not lost and vehicle.skips(address, time):  # most messages; needs no lock
             return
         with self._lock:
             if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
-                vehicle.add(address, message, time, missing, lost)
+                if lost:
+                    vehicle.count_lost(lost, "" if is_estimate else address.stream, time)
+                vehicle.add(address, message, time, missing)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
         """Record a logging dropout of a vehicle that starts at `time`."""

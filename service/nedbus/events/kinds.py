@@ -20,8 +20,8 @@ class Kind:
     always info. `message`: the PX4 message in which it is detected, "" for other sources.
     `causes`: kinds that may explain it. `row`: its row in plots, by default its name.
 
-    `validity`: a quantity of the estimate is invalid. `usual`: normal in a flight that has it from its first message on,
-    as without GNSS: no fault and no part of the state then, but evidence.
+    `validity`: a quantity of the estimate is invalid. `usual`: normal in a flight that has it from its first message
+    on, as without GNSS: no fault and no part of the state then, but evidence.
     `correction`: the estimate is corrected; both starts and ends of conditions may explain it.
     `phase`: a phase of a flight, shown even if its severity is info.
     `of_data`: it concerns the data, not the vehicle, and is no present fault in a verdict.
@@ -115,7 +115,7 @@ _ROWS: Final = (
         "no_messages", "watch", causes=("text", "link_down"), on_ground="info", flags={name: name for name in EVIDENCE},
         begin="no {} message", end="{} messages resumed",
     ),
-    Kind("text", "watch", "LogMessage", ("text", "no_messages", "ekf_changed"), row="PX4", phase=True, stateless=True),
+    Kind("text", "watch", "LogMessage", ("no_messages", "ekf_changed"), row="PX4", phase=True, stateless=True),
     Kind(
         "reset", "watch", _ESTIMATE, ("text", *_SENSING, *_INVALID, "origin_set", "origin_moved"), on_ground="info",
         correction=True,

@@ -75,7 +75,8 @@ SUBJECTS: Final[Mapping[str, str]] = {
     "accelerometer": r"\baccel|acc \d", "airspeed": "airspeed", "barometer": r"\bbaro", "battery": "battery",
     "EKF": "primary EKF", "GNSS": r"\bgps|gnss|satellite", "gyro": r"\bgyro", "heading": "heading|yaw",
     "height": r"height|altitude|vertical|\bv?z\b", "magnetometer": r"\bmag|compass", "optical flow": "flow",
-    "position": r"position|dead reckoning|\bv?xy\b", "range finder": r"\brange|distance sensor", "vision": "vision|odometry",
+    "position": r"position|dead reckoning|\bv?xy\b", "range finder": r"\brange|distance sensor",
+    "vision": "vision|odometry",
 }  # fmt: skip
 """Sensors and quantities, with patterns of the words for them in texts of PX4 and nedbus."""
 

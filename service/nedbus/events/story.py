@@ -288,6 +288,9 @@ def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> lis
         for cause in explain(replace(span.begin, time=span.since), near, held, late=LATE)
         if not (cause.kind == "text" and cause.time > span.since) and cause not in recovered
     ]
+    if span.kind == "text":
+        causes += [event for event in near if event.kind == "text" and event.severity != "info"]
+        causes = sorted((cause for cause in causes if cause.time <= span.since), key=lambda cause: cause.time)
     if causes:
         return causes
     others = [

@@ -96,11 +96,9 @@ class Vehicle:
         detector = self._detectors.get(address, _NEW)
         return detector is None or time < detector.due
 
-    def add(self, address: Address, message: object, time: float, missing: frozenset[str], lost: int) -> None:
-        """Add a message; `lost`: number of messages lost before it."""
+    def add(self, address: Address, message: object, time: float, missing: frozenset[str]) -> None:
+        """Add a message."""
         self.last_seen = time
-        if lost:
-            self._count("lost", time, lost, address.stream)
         try:
             detector = self._detectors[address]
         except KeyError:
@@ -122,11 +120,15 @@ class Vehicle:
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
-            found = [*(found or ()), *self._comparison.add_estimate(stamp, message, missing)]
+            found = iter([*(found or ()), *self._comparison.add_estimate(stamp, message, missing)])
         if not is_queued and (stamp < before - _REBOOT or self._suspect is not None):
             known = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
             found = detector.add(message, missing) if known is None else iter(known)
         self._emit_all(found or (), address, time)
+
+    def count_lost(self, count: int, stream: str, time: float) -> None:
+        """Count lost messages of a stream, "" for an estimate of those of all topics of the vehicle's ULog stream."""
+        self._count("lost", time, count, stream)
 
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
@@ -149,8 +151,12 @@ class Vehicle:
             del self._bursts[kind]
             messages, numbers = f"{burst.count} message{'s' * (burst.count > 1)}", {"messages": burst.count}
             if kind == "lost":
-                names = tuple(sorted(burst.topics))
-                text = f"{messages} lost ({', '.join(names)})"
+                names = tuple(sorted(burst.topics - {""}))
+                streams = ", ".join(names)
+                if "" in burst.topics:
+                    messages = f"about {messages}"
+                    streams = f"{streams} and the ULog stream" if streams else "the ULog stream"
+                text = f"{messages} lost ({streams})"
                 self.emit(Finding(kind, "once", text, names, numbers), "", burst.begin)
             elif kind == "rejected":
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
@@ -224,13 +230,13 @@ class Vehicle:
                     for found in detector.stop():
                         self.emit(found, address.topic, self._main_time - silence)
 
-    def _is_vision_fused(self) -> bool | None:
-        """Return whether the primary EKF fuses any vision, None if the data does not tell."""
+    def _is_vision_fused(self) -> tuple[bool | None, int]:
+        """Return whether the primary EKF fuses any vision, None if unknown, and the time of this state [us]."""
         detector = self._detectors.get(Address(self.name, _EKF, self._ekf))
         if detector is None or detector.last is None:
-            return None
+            return None, 0
         flags = [flag for flag in _read_vision(detector.last) if flag is not None]
-        return any(flags) if flags else None
+        return any(flags) if flags else None, detector.stamp
 
     def state(self, time: float) -> State:
         """Return the current state, set by active and flapping conditions and single events of the last minute."""
@@ -350,7 +356,7 @@ class Vehicle:
     @property
     def held_from_start(self) -> str:
         """Bad and watch conditions active since the first message, as text; "" if none."""
-        active = [*self.conditions.values(), *self.usual.values()]
+        active = self.conditions.values()
         held = [condition.text for condition in active if condition.initial and condition.severity != "info"]
         return ", ".join(dict.fromkeys(held))
 
@@ -369,7 +375,8 @@ class Vehicle:
             unused = [each for each in self._detectors if each.topic == rules.POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
-        if instance and topic not in (*rules.POSITIONS, *rules.AID_SOURCES, _EKF):  # only the first instance of sensors and batteries
+        is_of_ekf = topic in (*rules.POSITIONS, *rules.AID_SOURCES, _EKF)
+        if instance and not is_of_ekf:  # only the first instance of sensors and batteries
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
@@ -388,21 +395,27 @@ class Vehicle:
             self.main, self._position = address, PositionDetector()
             self._comparison.reset()
             return self._position
+        found = self._detector_of(topic, instance)
+        if found is not None and topic in _EVIDENCE_OF:
+            self._supplies.setdefault(_EVIDENCE_OF[topic], _Supply()).detectors[address] = found
+        return found
+
+    def _detector_of(self, topic: str, instance: int) -> ChangeDetector | None:
+        """Return a detector for a topic other than the positions, None if it has no events."""
         own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
-        if own is not None and topic == _EKF:
-            own = *own[:2], partial(self._detect_flags, instance, own[2])
-        kind = detectors.TextDetector if topic == "log_message" else ChangeDetector
-        is_reference = topic in REFERENCES
         if topic in rules.AID_SOURCES:
             return AidDetector(topic, lambda primary: primary == self._ekf)
         if topic in rules.VISION:
             return VisionDetector(self._is_vision_fused)
+        if topic in REFERENCES:
+            return ReferenceDetector(topic, self._comparison, own)
         if topic == MAGNETOMETER:
-            own = (), (), detectors.detect_nothing
-        found = ReferenceDetector(topic, self._comparison, own) if is_reference else kind(*own) if own else None
-        if found is not None and topic in _EVIDENCE_OF:
-            self._supplies.setdefault(_EVIDENCE_OF[topic], _Supply()).detectors[address] = found
-        return found
+            return ChangeDetector((), (), detectors.detect_nothing)
+        if own is None:
+            return None
+        if topic == _EKF:
+            own = *own[:2], partial(self._detect_flags, instance, own[2])
+        return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
 
     def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
@@ -499,7 +512,10 @@ class Vehicle:
         """Count an event; return True if there are too many like it to report each; `settle` reports the last one."""
         if event.change == "once":
             alike = event.text if event.kind == "text" else (event.names, event.severity)
-            limits = {(event.kind, alike): rules.EQUAL_EVENTS, (event.kind, None): rules.SINGLE_EVENTS}
+            limits: dict[tuple[str, object], int] = {
+                (event.kind, alike): rules.EQUAL_EVENTS,
+                (event.kind, None): rules.SINGLE_EVENTS,
+            }
         else:  # flags of a kind may change in any combination
             limits = {(event.kind, event.names): rules.CONDITION_CHANGES, (event.kind, None): rules.KIND_CHANGES}
             if (event.kind, None) in self._suppressed:

@@ -149,9 +149,7 @@ def verdict_of(
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 
 
-def _without_faults(
-    held: Iterable[Condition], times: Times, end: float, since: float | None, *, is_known: bool
-) -> str:
+def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None, *, is_known: bool) -> str:
     if not times.is_live:
         text = f"no faults in {end:.0f} s"
     elif since is None:
@@ -169,18 +167,16 @@ def _head(
 ) -> str:
     """Return the words before the worst fault: whether the position is valid, and since when."""
     of_estimate = [story for story in stories if story.is_bad and story.spans[0].is_of_estimate]
-    if worst.is_bad:
-        if worst not in of_estimate:
-            return ""
+    if worst.is_bad and worst in of_estimate:
         return "was not usable: " if is_past else "not usable: "
-    if not usable:
+    if worst.is_bad or not usable:
         return ""
     if any(story.in_flight for story in of_estimate):
         return "position valid now, but "
     if of_estimate:
         return "position valid in flight, but "
     if times.is_live and since is not None:
-        return f"position valid since {times.text_at(since)}, but "
+        return f"position valid since {times.text_at(since)} UTC, but "
     return "position valid throughout, but "
 
 
@@ -214,13 +210,13 @@ def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]
         subjects |= _subjects(event.text)
 
     def order(text: Event) -> tuple[bool, bool, float, float]:
-        distance = abs(text.time - worst.since)
+        distance = round(abs(text.time - worst.since), 1)
         if text.time > worst.since or worst.begin is None:
             return True, False, text.numbers.get("level", 0.0), distance
         return False, subjects.isdisjoint(_subjects(text.text)), text.severity != "bad", distance
 
     said: list[Event] = []
-    for text in sorted(texts, key=order):
+    for text in sorted(texts, key=lambda text: (order(text), len(text.text))):
         if not any(_is_same(text, other) for other in said):
             said.append(text)
     said = said[:_MAX_TEXTS]
