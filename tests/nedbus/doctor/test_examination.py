@@ -647,6 +647,27 @@ def test_mavlink_traffic_produces_findings() -> None:
     find(findings, "mavlink", "warning", r"address already in use")
 
 
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, "the type MAV_TYPE_ONBOARD_CONTROLLER"), (250, "the unknown type 250")],
+)
+def test_heartbeats_of_others_with_component_1_are_named(kind: int, text: str) -> None:
+    """A router or an unknown component with component id 1 is no vehicle, and is named, alone or beside a vehicle."""
+    vehicle = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    other = mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+    reason = f"not an autopilot: its HEARTBEAT has {text}"
+    findings = check_link(*packets_of(42, other))
+    find(findings, "mavlink", "wrong", f"system 42 component 1: ignored: {reason}")
+    assert not any("PX4 found" in each.seen for each in findings)
+    findings = check_link(*packets_of(7, vehicle), *packets_of(42, other))
+    find(findings, "mavlink", "ok", f"system 42 component 1: ignored: {reason}")
+    assert not any("system 42: " in f"{each.subject}: " for each in findings), "it is no vehicle"
+    findings = check_link(*packets_of(7, vehicle), *packets_of(7, other))
+    shared = find(findings, "mavlink", "warning", f"system 7 component 1: some HEARTBEATs are ignored: {reason}")
+    assert "give it a component id of its own" in shared.advice
+    find(findings, "mavlink", "ok", "system 7: PX4 found")
+
+
 def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch) -> None:
     """Findings name the origin of each setting and the mistakes in the sources."""
     Path("nedbus.toml").write_text('prefix = "fleet"\nsource = ["ulog:gone.ulg", "sim:?nonsense=1"]\n')

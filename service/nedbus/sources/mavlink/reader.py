@@ -43,7 +43,7 @@ class LinkReader:
             yield from parse(self._parser, data, self.name, peer, now)
             if not self.link.stream and self._parser.buf_len():
                 yield Rejection(self.name, f"truncated message ({self._parser.buf_len()} B)")
-                self._parser = new_parser()  # the next datagram may be from another sender
+                self._parser = new_parser(self._parser.senders)  # the next datagram may be from another sender
 
 
 @dataclass(slots=True)
