@@ -1,7 +1,7 @@
 """Conversion of individual MAVLink messages to fields of PX4's messages; unknown values are None."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from nedbus_msgs import MESSAGES
@@ -19,9 +19,33 @@ def _number(value: int, unit: float, *unknown: int) -> float | None:
     return None if value in unknown else value / unit
 
 
+def _quaternion(*q: float) -> tuple[float, ...] | None:
+    """Return a quaternion; None if it is unknown: not finite, or all zeros, as from MAVSDK's server."""
+    return q if math.isfinite(sum(q)) and any(q) else None
+
+
+def _variances(covariance: Sequence[float], *indices: int) -> tuple[float, ...] | None:
+    """Return the variances at these indices; None if all are zero, because nothing is exact."""
+    variances = tuple(covariance[index] for index in indices)
+    return variances if any(variances) else None
+
+
+def _global_position(message: Any) -> dict[str, object]:
+    """Convert GLOBAL_POSITION_INT; other autopilots than PX4 send zeros until they have a position."""
+    if not (message.lat or message.lon):
+        return {}
+    return {"lat": message.lat / 1e7, "lon": message.lon / 1e7, "alt": message.alt / 1e3}
+
+
+def _attitude(message: Any) -> dict[str, object]:
+    """Convert ATTITUDE_QUATERNION."""
+    return {"q": _quaternion(message.q1, message.q2, message.q3, message.q4)}
+
+
 def _home(message: Any) -> dict[str, object]:
     """Convert HOME_POSITION, which PX4 sends only with a valid global position."""
-    angles = quaternion_to_euler(message.q) if math.isfinite(sum(message.q)) else (None,) * 3
+    q = _quaternion(*message.q)
+    angles = (None, None, None) if q is None else quaternion_to_euler(q)
     local = (each if math.isfinite(each) else None for each in (message.x, message.y, message.z))
     return {
         "lat": message.latitude / 1e7, "lon": message.longitude / 1e7, "alt": message.altitude / 1e3,
@@ -41,7 +65,7 @@ def _gps(message: Any) -> dict[str, object]:
         "altitude_ellipsoid_m": _number(message.alt_ellipsoid, 1e3, 0),
         "eph": _number(message.h_acc, 1e3, 0), "epv": _number(message.v_acc, 1e3, 0),
         "s_variance_m_s": _number(message.vel_acc, 1e3, 0),
-        "hdop": _number(message.eph, 100, _U16), "vdop": _number(message.epv, 100, _U16),
+        "hdop": _number(message.eph, 100, 0, _U16), "vdop": _number(message.epv, 100, 0, _U16),
         "vel_m_s": _number(message.vel, 100, _U16), "cog_rad": None if course is None else math.radians(course),
         "heading": None if heading is None else wrap(math.radians(heading)),
         "satellites_used": None if message.satellites_visible == 255 else message.satellites_visible,
@@ -77,13 +101,13 @@ def _odometry(message: Any) -> dict[str, object]:
     """Convert ODOMETRY; pose and velocity only in frames that PX4 supports."""
     pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
     of_pose = {
-        "pose_frame": pose, "position": (message.x, message.y, message.z), "q": tuple(message.q),
-        "position_variance": tuple(message.pose_covariance[each] for each in (0, 6, 11)),
-        "orientation_variance": tuple(message.pose_covariance[each] for each in (15, 18, 20)),
+        "pose_frame": pose, "position": (message.x, message.y, message.z), "q": _quaternion(*message.q),
+        "position_variance": _variances(message.pose_covariance, 0, 6, 11),
+        "orientation_variance": _variances(message.pose_covariance, 15, 18, 20),
     }  # fmt: skip
     of_velocity = {
         "velocity_frame": velocity, "velocity": (message.vx, message.vy, message.vz),
-        "velocity_variance": tuple(message.velocity_covariance[each] for each in (0, 6, 11)),
+        "velocity_variance": _variances(message.velocity_covariance, 0, 6, 11),
     }  # fmt: skip
     return {
         **(of_pose if pose else {}), **(of_velocity if velocity else {}),
@@ -97,11 +121,8 @@ CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]]
         "vehicle_local_position",
         lambda each: {name: getattr(each, name) for name in ("x", "y", "z", "vx", "vy", "vz")},
     ),
-    "GLOBAL_POSITION_INT": (
-        "vehicle_global_position",
-        lambda each: {"lat": each.lat / 1e7, "lon": each.lon / 1e7, "alt": each.alt / 1e3},
-    ),
-    "ATTITUDE_QUATERNION": ("vehicle_attitude", lambda each: {"q": (each.q1, each.q2, each.q3, each.q4)}),
+    "GLOBAL_POSITION_INT": ("vehicle_global_position", _global_position),
+    "ATTITUDE_QUATERNION": ("vehicle_attitude", _attitude),
     "ATTITUDE": ("vehicle_attitude", lambda each: {"q": euler_to_quaternion(each.roll, each.pitch, each.yaw)}),
     "ODOMETRY": ("vehicle_odometry", _odometry),
     "HOME_POSITION": ("home_position", _home),

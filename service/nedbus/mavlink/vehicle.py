@@ -26,6 +26,7 @@ _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is res
 _FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose messages
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _UNKNOWN_HEADING: Final = 65535
+_MAX_LATITUDE: Final = 90e7  # 1e-7 deg
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
@@ -203,7 +204,7 @@ class Vehicle:
                 self._store("heading", now + _VALUE_TIMEOUT, heading=wrap(math.radians(message.hdg / 100)))
             case "ATTITUDE" if math.isfinite(message.yaw):
                 self._store("yaw", now + _VALUE_TIMEOUT, heading=wrap(message.yaw))
-            case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
+            case "GPS_GLOBAL_ORIGIN" if _is_origin(message):
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
@@ -216,14 +217,14 @@ class Vehicle:
             case "ODOMETRY":
                 covariance, known = message.velocity_covariance, {}
                 north, east, down = covariance[0], covariance[6], covariance[11]
-                if math.isfinite(north + east) and min(north, east) >= 0:
+                if math.isfinite(north + east) and min(north, east) >= 0 and north + east > 0:
                     known["evh"] = math.sqrt(north + east)
-                if math.isfinite(down) and down >= 0:
+                if math.isfinite(down) and down > 0:
                     known["evv"] = math.sqrt(down)
                 self._store("velocity", now + _VALUE_TIMEOUT, **known)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
-                known = {name: value for name, value in deviations.items() if math.isfinite(value)}
+                known = {name: value for name, value in deviations.items() if math.isfinite(value) and value > 0}
                 valid = _validity(message.flags)
                 self._store("status", now + _STATUS_TIMEOUT, **valid, **known)
                 is_global = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS)
@@ -269,6 +270,11 @@ class Vehicle:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", None)
         return self.clock.newest if ms is None else 1000 * ms
+
+
+def _is_origin(message: Any) -> bool:
+    """Return whether GPS_GLOBAL_ORIGIN has an origin: zeros are none, and PX4 up to 1.15 exceeds 180 degrees."""
+    return abs(message.latitude) <= _MAX_LATITUDE and bool(message.latitude or message.longitude)
 
 
 def _validity(bits: int) -> dict[str, object]:

@@ -286,6 +286,16 @@ UNKNOWN = {  # messages with the values that mean unknown in MAVLink's common.xm
         dialect.MAVLink_home_position_message(1, 1, 1, NAN, NAN, NAN, [NAN] * 4, NAN, NAN, NAN),
         {"lat", "lon", "alt", "valid_hpos", "valid_alt"},
     ),
+    "home without attitude": (
+        dialect.MAVLink_home_position_message(1, 1, 1, 1, 2, 3, [0] * 4, 0, 0, 0),
+        {"lat", "lon", "alt", "x", "y", "z", "valid_hpos", "valid_alt"},
+    ),
+    "attitude": (dialect.MAVLink_attitude_quaternion_message(1000, 0, 0, 0, 0, 0, 0, 0), set[str]()),
+    "odometry without attitude": (
+        dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [0] * 4, *[0] * 6, [0] * 21, [0] * 21, 0, 8, 100),
+        {"pose_frame", "position", "velocity_frame", "velocity", "angular_velocity", "reset_counter", "quality"},
+    ),
+    "global position": (dialect.MAVLink_global_position_int_message(1000, 0, 0, 0, 0, 0, 0, 0, 0), set[str]()),
     "landed": (dialect.MAVLink_extended_sys_state_message(0, 0), set[str]()),
     "status": (
         dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3),
@@ -306,6 +316,21 @@ def test_unknown_values_are_not_provided(name: str) -> None:
     if name == "further cells":
         assert converted is not None
         assert converted.fields["voltage_v"] == 16.0
+
+
+def test_zeros_of_other_messages_are_unknown(vehicle: Vehicle) -> None:
+    """An origin at 0, 0 and accuracies of 0 are no values, so the estimate has neither."""
+    vehicle.handle(dialect.MAVLink_gps_global_origin_message(0, 0, 0), 100.0)
+    vehicle.handle(dialect.MAVLink_estimator_status_message(0, 0x3F, *[0] * 8), 100.0)
+    odometry = dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21)
+    vehicle.handle(odometry, 100.0)
+    assert estimate(vehicle, 1000, 100.0).keys().isdisjoint({"ref_lat", "xy_global", "eph", "epv", "evh", "evv"})
+
+
+def test_origin_beyond_the_antimeridian_is_kept(vehicle: Vehicle) -> None:
+    """PX4 up to 1.15 sends an origin east of 180 degrees."""
+    vehicle.handle(dialect.MAVLink_gps_global_origin_message(-170_000_000, 1_800_000_100, 0), 100.0)
+    assert estimate(vehicle, 1000, 100.0)["ref_lon"] == 180.00001
 
 
 @pytest.mark.parametrize(("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)])
