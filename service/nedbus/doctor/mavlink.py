@@ -14,10 +14,10 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
 from nedbus.mavlink import AUTOPILOT, Senders
-from nedbus.sources import DuplicateIds, Link, expected_header, open_link
+from nedbus.sources import DuplicateIds, Link, expected_header, open_link, parse_link
 from nedbus.timings import TIMINGS
 
-from .finding import Finding, limit_findings, list_names
+from .finding import FIRST_PARTNER, Finding, limit_findings, list_names
 
 _READ_TIMEOUT: Final = 0.25  # s
 _MAX_SENDERS: Final = 5
@@ -57,6 +57,8 @@ def check_mavlink(link: str) -> Iterator[Finding]:
     packets, systems = traffic.packets, traffic.systems
     if not packets:
         advice = "check firewalls, and that the vehicle sends to this host and port ('mavlink status' in PX4's shell)"
+        if parse_link(link).kind == "udpout":
+            advice = f"{advice}; {FIRST_PARTNER}"
         yield Finding("mavlink", link, "wrong", f"no packet within {TIMINGS.listen:g} s", advice)
     elif not systems and not traffic.ignored:
         seen = f"no MAVLink among the packets from {list_names(sorted(packets))} (total: {packets.total()})"

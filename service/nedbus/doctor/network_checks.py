@@ -7,7 +7,7 @@ from nedbus.client import SourceStatus
 from nedbus.events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
-from .finding import Finding, State, brief, list_names
+from .finding import FIRST_PARTNER, Finding, State, brief, list_names
 from .observation import Observation
 
 _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
@@ -100,6 +100,8 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; see the log of its service")
     elif state in {"waiting", "starting"}:
         advice = "check that the vehicle sends to the service; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
+        if source.source.startswith("mavlink:udpout:"):
+            advice = f"{advice}; {FIRST_PARTNER}"
         yield Finding("source", name, "warning", f"{state}: no message yet", advice)
     if source.overload:
         yield Finding("source", name, "wrong", source.overload[:_MAX_TEXT], "stop other programs on its host")

@@ -38,7 +38,7 @@ class MavlinkSource:
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
-        if parse_link(link)[0] != "serial" and "baud" in options.model_fields_set:
+        if parse_link(link).kind != "serial" and "baud" in options.model_fields_set:
             raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
