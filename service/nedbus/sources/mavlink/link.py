@@ -22,6 +22,8 @@ Peer = Any  # remote address, as returned by the socket
 
 _CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect causes 1, a reordered packet 2 more
 _WINDOW: Final = 5.0  # s
+_PEER_TIMEOUT: Final = 3.0  # s without a message from an address until another one replaces it
+_PEER_RUN: Final = 20  # messages in a row from another address that replace it earlier
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
 _MAX_UNSENT: Final = 4096  # bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
@@ -212,6 +214,39 @@ def _wait(file: Any, timeout: float, events: int = 0) -> int:
     return next((found for _, found in poll.poll(timeout * 1000)), 0)
 
 
+def name_of(peer: Peer) -> str:
+    """Return an address as text."""
+    return ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
+
+
+class PeerChoice:
+    """The address to which the messages for one vehicle are sent: the one that has delivered its data.
+
+    Another address that sends with the id of the vehicle, a second link or a stranger, does not replace it at once. It
+    replaces an address that is silent for 3 s, or once it has delivered 20 messages in a row.
+
+    `peer`: the chosen address. `second`: another address that sent while the chosen one did, None if there is none.
+    """
+
+    def __init__(self, peer: Peer, now: float) -> None:
+        self.peer, self.second = peer, None
+        self._last = now  # time of the last message from the chosen address
+        self._other: tuple[Peer, float] | None = None  # last message from another address since then, and its time
+        self._run = 0  # messages from that address since then
+
+    def add(self, peer: Peer, now: float) -> None:
+        """Add a message from an address, at monotonic time `now` [s]."""
+        if peer == self.peer:
+            if self._other is not None and now - self._other[1] < _PEER_TIMEOUT:
+                self.second = self._other[0]
+            self._other, self._run, self._last = None, 0, now
+            return
+        self._run = self._run + 1 if self._other is not None and self._other[0] == peer else 1
+        self._other = peer, now
+        if now - self._last > _PEER_TIMEOUT or self._run >= _PEER_RUN:
+            self.peer, self._other, self._run, self._last = peer, None, 0, now
+
+
 class DuplicateIds:
     """Detect system ids with two senders, whose messages arrive alternately from two addresses."""
 
@@ -228,5 +263,5 @@ class DuplicateIds:
         if len(changes) < _CHANGES or now - changes[0][1] > _WINDOW or system in self._found:
             return ""
         self._found.add(system)
-        both = " and ".join(":".join(map(str, each[:2])) for each in (changes[-2][0], peer))  # only UDP has several
+        both = f"{name_of(changes[-2][0])} and {name_of(peer)}"
         return f"{both} both send as system {system}, and their messages are mixed; give each its own MAV_SYS_ID"

@@ -82,6 +82,10 @@ class LogStream:
         self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
         self._new_header = True  # not yet logged
 
+    def serves(self, client: LogStreamClient) -> bool:
+        """Return whether this is the stream of a client."""
+        return client is self._client
+
     @property
     def is_streaming(self) -> bool:
         """True while the stream delivers messages."""
