@@ -13,7 +13,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.mavlink import AUTOPILOT, Senders
+from nedbus.mavlink import AUTOPILOT, HIGH_LATENCY, Senders
 from nedbus.sources import DuplicateIds, Link, expected_header, open_link, parse_link
 from nedbus.timings import TIMINGS
 
@@ -138,6 +138,9 @@ def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
         seen = f"{_POSITION} at {counts[_POSITION] / TIMINGS.listen:.0f} Hz; messages: {types}"
         advice = "" if counts["ODOMETRY"] else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
         return Finding("mavlink", name, "ok", seen, advice)
+    if set(counts) == {HIGH_LATENCY}:
+        advice = "'nedbus serve' publishes global position, status and battery, and sends nothing to the vehicle"
+        return Finding("mavlink", name, "ok", f"a satellite link: {HIGH_LATENCY} only", advice)
     seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}, only {types}"
     advice = (
         f"'nedbus serve --source mavlink:{link}' requests it; if none arrives, PX4 may have no estimate, or may need"

@@ -9,7 +9,7 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .boot_clock import BootClock
-    from .fields import CONVERSIONS
+    from .fields import CONVERSIONS, HIGH_LATENCY
     from .log_reassembly import Chunk, Reassembly
     from .parser import Received, new_parser, parse
     from .senders import AUTOPILOT, Senders
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .vehicle import Vehicle
 else:
     _NAMES = {
-        "boot_clock": "BootClock", "fields": "CONVERSIONS", "log_reassembly": "Chunk Reassembly",
+        "boot_clock": "BootClock", "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
         "parser": "Received new_parser parse", "senders": "AUTOPILOT Senders",
         "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",
     }  # fmt: skip

@@ -4,9 +4,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from pymavlink.dialects.v20 import common as dialect
+
 from nedbus_msgs import MESSAGES
 from nedbus_msgs.frames import euler_to_quaternion, quaternion_to_euler, wrap
 
+_U8: Final = 2**8 - 1  # "unknown", or more
 _U16: Final = 2**16 - 1  # "unknown" in most fields of this type
 _WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # MAV_BATTERY_CHARGE_STATE to `warning`
 _FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: standby, active, critical
@@ -116,6 +119,34 @@ def _odometry(message: Any) -> dict[str, object]:
     }  # fmt: skip
 
 
+def _position_of_high_latency(message: Any) -> dict[str, object]:
+    """Convert the position in HIGH_LATENCY2; its errors in decimetres are at most 25.4 m."""
+    if not (message.latitude or message.longitude):
+        return {}
+    is_valid = not message.failure_flags & dialect.HL_FAILURE_FLAG_ESTIMATOR
+    return {
+        "lat": message.latitude / 1e7, "lon": message.longitude / 1e7, "alt": float(message.altitude),
+        "eph": _number(message.eph, 10, 0, _U8), "epv": _number(message.epv, 10, 0, _U8),
+        "lat_lon_valid": is_valid, "alt_valid": is_valid,
+    }  # fmt: skip
+
+
+def _status_of_high_latency(message: Any) -> dict[str, object]:
+    """Convert the status in HIGH_LATENCY2, in which only ArduPilot sends whether the vehicle is armed."""
+    fields = {
+        "system_type": message.type, "system_id": message.get_srcSystem(), "component_id": message.get_srcComponent(),
+    }  # fmt: skip
+    if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
+        model = MESSAGES["VehicleStatus"].model
+        is_armed = message.custom0 & _ARMED
+        fields["arming_state"] = model.ARMING_STATE_ARMED if is_armed else model.ARMING_STATE_DISARMED
+    return fields
+
+
+def _battery_of_high_latency(message: Any) -> dict[str, object]:
+    return {"remaining": _number(message.battery, 100, -1)}
+
+
 CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]] = {
     "LOCAL_POSITION_NED": (
         "vehicle_local_position",
@@ -136,8 +167,18 @@ CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]]
 }
 """Topic and conversion function of each MAVLink message."""
 
+HIGH_LATENCY: Final = "HIGH_LATENCY2"
+"""Name of the only message that a vehicle sends over a satellite link."""
+
+OF_HIGH_LATENCY: Final[Mapping[str, Callable[[Any], dict[str, object]]]] = {
+    "vehicle_global_position": _position_of_high_latency,
+    "vehicle_status": _status_of_high_latency,
+    "battery_status": _battery_of_high_latency,
+}
+"""Conversion function of HIGH_LATENCY2 for each topic."""
+
 DECODED: Final = {
-    *CONVERSIONS, "ALTITUDE", "COMMAND_ACK", "ESTIMATOR_STATUS", "GPS_GLOBAL_ORIGIN", "LOGGING_DATA",
+    *CONVERSIONS, HIGH_LATENCY, "ALTITUDE", "COMMAND_ACK", "ESTIMATOR_STATUS", "GPS_GLOBAL_ORIGIN", "LOGGING_DATA",
     "LOGGING_DATA_ACKED", "STATUSTEXT", "SYSTEM_TIME", "SYS_STATUS", "TIMESYNC",
 }  # fmt: skip
 """Names of all MAVLink messages that are used; of others, only the header is."""

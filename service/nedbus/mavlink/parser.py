@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.samples import Rejection
 
-from .fields import DECODED
+from .fields import DECODED, HIGH_LATENCY
 from .log_reassembly import Chunk
 from .senders import Senders
 
@@ -111,6 +111,8 @@ def _layout_of(message: Any) -> _Layout:
         key = f"_{name}_raw" if code == "c" else name  # pymavlink's name of the bytes of a text
         fields[key] = unpack.unpack_from, bool(length) and code != "c"
         offset = unpack.size
+    if message.msgname == HIGH_LATENCY:
+        fields["time_boot_ms"] = fields["timestamp"]
     return _Layout(message.msgname, bytes([message.crc_extra]), message.instance_field, offset, fields)
 
 

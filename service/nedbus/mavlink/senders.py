@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from .fields import DECODED
+from .fields import DECODED, HIGH_LATENCY
 
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations should have others
 
@@ -13,7 +13,7 @@ _BROADCAST: Final = "id 0 is for broadcast only; an autopilot has system id 1 to
 _OTHER_COMPONENT: Final = f"not an autopilot, which has component id {AUTOPILOT}"
 _NO_HEARTBEAT: Final = "not known to be an autopilot, because no HEARTBEAT has arrived"
 
-IDENTIFYING: Final[Set[str]] = {"HEARTBEAT", "HIGH_LATENCY2"}
+IDENTIFYING: Final[Set[str]] = {"HEARTBEAT", HIGH_LATENCY}
 """Names of the messages that contain the type and the autopilot of their sender."""
 
 _SENT_BY_AUTOPILOTS: Final = {

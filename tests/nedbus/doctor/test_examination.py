@@ -251,12 +251,14 @@ def test_service_status_produces_findings(zenoh_session: Session, endpoint: str)
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
         source(source="px4-zenoh:", state="waiting"),
         source(source="mavlink:udpout:10.0.0.1:14580", state="waiting"),
+        source(source="mavlink:satellite", warnings=["system 5: a satellite link"]),
     ]
     with service_status(zenoh_session, version="99.1.0", sources=sources):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
     assert "first address" not in find(findings, "source", "warning", "px4-zenoh:: waiting").advice
     assert "first address" in find(findings, "source", "warning", "mavlink:udpout:10.0.0.1:14580: waiting").advice
+    find(findings, "source", "ok", "mavlink:satellite: system 5: a satellite link")
     find(findings, "source", "warning", "no more messages of 9/x")
     find(findings, "source", "warning", r"messages rejected: 7 \(xy_valid\)")
     find(findings, "version", "warning", r"the service runs nedbus 99\.1\.0")
@@ -619,6 +621,8 @@ def test_mavlink_traffic_produces_findings() -> None:
     """Packets, messages, positions, ULog stream, ignored senders and a port in use produce findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
+    satellite = mavlink.MAVLink_high_latency2_message(5000, 2, 12, *[0] * 24)
+    assert "sends nothing" in find(check_link(*packets_of(7, satellite)), "mavlink", "ok", "a satellite link").advice
     assert "first address" not in find(check_link(), "mavlink", "wrong", "no packet within").advice
     findings = diagnose(free_endpoint(), mavlink=f"udpout:127.0.0.1:{free_port()}", listen=0.1)
     silent = find(findings, "mavlink", "wrong", "no packet within")

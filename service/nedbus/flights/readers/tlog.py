@@ -102,20 +102,20 @@ class TlogReader(FlightReader):
                     vehicles[item.system] = Vehicle(name, self.options.topics), SequenceCounter()
                 vehicle, sequence = vehicles[item.system]
                 vehicle.count_lost(sequence.add(item.sequence, item.time), item.time)
-                found = vehicle.handle(item.message, item.time)
-                if found is None or found.address is None:
-                    continue
-                stream = self._stream(found.address)
-                if isinstance(found, Rejection):
-                    yield Record(stream, {}, stamp, found.reason)
-                    continue
-                if found.rebooted or item.system not in booted:
-                    # The message may have the time of an old sample.
-                    booted.add(item.system)
-                    self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
-                    self.boot_utc = next(iter(self._boots)) if len(self._boots) == 1 else 0
-                self._lost, self._rebooted = found.lost, found.rebooted
-                yield Record(stream, found.fields, stamp)
+                for found in vehicle.handle_all(item.message, item.time):
+                    if found.address is None:
+                        continue
+                    stream = self._stream(found.address)
+                    if isinstance(found, Rejection):
+                        yield Record(stream, {}, stamp, found.reason)
+                        continue
+                    if found.rebooted or item.system not in booted:
+                        # The message may have the time of an old sample.
+                        booted.add(item.system)
+                        self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
+                        self.boot_utc = next(iter(self._boots)) if len(self._boots) == 1 else 0
+                    self._lost, self._rebooted = found.lost, found.rebooted
+                    yield Record(stream, found.fields, stamp)
         if not self.definitions:
             reason = "this file has no autopilot messages for these topics"
             raise SourceError(str(self.path), "; ".join([reason, *self.warnings]))

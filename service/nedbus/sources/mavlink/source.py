@@ -26,6 +26,12 @@ from .saved_stream import StreamFile, state_path
 
 _log = logging.getLogger(__name__)
 
+HIGH_LATENCY_LINK: Final = (
+    "a satellite link, because only HIGH_LATENCY2 arrives: global position, status and battery at its rate; nothing is"
+    " sent to the vehicle"
+)
+"""Description of a link of a vehicle that sends only HIGH_LATENCY2."""
+
 _STATUS_INTERVAL: Final = 1.0  # s between heartbeats, and between status reports of ULog streams
 
 
@@ -68,6 +74,7 @@ class _LinkSession:
         self._unsent = 0  # messages that the link did not accept, to be logged
         self._vehicles: dict[int, Vehicle] = {}
         self._remarked: set[int] = set()  # system ids whose second address was reported
+        self._high_latency: set[int] = set()  # system ids whose satellite link was reported
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
         self._receiver = LogReceiver(LinkReader(link, name=name), options, self._send)
@@ -98,6 +105,8 @@ class _LinkSession:
                 self._log_unsent()
                 for system, log in self._logs.items():
                     yield log.status(now)
+                    if self._vehicles[system].is_high_latency:
+                        continue
                     self._send_to(system, dialect.MAVLink_timesync_message(0, log.request_time()))
 
     def close(self) -> None:
@@ -123,8 +132,10 @@ class _LinkSession:
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1 and self._is_chosen(received):
             log.add_timesync(message.tc1, message.ts1, now)
         if chunk is None:
-            converted = vehicle.handle(message, now, log)
-            items: Iterable[SourceMessage | Rejection] = () if converted is None else (converted,)
+            items: Iterable[SourceMessage | Rejection] = vehicle.handle_all(message, now, log)
+            if vehicle.is_high_latency and system not in self._high_latency:
+                self._high_latency.add(system)
+                yield Rejection(f"{self._name} system {system}", HIGH_LATENCY_LINK, count=0)
         else:
             items = log.add(chunk, now) if log is not None else ()
         is_measured = log is None or chunk is None  # the delay is that of the first message in each part of a stream
@@ -175,10 +186,12 @@ class _LinkSession:
                 self._send_to(system, message)
 
     def _all_peers(self) -> set[Peer]:
-        """Return the addresses of all vehicles, or the only address of the link."""
+        """Return the addresses of all vehicles, or the only address of the link; none that are behind a satellite."""
+        silent = {system for system, vehicle in self._vehicles.items() if vehicle.is_high_latency}
         if self._link.peer is not None:
-            return {self._link.peer}
-        return {vehicle.peers.peer for vehicle in [*self._receiver.vehicles.values()]}  # changed on another thread
+            return set() if silent and silent == self._vehicles.keys() else {self._link.peer}
+        known = [*self._receiver.vehicles.values()]  # changed on another thread
+        return {vehicle.peers.peer for vehicle in known if vehicle.system not in silent}
 
     def _is_chosen(self, received: Received) -> bool:
         """Return whether a message is from the address to which the messages for its vehicle are sent."""
