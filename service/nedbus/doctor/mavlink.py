@@ -13,7 +13,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.mavlink import AUTOPILOT, HIGH_LATENCY, Senders
+from nedbus.mavlink import AUTOPILOT, HIGH_LATENCY, NO_HEARTBEAT, Senders
 from nedbus.sources import DuplicateIds, Link, expected_header, open_link, parse_link
 from nedbus.timings import TIMINGS
 
@@ -114,6 +114,8 @@ def _listen(link: Link) -> _Traffic:
                 if reason := senders.ignore_reason(message, *ids):
                     traffic.ignored[ids] = reason
                     continue
+                if traffic.ignored.get(ids) == NO_HEARTBEAT:
+                    del traffic.ignored[ids]  # it has identified itself since
                 if duplicate := addresses.add(ids[0], peer, now):
                     traffic.duplicates[ids[0]] = duplicate
                 traffic.systems.setdefault(ids[0], []).append(message)

@@ -11,7 +11,8 @@ AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations shoul
 
 _BROADCAST: Final = "id 0 is for broadcast only; an autopilot has system id 1 to 255 and component id 1"
 _OTHER_COMPONENT: Final = f"not an autopilot, which has component id {AUTOPILOT}"
-_NO_HEARTBEAT: Final = "not known to be an autopilot, because no HEARTBEAT has arrived"
+NO_HEARTBEAT: Final = "not known to be an autopilot, because no HEARTBEAT has arrived"
+"""Why a message of a sender is ignored that may identify itself later."""
 
 IDENTIFYING: Final[Set[str]] = {"HEARTBEAT", HIGH_LATENCY}
 """Names of the messages that contain the type and the autopilot of their sender."""
@@ -69,7 +70,7 @@ class Senders:
             return self._others[system]
         if kind in _PRESUMED:
             self._presumed.add(system)
-        return "" if system in self._presumed else _NO_HEARTBEAT
+        return "" if system in self._presumed else NO_HEARTBEAT
 
     def ignores(self, system: int, component: int) -> bool:
         """Return whether all messages with these ids are ignored, as far as known."""

@@ -675,6 +675,10 @@ def test_heartbeats_of_others_with_component_1_are_named(kind: int, text: str) -
     shared = find(findings, "mavlink", "warning", f"system 7 component 1: some HEARTBEATs are ignored: {reason}")
     assert "give it a component id of its own" in shared.advice
     find(findings, "mavlink", "ok", "system 7: PX4 found")
+    pressure = mavlink.MAVLink_scaled_pressure_message(1, 1.0, 1.0, 1)
+    findings = check_link(*packets_of(7, pressure, vehicle), *packets_of(8, pressure))
+    assert not any("system 7 component 1" in each.subject for each in findings), "its heartbeat came second"
+    find(findings, "mavlink", "ok", "system 8 component 1: ignored: not known to be an autopilot")
 
 
 def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch) -> None:
