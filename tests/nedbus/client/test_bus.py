@@ -410,6 +410,15 @@ def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> No
         client.publisher("estimator_local_position", vehicle="1")
 
 
+def test_several_vehicles_are_selected_by_a_list(client: nedbus.Bus) -> None:
+    """`vehicle=["a", 2]` selects these vehicles in `subscribe` and `latest`, with either client."""
+    for vehicle in ("a", "2", "c"):
+        publish(client.publisher(VLP, vehicle=vehicle), 1)
+    assert sorted(sample.vehicle for sample in client.latest(vehicle=["a", 2])) == ["2", "a"]
+    with client.subscribe(vehicle=["a", 2], mode="every") as subscription:
+        assert {subscription.receive(30).vehicle for _ in range(2)} == {"a", "2"}
+
+
 def test_prefixes_separate_fleets(endpoint: str) -> None:
     """Fleets with different prefixes on one router do not see each other."""
     with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
