@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -17,7 +17,7 @@ _MEANT: Final[Mapping[str, str]] = {
 """The option meant by a name that no command has: other tools call it so."""
 
 
-_UsageError: Final = typer.BadParameter.__mro__[1]  # Click's, which newer releases of Typer contain
+_UsageError = cast("type[Exception]", typer.BadParameter.__mro__[1])  # Click's, which newer releases of Typer contain
 
 
 class _StrictParsing:
