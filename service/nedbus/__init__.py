@@ -29,7 +29,20 @@ if TYPE_CHECKING:
         define_msg,
     )
     from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, mask_invalid, to_array, to_message
-    from nedbus_msgs.messages import *  # noqa: F403 - one class per PX4 message
+    from nedbus_msgs.messages import (  # `as`: without it, pyright counts the names as private
+        BatteryStatus as BatteryStatus,
+        EstimatorStatusFlags as EstimatorStatusFlags,
+        FailsafeFlags as FailsafeFlags,
+        HomePosition as HomePosition,
+        LogMessage as LogMessage,
+        SensorGps as SensorGps,
+        TimesyncStatus as TimesyncStatus,
+        VehicleAttitude as VehicleAttitude,
+        VehicleGlobalPosition as VehicleGlobalPosition,
+        VehicleLandDetected as VehicleLandDetected,
+        VehicleOdometry as VehicleOdometry,
+        VehicleStatus as VehicleStatus,
+    )
 
     from . import errors as errors
     from . import frames as frames
