@@ -31,16 +31,38 @@ if TYPE_CHECKING:
     from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, mask_invalid, to_array, to_message
     from nedbus_msgs.messages import (  # `as`: without it, pyright counts the names as private
         BatteryStatus as BatteryStatus,
+    )
+    from nedbus_msgs.messages import (
         EstimatorStatusFlags as EstimatorStatusFlags,
+    )
+    from nedbus_msgs.messages import (
         FailsafeFlags as FailsafeFlags,
+    )
+    from nedbus_msgs.messages import (
         HomePosition as HomePosition,
+    )
+    from nedbus_msgs.messages import (
         LogMessage as LogMessage,
+    )
+    from nedbus_msgs.messages import (
         SensorGps as SensorGps,
+    )
+    from nedbus_msgs.messages import (
         TimesyncStatus as TimesyncStatus,
+    )
+    from nedbus_msgs.messages import (
         VehicleAttitude as VehicleAttitude,
+    )
+    from nedbus_msgs.messages import (
         VehicleGlobalPosition as VehicleGlobalPosition,
+    )
+    from nedbus_msgs.messages import (
         VehicleLandDetected as VehicleLandDetected,
+    )
+    from nedbus_msgs.messages import (
         VehicleOdometry as VehicleOdometry,
+    )
+    from nedbus_msgs.messages import (
         VehicleStatus as VehicleStatus,
     )
 
