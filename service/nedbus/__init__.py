@@ -75,6 +75,7 @@ if TYPE_CHECKING:
         AsyncPublisher,
         AsyncSubscription,
         Bus,
+        LinkCallback,
         Newest,
         Publisher,
         Subscription,
@@ -122,6 +123,7 @@ __all__ = [
     "Flight",
     "FlightSamples",
     "InvalidMessageError",
+    "LinkCallback",
     "Message",
     "MessageArray",
     "Mode",
@@ -161,8 +163,8 @@ __all__ = [
 # By module; a module is imported on first use of one of its names: those for files load no Zenoh, and few load NumPy.
 _MODULES = {
     "nedbus.samples": "Batch Counts Mode Sample",
-    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest Publisher Subscription connect"
-    " connect_async",
+    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus LinkCallback Newest Publisher Subscription"
+    " connect connect_async",
     "nedbus.flights": "Flight FlightSamples UtcOffset open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.transport": "Session Tls",

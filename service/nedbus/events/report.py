@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
@@ -71,7 +72,10 @@ class AccountReport:
         ]
 
 
-_REPORT: Final = TypeAdapter(AccountReport)
+@cache
+def _report_type() -> TypeAdapter[AccountReport]:
+    """Return the validation of a reply; Pydantic takes 30 ms to compile it, so it waits for the first reply."""
+    return TypeAdapter(AccountReport)
 
 
 def report_of(
@@ -118,6 +122,6 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 def from_json(content: object) -> AccountReport | None:
     """Validate the reply of a peer; return None if it is not a report, for example from an older service."""
     try:
-        return _REPORT.validate_python(content)
+        return _report_type().validate_python(content)
     except ValidationError:
         return None
