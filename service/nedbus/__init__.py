@@ -31,44 +31,20 @@ if TYPE_CHECKING:
     from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, mask_invalid, to_array, to_message
     from nedbus_msgs.messages import (  # `as`: without it, pyright counts the names as private
         BatteryStatus as BatteryStatus,
-    )
-    from nedbus_msgs.messages import (
         EstimatorStatusFlags as EstimatorStatusFlags,
-    )
-    from nedbus_msgs.messages import (
         FailsafeFlags as FailsafeFlags,
-    )
-    from nedbus_msgs.messages import (
         HomePosition as HomePosition,
-    )
-    from nedbus_msgs.messages import (
         LogMessage as LogMessage,
-    )
-    from nedbus_msgs.messages import (
         SensorGps as SensorGps,
-    )
-    from nedbus_msgs.messages import (
         TimesyncStatus as TimesyncStatus,
-    )
-    from nedbus_msgs.messages import (
         VehicleAttitude as VehicleAttitude,
-    )
-    from nedbus_msgs.messages import (
         VehicleGlobalPosition as VehicleGlobalPosition,
-    )
-    from nedbus_msgs.messages import (
         VehicleLandDetected as VehicleLandDetected,
-    )
-    from nedbus_msgs.messages import (
         VehicleOdometry as VehicleOdometry,
-    )
-    from nedbus_msgs.messages import (
         VehicleStatus as VehicleStatus,
     )
 
-    from . import errors as errors
-    from . import frames as frames
-    from . import health as health
+    from . import errors as errors, frames as frames, health as health
     from .client import (
         AsyncBus,
         AsyncNewest,
@@ -94,8 +70,13 @@ if TYPE_CHECKING:
         ReceiveError,
         SourceError,
     )
-    from .flights import Flight, FlightSamples, UtcOffset, utc_of
-    from .flights import open_flight as open  # noqa: A004 - as in nedbus.open(path)
+    from .flights import (
+        Flight,
+        FlightSamples,
+        UtcOffset,
+        open_flight as open,  # noqa: A004 - as in nedbus.open(path)
+        utc_of,
+    )
     from .samples import Batch, Counts, Mode, Sample
     from .tables import addresses_of, align, missing_of, read
     from .transport import Session, Tls
@@ -163,8 +144,8 @@ __all__ = [
 # By module; a module is imported on first use of one of its names: those for files load no Zenoh, and few load NumPy.
 _MODULES = {
     "nedbus.samples": "Batch Counts Mode Sample",
-    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus LinkCallback Newest Publisher Subscription"
-    " connect connect_async",
+    "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus LinkCallback Newest Publisher"
+    " Subscription connect connect_async",
     "nedbus.flights": "Flight FlightSamples UtcOffset open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.transport": "Session Tls",
