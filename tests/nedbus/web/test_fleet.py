@@ -252,7 +252,7 @@ def test_last_position_is_the_last_valid_position(sim: SimulatedFleet) -> None:
     assert sim.vehicle().last_position == "none yet"
     sim.fly(1, x=3.0, y=-4.0, z=-5.0)
     sim.fly(1, xy_valid=False, x=77.0, y=77.0)
-    assert sim.vehicle().last_position == "3.0 m north, -4.0 m east, altitude 5.0 m"
+    assert sim.vehicle().last_position == "3.0 m north, -4.0 m east, height 5.0 m"
     sim.fly(1, **ZURICH, x=10.0, z=-12.0)
     sim.fly(1, **ZURICH, xy_valid=False, x=77.0)
     assert sim.vehicle().last_position == "10.0 m north, 0.0 m east, altitude 500.0 m (47.397832, 8.545594)"
