@@ -136,7 +136,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a message, or its supported layouts.
 
-    The schema of a message that is not built in is requested from its publisher.
+    The schema of a message that is not built in is requested from its publisher, by its name or its topic's.
     """
     try:
         definition: Definition[Any] = definition_of(message)
@@ -145,21 +145,25 @@ def schema(
     write(json.dumps(definition.schema()["layouts" if layouts else "json_schema"], indent=2))
 
 
-def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
-    reason = "and no such topic is published"
+def _ask_publisher(open_bus: Callable[[], Bus], name: str) -> Definition[Any]:
+    """Return the definition of a published message, given by the name of its topic or its own."""
+    reason = "and no such message or topic is published"
+    is_message_name = name[:1].isupper()
     try:
-        get_topic(topic)  # raises AddressError for "*"
+        if not is_message_name:
+            get_topic(name)  # raises AddressError for "*"
         with open_bus() as bus:
-            for sample in bus.latest(topic):
+            for sample in bus.latest(ANY if is_message_name else name):
                 message: Message = sample.message
-                return message.DEFINITION
+                if name in (message.DEFINITION.name, sample.topic):
+                    return message.DEFINITION
     except AddressError:
         pass
     except ConnectError as exc:
         reason = f"and no publisher can be queried ({exc})"
-    near = get_close_matches(topic, [*MESSAGES, *TOPICS], 3, _SIMILAR)
+    near = get_close_matches(name, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
-    raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
+    raise ConfigError("message", f"unknown message {name!r}, {reason}: {hint}")
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

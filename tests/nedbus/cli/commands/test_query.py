@@ -19,7 +19,7 @@ from nedbus.client import Subscription
 from nedbus.settings import Settings
 from nedbus.timings import Timings
 from nedbus.transport import liveliness, open_router
-from nedbus_msgs import ANY
+from nedbus_msgs import ANY, define_msg
 from tests.flights.local_position import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import fork_command, run_command
@@ -176,6 +176,20 @@ def test_schema_needs_no_network() -> None:
     """`schema` prints JSON Schema and layouts without a router."""
     assert json.loads(run_command("schema").out) == json_schema()
     assert [layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)] == list(LAYOUTS)
+
+
+@pytest.mark.parametrize("name", ["Gripper", "gripper_left"])
+def test_schema_of_a_published_message_is_found_by_its_name_or_topic(endpoint: str, bus: nedbus.Bus, name: str) -> None:
+    """`schema` of a message that is not built in accepts its name and its topic; the topic may have another name."""
+    definition = define_msg("Gripper", "uint64 timestamp\nfloat32 width\n")
+    publisher = bus.publisher("gripper_left", vehicle="7", definition=definition)
+    publisher.publish({"timestamp": 1, "width": 0.5})
+    printed = run_command("schema", name, "-c", endpoint)
+    assert printed.exit_code == 0, printed.err
+    assert json.loads(printed.out)["title"] == "Gripper"
+    unknown = run_command("schema", name + "Arm" if name == "Gripper" else name + "_arm", "-c", endpoint)
+    assert unknown.exit_code == 2
+    assert "no such message or topic is published" in unknown.err
 
 
 def test_absence_of_vehicles_is_reported(
