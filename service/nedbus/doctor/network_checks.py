@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import ServiceStatus, SourceStatus
+from nedbus.client import ServiceStatus, SourceStatus, prefix_of
 from nedbus.events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
@@ -245,12 +245,7 @@ def _clock_finding(name: str, clock: str, offset: float, reference: str, advice:
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
     """Yield other prefixes and ROS 2 topics, which readers of this prefix do not receive."""
-    prefixes = set()
-    for key in seen.elsewhere:
-        vehicle, alive, _ = key.partition("/@alive/")
-        before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
-        if before and not before[0].isdecimal():  # `<domain>/fmu/out/vehicle_local_position` is a ROS 2 topic
-            prefixes.add("/".join(before))
+    prefixes = {prefix_of(key) for key in seen.elsewhere}
     for prefix in sorted(prefixes - {""})[:5]:
         advice = f"use --prefix {prefix} or NEDBUS_PREFIX={prefix} to read them, or correct the publisher's prefix"
         text = f"messages are published under {prefix}/, but the prefix here is {seen.prefix}/"

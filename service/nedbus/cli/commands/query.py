@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus.cli.absence import explain_absence
 from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
@@ -33,12 +34,13 @@ _MAX_WARNINGS: Final = 5  # shown per source: damage of its file, or the first r
 def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption = False) -> None:
     """List the published streams with the state of each and the age of its last message.
 
-    Exits with 1 if the given vehicle is not published, or if the router is too slow or refuses the query.
+    Without any, states the reason: a failed source, a vehicle's lost link, another prefix.
+    Exits with 1 then, if the given vehicle is not published, and if the router is too slow or refuses the query.
     """
     selection = Selection(ANY, vehicle or ANY)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=selection.vehicles)}
-    rows = []
+    rows, is_fault = [], False
     for address in sorted({*filter(selection.matches, everything), *newest}):
         sample = newest.get(address)
         health = health_of_last(sample) if sample else None
@@ -54,15 +56,14 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
-        hint = "start a source with 'nedbus serve'" if everything.complete else "not all streams are listed: try again"
-        if others := sorted({address.vehicle for address in everything}):
-            hint = f"choose one of {to_text(', '.join(others[:20]))}"
-        elif bus.services():
-            hint = "a service answers: see 'nedbus info' and the access rules for it and this client (docs/security.md)"
+        published = {address.vehicle for address in everything}
+        hint, is_fault = "not all streams are listed: try again", True
+        if everything.complete or published:
+            hint, is_fault = explain_absence(bus, published, vehicle or ())
         what = f"no vehicle {' or '.join(vehicle)}" if vehicle else "no vehicle"
         known = "is published" if everything.complete else "is known yet"
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
-    if not everything.complete or (not rows and vehicle):
+    if not everything.complete or (not rows and (vehicle or is_fault)):
         raise typer.Exit(1)
 
 
