@@ -13,7 +13,7 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOptio
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
+from nedbus.client import Bus, Health, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
 from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
@@ -34,16 +34,18 @@ _MAX_WARNINGS: Final = 5  # shown per source: damage of its file, or the first r
 def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption = False) -> None:
     """List the published streams with the state of each and the age of its last message.
 
+    A stream is stale by the rule of `nedbus hz`, if a service publishes it: services report its usual interval.
     Without any, states the reason: a failed source, a vehicle's lost link, another prefix.
     Exits with 1 then, if the given vehicle is not published, and if the router is too slow or refuses the query.
     """
     selection = Selection(ANY, vehicle or ANY)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=selection.vehicles)}
+    measured = _measured_by_services(bus) if newest else {}
     rows, is_fault = [], False
     for address in sorted({*filter(selection.matches, everything), *newest}):
         sample = newest.get(address)
-        health = health_of_last(sample) if sample else None
+        health = health_of_last(sample, measured=measured.get(str(address))) if sample else None
         state = stream_state(health, publishers=everything[address]) if health else None
         age = health.age if health else None
         is_stored = sample is not None and sample.stored
@@ -65,6 +67,12 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
     if not everything.complete or (not rows and (vehicle or is_fault)):
         raise typer.Exit(1)
+
+
+def _measured_by_services(bus: Bus) -> dict[str, Health]:
+    """Return the health of the streams that services report, by address; one message reveals no usual interval."""
+    sources = [source for service in bus.services() for source in service.sources]
+    return {stream.address: stream.health for source in sources for stream in source.streams}
 
 
 @command
