@@ -79,13 +79,15 @@ class ConfigError(NedbusError, ValueError):
 
 
 class ConnectError(NedbusError, ConnectionError):
-    """Raised when no endpoint answers in time."""
+    """Raised when no endpoint answers in time; `advice`: the remedy, if the cause is known."""
 
-    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
+    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "", *, advice: str = "") -> None:
         self.endpoints = tuple(endpoints)
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
         where = " or ".join(endpoints)
-        if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
+        if advice:
+            super().__init__(f"no Zenoh session at {where} ({tried}): {advice}; run 'nedbus doctor' to check it")
+        elif any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
             advice = reason or (
                 "check that tls_ca signed the router's certificate and tls_certificate, that none of them has expired,"
                 " and that the router's certificate names the host of the endpoint"

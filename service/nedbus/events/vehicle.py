@@ -495,7 +495,7 @@ class Vehicle:
         self._invalid = -math.inf
         last, self._rebooted = self._rebooted, time
         if time - last >= rules.PAUSE and ("duplicate", "") not in self.conditions:
-            text = f"reboot: time since boot is {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
+            text = f"reboot (up for {self.boot or 0.0:.1f} s, before it for {before / 1e6:.1f} s)"
             self.emit(Finding("reboot", "once", text, numbers={"before": before / 1e6}), "", time)
 
     def _report(self, event: Event) -> None:

@@ -93,7 +93,10 @@ def align(
         wanted = names if topics else None
         streams, start, offset = read_streams(flight, wanted, vehicle=vehicle, layout=layout, utc=utc)
     if isinstance(on, str):
-        found = [name for name in streams if f"/{name}".endswith(f"/{on}")]
+        found = _streams_named(on, streams)
+        if not found and not isinstance(flight, Mapping):  # not one of the topics known to nedbus
+            streams |= read_streams(flight, [on], vehicle=vehicle, layout=layout).streams
+            found = _streams_named(on, streams)
         if not found:
             expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
             raise ArgumentError("on", on, expected, problem="is not in this flight")
@@ -124,6 +127,10 @@ def align(
     for name, column in columns.items():
         table[name] = column
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
+
+
+def _streams_named(name: str, streams: Streams) -> list[str]:
+    return [each for each in streams if f"/{each}".endswith(f"/{name}")]
 
 
 def _choose_streams(arrays: Mapping[str, MessageArray], topics: Sequence[str] | None, names: Sequence[str]) -> Streams:

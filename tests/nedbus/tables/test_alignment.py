@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import pytest
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.flights import RecordingWriter, find_utc
-from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
+from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, define_msg, definition_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
@@ -266,6 +267,31 @@ def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
         nedbus.read(tmp_path / "two.mcap", ["*"])
     with pytest.raises(AddressError, match=r"vehicle '\*' is not valid"):
         nedbus.utc_of(tmp_path / "two.mcap")
+
+
+@pytest.mark.parametrize("wrong", [{"topics": [VLP, "nope"]}, {"on": "nope"}, {"topics": ["nope"]}])
+def test_unknown_stream_is_one_error_with_the_streams_of_the_file(tmp_path: Path, wrong: Any) -> None:
+    """An unknown stream raises one error without a chained one; it lists all known streams of the file."""
+    path = write(tmp_path / "a.mcap", {VLP: POSITIONS, "home_position": HOME})
+    with pytest.raises(AddressError, match=r"topic '.*nope' is not in .*: expected one of .*") as raised:
+        nedbus.align(path, **wrong)
+    assert f"1/home_position, 1/{VLP}" in str(raised.value)
+    assert raised.value.__cause__ is None
+    assert raised.value.__suppress_context__ or raised.value.__context__ is None
+
+
+def test_rows_may_be_those_of_a_message_that_only_the_file_defines(tmp_path: Path) -> None:
+    """`on` accepts each stream of a file, without `topics` too."""
+    definition = define_msg("Gripper", "uint64 timestamp\nfloat32 width\n")
+    grips = arrays_of(definition).of([definition.model(timestamp=1_150_000, width=0.5)])
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for topic, kind, array in ((VLP, definition_of(VLP), POSITIONS), ("gripper", definition, grips)):
+            addresses = repeat((Address("1", topic), Provenance()))
+            writer.write(array, kind, addresses, logged=[1] * len(array), published=repeat(1))
+    table = nedbus.align(path, on="gripper")
+    assert table["gripper.width"].tolist() == [0.5]
+    assert table[f"{VLP}.x"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize("wild", [10**11, 9 * 10**18])

@@ -143,6 +143,7 @@ def why(
             reports = bus.accounts(within=_DAY)
             published = bus.vehicles()
             routers = " or ".join(bus.routers)
+            absence = "" if by_vehicle(reports) else _explain_absence(bus)
         found = _in_order(event for report in reports for event in report.events)
         times, where, advice = Times(is_live=True), "the history of the services", _LIVE_ADVICE
     reporting, faults, texts = by_vehicle(reports), 0, list[str]()
@@ -151,7 +152,7 @@ def why(
             hint = f"follow it with 'nedbus events --vehicle {name}'"
             raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
     if not files and not reporting:
-        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: start one with 'nedbus serve'")
+        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: {absence}")
     _require_vehicles(where, reporting, vehicle or ())
     for name in vehicle or reporting:
         events = [event for event in found if event.vehicle in (name, ANY)]
@@ -177,6 +178,12 @@ def why(
         write(("\n\n" if details else "\n").join(texts))
     if faults and not details:
         write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
+
+
+def _explain_absence(bus: "Bus") -> str:
+    from nedbus.cli.absence import explain_absence  # loads Zenoh, which files do not need
+
+    return explain_absence(bus, ()).reason
 
 
 def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:

@@ -289,7 +289,7 @@ def test_why_without_router_or_service_fails(endpoint: str) -> None:
     assert len(result.err.splitlines()) == 1
     result = run_command("why", "-c", endpoint)
     assert (result.exit_code, result.err) == (
-        1, f"nedbus: no nedbus service at {endpoint} has data on any vehicle: start one with 'nedbus serve'\n"
+        1, f"nedbus: no nedbus service at {endpoint} has data on any vehicle: start a source with 'nedbus serve'\n"
     )  # fmt: skip
 
 
