@@ -17,6 +17,7 @@ from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
+from nedbus_msgs.frames import derived_from
 
 from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
 
@@ -190,7 +191,7 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     known = list(MESSAGES.values()) if selection.topic == ANY else [BY_TOPIC.get(selection.topic)]
     for name in names:
         first = known[0]  # None for an undeclared message, which may have any field
-        if first is not None and not any(each and name in each.types for each in known):
+        if first is not None and not any(each and name in (*each.types, *derived_from(each.types)) for each in known):
             raise ConfigError("--field", first.explain_unknown_field(name))
     return names
 
