@@ -10,11 +10,10 @@ from bokeh.models import (
     DatetimeTicker,
     FixedTicker,
     HoverTool,
-    Legend,
-    LegendItem,
     Range1d,
     TapTool,
 )
+from bokeh.models.annotations import Legend, LegendItem
 from bokeh.plotting import figure
 
 from nedbus.events import ALL, KINDS, Event, Span
@@ -157,12 +156,13 @@ class Plots:
         legend = Legend()
         for (name, title), colour in zip(titles.items(), self._style.vehicles, strict=False):
             line = plot.line("time", name, source=self.chosen, color=colour, line_width=1.5)
-            legend.items.append(LegendItem(label=title, renderers=[line]))
+            item = LegendItem(label=title, renderers=[line])  # type: ignore[list-item] # a line is a glyph
+            legend.items.append(item)  # type: ignore[arg-type] # declared as the pairs that a new Legend accepts
             if name in _TRUTH_COLUMNS:
                 truth = self._style.colours["truth"]
                 plot.line("time", name, source=self._truth, color=truth, line_dash="dotted", line_width=1.5)
         if len(titles) == 1:
-            plot.title.text = next(iter(titles.values()))
+            plot.title = next(iter(titles.values()))
         else:
             plot.add_layout(legend, "above")  # instead of a title; inside the frame it would cover the lines
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)

@@ -15,7 +15,7 @@ from nedbus.events import EventLog, Times
 from nedbus.monitoring import Snapshot
 from nedbus.web.event_timeline import EventTimeline
 from nedbus.web.fleet import TRUTH
-from nedbus.web.stream import COLUMNS, POINTS, PageStream
+from nedbus.web.stream import COLUMNS, POINTS, PageStream, Position
 from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection
 from tests.flights.messages import VALID, VLP, message
@@ -270,9 +270,9 @@ def test_vehicles_with_global_origins_share_one_origin(sim: SimulatedFleet) -> N
     sim.fly(1, lost, x=1.0, y=2.0)
     places = {row.vehicle: row.main.stream.valid for row in sim.poll().vehicles}
     assert all(places.values())
-    assert places["wing"] == pytest.approx((2.0, 1.0, 488.0, True), abs=1e-3)
-    assert places["quad"] == pytest.approx((52.0, 101.0, 488.0, True), abs=0.05)
-    assert places["lost"] == (2.0, 1.0, 0.0, False)
+    assert places["wing"] == pytest.approx((2.0, 1.0, 488.0, True, True), abs=1e-3)
+    assert places["quad"] == pytest.approx((52.0, 101.0, 488.0, True, True), abs=0.05)
+    assert places["lost"] == Position(2.0, 1.0, 0.0, common=False, is_altitude_global=False)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
