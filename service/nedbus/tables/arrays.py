@@ -156,4 +156,5 @@ def _to_signed(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Convert uint64 to int64, larger values to 2^63 - 1: a negative difference of uint64 wraps to about 2^64."""
     if values.dtype != np.uint64:
         return values
-    return np.minimum(values, np.uint64(2**63 - 1)).astype(np.int64)
+    signed: npt.NDArray[np.int64] = np.minimum(values, np.uint64(2**63 - 1)).astype(np.int64)
+    return signed

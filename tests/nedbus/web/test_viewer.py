@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from bokeh.document import Document
 from bokeh.document.events import ColumnsPatchedEvent
-from bokeh.models import ColumnDataSource, Legend
+from bokeh.models import ColumnDataSource
+from bokeh.models.annotations import Legend
 from bokeh.plotting import figure
 from hypothesis import given, strategies as st
 
