@@ -78,7 +78,8 @@ def read(
     Fields that a layout or source lacks are NaN, false or 0; `nedbus.missing_of` names them.
     Invalid messages and damaged parts of the file are skipped and logged.
     `dataframe`: return a pandas or polars data frame, with array fields as columns `delta_xy[0]`, `delta_xy[1]` and
-    nulls for missing fields; a pandas data frame names these in `attrs["missing"]`.
+    nulls for missing fields; a pandas data frame names these in `attrs["missing"]`. Its uint64 fields, such as
+    `timestamp`, are int64, so that differences may be negative; values above 2^63 - 1 become 2^63 - 1.
     A list of topics, or of streams such as "sensor_gps/1", returns a dict by stream, for one vehicle. "*" selects all
     streams of the file, including messages that only the file defines.
     `layout`: the PX4 release, such as "1.15", whose layouts a recording has, if its definitions are of another one.

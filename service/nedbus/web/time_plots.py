@@ -151,20 +151,18 @@ class Plots:
         replace(self._spans, held)
 
     def _draw(self, titles: Mapping[str, str]) -> figure:
-        plot = _time_figure(self.range, self._clock, height=76, min_height=76)
+        title = next(iter(titles.values())) if len(titles) == 1 else None  # otherwise the legend
+        plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
         plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
-        legend = Legend()
-        for (name, title), colour in zip(titles.items(), self._style.vehicles, strict=False):
-            line = plot.line("time", name, source=self.chosen, color=colour, line_width=1.5)
-            item = LegendItem(label=title, renderers=[line])  # type: ignore[list-item] # a line is a glyph
-            legend.items.append(item)  # type: ignore[arg-type] # declared as the pairs that a new Legend accepts
+        entries: list[Any] = []
+        for (name, label), colour in zip(titles.items(), self._style.vehicles, strict=False):
+            line: Any = plot.line("time", name, source=self.chosen, color=colour, line_width=1.5)
+            entries.append(LegendItem(label=label, renderers=[line]))
             if name in _TRUTH_COLUMNS:
                 truth = self._style.colours["truth"]
                 plot.line("time", name, source=self._truth, color=truth, line_dash="dotted", line_width=1.5)
-        if len(titles) == 1:
-            plot.title = next(iter(titles.values()))
-        else:
-            plot.add_layout(legend, "above")  # instead of a title; inside the frame it would cover the lines
+        if title is None:
+            plot.add_layout(Legend(items=entries), "above")  # inside the frame it would cover the lines
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
         plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)
