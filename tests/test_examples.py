@@ -62,8 +62,15 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
     assert process.err == ""
 
 
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_example_that_prints_leaves_sigpipe_to_the_system(path: Path) -> None:
+    """Every example that prints sets the default action of SIGPIPE; some print too rarely to try it."""
+    text = path.read_text()
+    assert ("print(" in text) == ("signal.signal(signal.SIGPIPE, signal.SIG_DFL)" in text)
+
+
 @pytest.mark.process
-@pytest.mark.parametrize("name", ["position_async.py", "plain_zenoh.py", "batches.py"])
+@pytest.mark.parametrize("name", [name for name in PRINTS if name not in {"alarm.py", "fleet.py"}])
 def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path: Path, name: str) -> None:
     """An example whose reader leaves, as in `| head -1`, prints no traceback."""
     script = tmp_path / name

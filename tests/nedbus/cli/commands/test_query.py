@@ -250,7 +250,6 @@ def test_duration_without_data_exits_with_1(endpoint: str, command: str, key_exp
 @pytest.mark.parametrize("command", ["list", "echo", "hz", "get", "info"])
 def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a router, a command exits with 1 and prints one line with the endpoint, the time waited and a remedy."""
-
     connect = nedbus.Bus  # looked up before it is replaced
 
     def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
