@@ -67,6 +67,10 @@ class Times:
             return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
         return format_utc(utc)
 
+    def text_at(self, time: float) -> str:
+        """Format a time of live data on the event log's clock [s], as UTC."""
+        return format_utc(time + self.ahead)
+
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
         """Format a period and its duration [s]; `begin` and `end` are None if they are outside the data."""
         still = f"until {'now' if self.is_live else 'the end'}"
