@@ -156,7 +156,9 @@ class Vehicle:
                 if "" in burst.topics:
                     messages = f"about {messages}"
                     streams = f"{streams} and the ULog stream" if streams else "the ULog stream"
-                text = f"{messages} lost ({streams})"
+                duration = burst.end - burst.begin
+                within = f" in {format_duration(duration)}" if duration >= 1 else ""
+                text, numbers = f"{messages} lost{within} ({streams})", {**numbers, "duration": duration}
                 self.emit(Finding(kind, "once", text, names, numbers), "", burst.begin)
             elif kind == "rejected":
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
