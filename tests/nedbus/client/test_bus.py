@@ -405,7 +405,7 @@ def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> No
     with pytest.raises(nedbus.AddressError, match="vehicle"):
         client.latest(vehicle="a/b")
     with pytest.raises(nedbus.AddressError, match=r"vehicle \[\['1'\]\] .* a list of names"):
-        client.subscribe(vehicle=[["1"]])  # type: ignore[call-overload] # the mistake under test
+        client.subscribe(vehicle=[["1"]])  # type: ignore[list-item] # the mistake under test
     with pytest.raises(nedbus.AddressError, match="instance"):
         client.publisher("estimator_local_position", vehicle="1")
 

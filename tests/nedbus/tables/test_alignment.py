@@ -283,7 +283,7 @@ def test_unknown_stream_is_one_error_with_the_streams_of_the_file(tmp_path: Path
 def test_rows_may_be_those_of_a_message_that_only_the_file_defines(tmp_path: Path) -> None:
     """`on` accepts each stream of a file, without `topics` too."""
     definition = define_msg("Gripper", "uint64 timestamp\nfloat32 width\n")
-    grips = arrays_of(definition).of([definition.model(timestamp=1_150_000, width=0.5)])
+    grips = arrays_of(definition).of([definition.model.model_validate({"timestamp": 1_150_000, "width": 0.5})])
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         for topic, kind, array in ((VLP, definition_of(VLP), POSITIONS), ("gripper", definition, grips)):
