@@ -1,6 +1,6 @@
 """Print an alarm when a vehicle's position is in doubt or nothing arrives for 1 s, and when it is good again."""
 
-import signal
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -31,14 +31,16 @@ def states(vehicle: str) -> Iterator[str]:
                 yield f"ALARM: {', '.join(doubts).lower()}" if doubts else "good"
 
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 if any(argument.startswith("-") for argument in sys.argv[1:]):
     print("usage: alarm.py [VEHICLE]", file=sys.stderr)
     sys.exit(2)
-with suppress(KeyboardInterrupt):
-    watched = sys.argv[1] if len(sys.argv) > 1 else "1"
-    shown = ""
-    for state in states(watched):
-        if state != shown:
-            shown = state
-            print(f"vehicle {watched}: {state}", flush=True)
+watched = sys.argv[1] if len(sys.argv) > 1 else "1"
+shown = ""
+try:
+    with suppress(KeyboardInterrupt):
+        for state in states(watched):
+            if state != shown:
+                shown = state
+                print(f"vehicle {watched}: {state}", flush=True)
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest

@@ -1,6 +1,6 @@
 """Read the messages of all vehicles as NumPy arrays, and print the mean speed of each."""
 
-import signal
+import os
 import sys
 from contextlib import suppress
 
@@ -8,7 +8,6 @@ import numpy as np
 
 import nedbus
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
         for batch in subscription.batches():
@@ -17,5 +16,7 @@ try:
                 speeds = np.hypot(own["vx"], own["vy"])
                 if not np.isnan(speeds).all():
                     print(address.vehicle, len(own), f"{np.nanmean(speeds):.2f} m/s", flush=True)
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except nedbus.ConnectError as exc:
     sys.exit(str(exc))

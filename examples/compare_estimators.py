@@ -1,14 +1,13 @@
 """Print the distance of each EKF instance from the ground truth, in mode "every" to compare every message."""
 
 import math
-import signal
+import os
 import sys
 from contextlib import suppress
 
 import nedbus
 
 truth: nedbus.frames.Ned | None = None
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus:
         for sample in bus.subscribe("*", vehicle="1", mode="every"):
@@ -20,5 +19,7 @@ try:
             elif sample.topic == "estimator_local_position" and truth and message.position:
                 error = math.dist(message.position, truth)
                 print(f"estimator {sample.instance}: {error:6.2f} m off, reports eph {message.eph:5.2f} m")
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except nedbus.ConnectError as exc:
     sys.exit(str(exc))

@@ -1,7 +1,7 @@
 """Print the highest speed of each vehicle: of live vehicles, or of files given as arguments."""
 
 import math
-import signal
+import os
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
@@ -19,7 +19,6 @@ def show_highest_speeds(samples: Iterable[nedbus.Sample]) -> None:
             print(f"{sample.vehicle}: {speed:.1f} m/s", flush=True)
 
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt):
         if files := sys.argv[1:]:
@@ -28,5 +27,7 @@ try:
         else:
             with nedbus.connect() as bus:
                 show_highest_speeds(bus.subscribe(nedbus.VehicleLocalPosition, mode="every"))
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except (nedbus.ConnectError, nedbus.SourceError) as exc:
     sys.exit(str(exc))

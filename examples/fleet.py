@@ -1,12 +1,11 @@
 """List all vehicles once: their streams, positions, and the age of their last messages."""
 
-import signal
+import os
 import sys
 from contextlib import suppress
 
 import nedbus
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus:
         for vehicle, addresses in bus.vehicles().items():
@@ -17,5 +16,7 @@ try:
             where = "no valid position" if position is None else " ".join(f"{metres:.2f}" for metres in position)
             doubt = ", dead reckoning" if sample.message.dead_reckoning else ""
             print(f"{sample.vehicle}: {where}, {age} old{doubt}")
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except nedbus.ConnectError as exc:
     sys.exit(str(exc))

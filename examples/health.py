@@ -1,13 +1,12 @@
 """Print the health of all streams every two seconds: rate, loss, gaps, and the share of valid messages."""
 
-import signal
+import os
 import sys
 import time
 from contextlib import suppress
 
 import nedbus
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe("*", mode="every") as subscription:
         monitor = nedbus.health.Monitor()
@@ -21,5 +20,7 @@ try:
                 shares = "".join(f", {flag} {share:.0%}" for flag, share in (health.flags or {}).items())
                 rates = f"{health.rate or 0.0:.1f} of {health.nominal:g} Hz"
                 print(f"{address}: {rates}, {health.lost} lost, {health.gaps} gaps{shares}", flush=True)
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except nedbus.ConnectError as exc:
     sys.exit(str(exc))

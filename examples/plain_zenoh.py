@@ -4,7 +4,7 @@ array[0] is the number of the layout; array[1], array[2], ... are PX4's fields i
 """
 
 import json
-import signal
+import os
 import sys
 from contextlib import suppress
 
@@ -14,7 +14,6 @@ import zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), zenoh.open(config) as session:
         samples = session.declare_subscriber("nedbus/*/vehicle_local_position", zenoh.handlers.RingChannel(100))
@@ -22,5 +21,7 @@ try:
             sample = samples.recv()
             array = msgpack.unpackb(sample.payload.to_bytes(), raw=True)  # texts of others may not be UTF-8
             print(sample.key_expr, "timestamp", array[1], "x", array[7], "y", array[8], "z", array[9])
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except zenoh.ZError as exc:
     sys.exit(str(exc))

@@ -1,9 +1,8 @@
-import signal
+import os
 from contextlib import suppress
 
 import nedbus
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus:
         for sample in bus.subscribe():  # vehicle_local_position of all vehicles, by default
@@ -13,5 +12,7 @@ try:
             else:
                 north, east, down = position
                 print(sample.vehicle, f"{north:.2f} m north, {east:.2f} m east, {-down:.2f} m up")
+except BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except nedbus.ConnectError as exc:
     raise SystemExit(str(exc)) from None

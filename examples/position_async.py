@@ -1,7 +1,7 @@
 """Print the position of every vehicle with asyncio, and the message counts once a second."""
 
 import asyncio
-import signal
+import os
 import sys
 from contextlib import suppress
 
@@ -29,9 +29,10 @@ async def main() -> None:
             group.create_task(report(subscription))
 
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt):
         asyncio.run(main())
-except nedbus.ConnectError as exc:
-    sys.exit(str(exc))
+except* BrokenPipeError:
+    os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
+except* nedbus.ConnectError as group:
+    sys.exit(str(group.exceptions[0]))

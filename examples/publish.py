@@ -1,14 +1,12 @@
 """Publish your own estimate at 50 Hz: a vehicle called "mine" flies a circle."""
 
 import math
-import signal
 import sys
 import time
 from contextlib import suppress
 
 import nedbus
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 try:
     with suppress(KeyboardInterrupt), nedbus.connect() as bus:
         publisher = bus.publisher("external_ins_local_position", vehicle="mine")

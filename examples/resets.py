@@ -1,13 +1,11 @@
 """Plot a flight twice: as its estimator reported it, with all resets, and as a track without jumps."""
 
-import signal
 import sys
 
 import matplotlib.pyplot as plt
 
 import nedbus
 
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends the script
 flight, picture = sys.argv[1:]
 tracker = nedbus.ResetTracker()
 messages = [nedbus.to_message(element) for element in nedbus.read(flight)]

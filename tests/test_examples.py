@@ -62,17 +62,13 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
     assert process.err == ""
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_example_that_prints_leaves_sigpipe_to_the_system(path: Path) -> None:
-    """Every example that prints sets the default action of SIGPIPE; some print too rarely to try it."""
-    text = path.read_text()
-    assert "print(" not in text or "signal.signal(signal.SIGPIPE, signal.SIG_DFL)" in text
-
-
 @pytest.mark.process
-@pytest.mark.parametrize("name", [name for name in PRINTS if name not in {"alarm.py", "fleet.py"}])
+@pytest.mark.parametrize("name", sorted(PRINTS.keys() - {"fleet.py", "fastest.py", "alarm.py"}))  # these print rarely
 def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path: Path, name: str) -> None:
-    """An example whose reader leaves, as in `| head -1`, prints no traceback."""
+    """An example whose reader leaves, as in `| head -1`, prints no traceback.
+
+    The default action of SIGPIPE is not used: it would also end a script whose connection to the router breaks.
+    """
     script = tmp_path / name
     script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", simulation))
     command, environment = [sys.executable, "-u", str(script)], os.environ | {"NEDBUS_CONNECT": simulation}
@@ -81,7 +77,7 @@ def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path:
             assert process.stdout is not None
             assert process.stdout.readline()
             process.stdout.close()
-            assert process.wait(DEADLINE) == -signal.SIGPIPE
+            assert process.wait(DEADLINE) == 0
             assert process.stderr is not None
             assert process.stderr.read() == ""
         finally:

@@ -186,10 +186,13 @@ class Selection:
 def _distinct(what: str, given: object) -> tuple[str, ...]:
     """Return the distinct names in one name or several, only "*" if it is among them; the caller checks them."""
     several = given if isinstance(given, Iterable) and not isinstance(given, str) else [given]
-    names = tuple(dict.fromkeys(map(vehicle_name, several)))
+    names: list[str] = []
+    for name in map(vehicle_name, several):
+        if name not in names:  # compared, because a wrong value may not be hashable
+            names.append(name)
     if not names:
         raise AddressError(what, given, f'at least one {what}, or "*" for all')
-    return (ANY,) if ANY in names else names
+    return (ANY,) if ANY in names else tuple(names)
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:

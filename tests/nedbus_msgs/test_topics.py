@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 import zenoh
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from nedbus_msgs import (
     ANY,

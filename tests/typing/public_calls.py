@@ -62,6 +62,8 @@ def subscribe_by_class_and_topic(bus: nedbus.Bus, any_topic: str) -> None:
     assert_type(three.receive().message, nedbus.VehicleAttitude | nedbus.SensorGps | nedbus.HomePosition)
     assert_type(bus.subscribe(nedbus.VehicleAttitude, "sensor_gps"), nedbus.Subscription[nedbus.Message])
     both.batches(max_messages="1")  # type: ignore[arg-type] # not a number
+    bus.subscribe(nedbus.VehicleAttitude, vehicle=["1", 2])
+    bus.latest("*", vehicle=("1", "2"))
     bus.publisher(nedbus.VehicleAttitude, vehicle=7)
     bus.on_link(lambda is_up: assert_type(is_up, bool))
     bus.on_link(3)  # type: ignore[arg-type] # not a function

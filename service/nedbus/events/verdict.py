@@ -15,6 +15,7 @@ from .rules import POSITIONS, SUBJECTS
 from .story import TOGETHER, Story, is_alarm, stories_of
 from .times import Times, format_duration
 
+_GLOBAL: Final = "vehicle_global_position"
 _WIDTH: Final = 97  # columns next to a short vehicle name
 _LINES: Final = 3
 _MODULE: Final = re.compile(r'(?<=PX4: )"\[\w+\] ')  # the name of PX4's module before a text
@@ -105,6 +106,14 @@ class _Parts:
         return textwrap.shorten(text(), _LINES * _WIDTH, placeholder="...") if not fits() else text()
 
 
+def _describe_unknown(topics: Collection[str]) -> str:
+    """Describe data without the validity of positions."""
+    text = "the data has no position validity"
+    if set(POSITIONS).isdisjoint(topics) and _GLOBAL in topics:
+        text += ", only a global position, as over a satellite link (HIGH_LATENCY2)"
+    return text
+
+
 def verdict_of(
     vehicle: str,
     events: Sequence[Event],
@@ -129,7 +138,8 @@ def verdict_of(
     stories = stories_of(events, held, topics=topics, at=at)
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
-        return Verdict(_without_faults(held, times, end, since, is_known=known is True), known)
+        remark = "" if known else f"; {_describe_unknown(topics)}"
+        return Verdict(f"{_without_faults(held, times, end, since)}{remark}", known)
     is_now = times.is_live and at is None
     past = [story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)]
     ranked = sorted(stories, key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank))
@@ -149,7 +159,7 @@ def verdict_of(
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 
 
-def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None, *, is_known: bool) -> str:
+def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None) -> str:
     if not times.is_live:
         text = f"no faults in {end:.0f} s"
     elif since is None:
@@ -159,7 +169,7 @@ def _without_faults(held: Iterable[Condition], times: Times, end: float, since: 
     usual = dict.fromkeys(each.text for each in held if each.initial and KINDS[each.kind].usual)
     if usual:
         text += f"; throughout: {', '.join(usual)}"
-    return text if is_known else f"{text}; the data has no position validity"
+    return text
 
 
 def _head(

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any, Final, Protocol, cast
 
@@ -16,7 +16,7 @@ from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, deco
 from nedbus_msgs.frames import wrap
 
 from .boot_clock import BootClock
-from .fields import CONVERSIONS
+from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
 
 _log = logging.getLogger(__name__)
 
@@ -26,6 +26,8 @@ _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is res
 _FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose messages
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _UNKNOWN_HEADING: Final = 65535
+_MAX_LATITUDE: Final = 90e7  # 1e-7 deg
+_HEARTBEAT_TIMEOUT: Final = 10.0  # s without a HEARTBEAT until a link with HIGH_LATENCY2 is a satellite link
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
@@ -102,6 +104,7 @@ class Vehicle:
             self._rates[ORIGIN] = 0.0
         self.clock = BootClock()
         self._last_message = 0.0
+        self._last_heartbeat = self._high_latency = -math.inf  # time of the last HEARTBEAT and HIGH_LATENCY2
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self.rebooted = False
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
@@ -143,7 +146,7 @@ class Vehicle:
 
         Each message is requested three times, and then every 5 s until it arrives.
         """
-        if now - self._last_message > _SILENCE_TIMEOUT:
+        if now - self._last_message > _SILENCE_TIMEOUT or self.is_high_latency:
             return None
         if not self._pending and now >= self._next_round:
             self._next_round = now + _REQUEST_INTERVAL
@@ -158,6 +161,30 @@ class Vehicle:
             return None
         number = self._pending.pop(0)
         return number, self._rates[number]
+
+    @property
+    def is_high_latency(self) -> bool:
+        """Whether the link is a satellite link, whose only message is HIGH_LATENCY2."""
+        return self._high_latency > self._last_heartbeat + _HEARTBEAT_TIMEOUT
+
+    def handle_all(
+        self, message: Any, now: float, log: StreamedTopics | None = None
+    ) -> list[SourceMessage | Rejection]:
+        """Convert a message as `handle` does; HIGH_LATENCY2 contains several topics."""
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            self._last_heartbeat = now
+        if kind != HIGH_LATENCY:
+            item = self.handle(message, now, log)
+            return [] if item is None else [item]
+        self._high_latency = now
+        timestamp = self._track_time(message, now)
+        items = [
+            self._publish(self._address(topic), fields_of(message), timestamp, now, log)
+            for topic, fields_of in OF_HIGH_LATENCY.items()
+            if topic in self._topics and timestamp is not None
+        ]
+        return [item for item in items if item is not None]
 
     def handle(self, message: Any, now: float, log: StreamedTopics | None = None) -> SourceMessage | Rejection | None:
         """Convert a message; return a Rejection if it is out of order, or there are too many texts.
@@ -181,20 +208,27 @@ class Vehicle:
             timestamp = self.clock.newest
         if topic not in self._topics or is_redundant or timestamp is None:
             return None
-        instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
-        address = Address(self._name, topic, instance)
-        is_delivered = log is not None and log.delivers(address)
-        if is_delivered and kind in CONVERSIONS:
+        address = self._address(topic, message.id if kind == "BATTERY_STATUS" else 0)
+        if kind in CONVERSIONS and log is not None and log.delivers(address):
             return None
-        fields = {name: value for name, value in fields_of(message).items() if value is not None}
-        if not fields or is_delivered:  # a text is discarded
+        return self._publish(address, fields_of(message), timestamp, now, log)  # a text is discarded only now
+
+    def _address(self, topic: str, instance: int = 0) -> Address:
+        return Address(self._name, topic, instance if TOPICS[topic].instances else None)
+
+    def _publish(
+        self, address: Address, fields: Mapping[str, object], timestamp: int, now: float, log: StreamedTopics | None
+    ) -> SourceMessage | Rejection | None:
+        """Return the message of an address, from which unknown fields are left out; see `handle`."""
+        fields = {name: value for name, value in fields.items() if value is not None}
+        if not fields or (log is not None and log.delivers(address)):
             return None
         if timestamp < (last := self._last.get(address, 0)):
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
-        self._add_stored_fields(topic, fields, timestamp, now)
+        self._add_stored_fields(address.topic, fields, timestamp, now)
         return self.report(SourceMessage(now, address, fields), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
@@ -203,7 +237,7 @@ class Vehicle:
                 self._store("heading", now + _VALUE_TIMEOUT, heading=wrap(math.radians(message.hdg / 100)))
             case "ATTITUDE" if math.isfinite(message.yaw):
                 self._store("yaw", now + _VALUE_TIMEOUT, heading=wrap(message.yaw))
-            case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
+            case "GPS_GLOBAL_ORIGIN" if _is_origin(message):
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
@@ -216,14 +250,14 @@ class Vehicle:
             case "ODOMETRY":
                 covariance, known = message.velocity_covariance, {}
                 north, east, down = covariance[0], covariance[6], covariance[11]
-                if math.isfinite(north + east) and min(north, east) >= 0:
+                if math.isfinite(north + east) and min(north, east) >= 0 and north + east > 0:
                     known["evh"] = math.sqrt(north + east)
-                if math.isfinite(down) and down >= 0:
+                if math.isfinite(down) and down > 0:
                     known["evv"] = math.sqrt(down)
                 self._store("velocity", now + _VALUE_TIMEOUT, **known)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
-                known = {name: value for name, value in deviations.items() if math.isfinite(value)}
+                known = {name: value for name, value in deviations.items() if math.isfinite(value) and value > 0}
                 valid = _validity(message.flags)
                 self._store("status", now + _STATUS_TIMEOUT, **valid, **known)
                 is_global = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS)
@@ -269,6 +303,11 @@ class Vehicle:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", None)
         return self.clock.newest if ms is None else 1000 * ms
+
+
+def _is_origin(message: Any) -> bool:
+    """Return whether GPS_GLOBAL_ORIGIN has an origin: zeros are none, and PX4 up to 1.15 exceeds 180 degrees."""
+    return abs(message.latitude) <= _MAX_LATITUDE and bool(message.latitude or message.longitude)
 
 
 def _validity(bits: int) -> dict[str, object]:

@@ -35,6 +35,23 @@ COMMON_SETTINGS: Final = {
     "transport/shared_memory/enabled": False,
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
+    # Channels for heartbeats (4 bytes) and rejection reports count messages, not bytes: larger ones are not received.
+    "low_pass_filter": [
+        {
+            "id": "heartbeat-size",
+            "flows": ["ingress"],
+            "messages": ["put", "delete"],
+            "key_exprs": ["**/@adv/**"],
+            "size_limit": 64,
+        },
+        {
+            "id": "report-size",
+            "flows": ["ingress"],
+            "messages": ["put", "delete"],
+            "key_exprs": ["**/@rejected/**"],
+            "size_limit": 16384,
+        },
+    ],
 }
 MAX_REPLY_BYTES: Final = 2**18  # payload of a reply: services split longer ones, clients reject them
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)

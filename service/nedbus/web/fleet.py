@@ -91,7 +91,8 @@ class VehicleView:
         if position is None:
             return "none yet"
         text = f"{position.north:z.1f} m north, {position.east:z.1f} m east"
-        text += f", altitude {position.altitude:z.1f} m" if math.isfinite(position.altitude) else ""
+        name = "altitude" if position.is_altitude_global else "height"
+        text += f", {name} {position.altitude:z.1f} m" if math.isfinite(position.altitude) else ""
         if not position.common or projection is None:
             return text
         latitude, longitude = projection.reproject(position.north, position.east)

@@ -4,7 +4,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from bokeh.models import BasicTicker, ColumnDataSource, DatetimeTicker, FixedTicker, HoverTool, Range1d, TapTool
+from bokeh.models import (
+    BasicTicker,
+    ColumnDataSource,
+    DatetimeTicker,
+    FixedTicker,
+    HoverTool,
+    Range1d,
+    TapTool,
+)
+from bokeh.models.annotations import Legend, LegendItem
 from bokeh.plotting import figure
 
 from nedbus.events import ALL, KINDS, Event, Span
@@ -16,11 +25,11 @@ from .style import MARKERS, SHAPES, Style
 _MAX_ROWS: Final = 7  # vehicles; if there are more, the last row counts the hidden ones
 _MAX_MARKS: Final = 2000
 _MIN_ROWS: Final = 4  # minimum height in rows; fewer rows would have thick bars
-_PLOTS: Final = {
-    "height above own origin [m]": ("height",),
-    "horizontal speed [m/s]": ("speed",),
-    "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
-}
+_PLOTS: Final = (  # the title of each column of each plot
+    {"height": "height above own origin [m]"},
+    {"speed": "horizontal speed [m/s]"},
+    {"eph": "eph", "epv": "epv", "error": "error to ground truth [m]"},
+)
 _LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} flight phase  ▬ duration  ┊ now"
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _TRUTH_COLUMNS: Final = {"height", "speed"}
@@ -115,7 +124,7 @@ class Plots:
 
     def draw(self) -> Iterator[figure]:
         """Yield new plots one by one, because each takes a browser as long to draw as the map."""
-        return (self._draw(title, names) for title, names in _PLOTS.items())
+        return (self._draw(titles) for titles in _PLOTS)
 
     def update(self, chosen: History | None, truth: History | None) -> None:
         """Add the new points of the selected stream and of its ground truth."""
@@ -141,15 +150,21 @@ class Plots:
         ]  # fmt: skip
         replace(self._spans, held)
 
-    def _draw(self, title: str, names: tuple[str, ...]) -> figure:
-        plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
+    def _draw(self, titles: Mapping[str, str]) -> figure:
+        plot = _time_figure(self.range, self._clock, height=76, min_height=76)
         plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
-        for name, colour in zip(names, self._style.vehicles, strict=False):
-            legend: dict[str, Any] = {"legend_label": name} if len(names) > 1 else {}
-            plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
+        legend = Legend()
+        for (name, title), colour in zip(titles.items(), self._style.vehicles, strict=False):
+            line = plot.line("time", name, source=self.chosen, color=colour, line_width=1.5)
+            item = LegendItem(label=title, renderers=[line])  # type: ignore[list-item] # a line is a glyph
+            legend.items.append(item)  # type: ignore[arg-type] # declared as the pairs that a new Legend accepts
             if name in _TRUTH_COLUMNS:
                 truth = self._style.colours["truth"]
                 plot.line("time", name, source=self._truth, color=truth, line_dash="dotted", line_width=1.5)
+        if len(titles) == 1:
+            plot.title = next(iter(titles.values()))
+        else:
+            plot.add_layout(legend, "above")  # instead of a title; inside the frame it would cover the lines
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
         plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)

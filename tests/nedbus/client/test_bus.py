@@ -404,10 +404,19 @@ def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> No
     assert not isinstance(error.value, nedbus.AddressError)
     with pytest.raises(nedbus.AddressError, match="vehicle"):
         client.latest(vehicle="a/b")
-    with pytest.raises(nedbus.AddressError, match=r"vehicle \[\['1'\]\] .* a list of names"):
+    with pytest.raises(nedbus.AddressError, match=r"vehicle \['1'\] .* a list of names"):
         client.subscribe(vehicle=[["1"]])  # type: ignore[list-item] # the mistake under test
     with pytest.raises(nedbus.AddressError, match="instance"):
         client.publisher("estimator_local_position", vehicle="1")
+
+
+def test_several_vehicles_are_selected_by_a_list(client: nedbus.Bus) -> None:
+    """`vehicle=["a", 2]` selects these vehicles in `subscribe` and `latest`, with either client."""
+    for vehicle in ("a", "2", "c"):
+        publish(client.publisher(VLP, vehicle=vehicle), 1)
+    assert sorted(sample.vehicle for sample in client.latest(vehicle=["a", 2])) == ["2", "a"]
+    with client.subscribe(vehicle=["a", 2], mode="every") as subscription:
+        assert {subscription.receive(30).vehicle for _ in range(2)} == {"a", "2"}
 
 
 def test_prefixes_separate_fleets(endpoint: str) -> None:

@@ -11,10 +11,12 @@ import lz4.frame
 import pytest
 import zstandard
 from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, McapRecord, Message, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 import nedbus
+from nedbus.flights.readers.mcap_chunks import ChunkFile, records_of
 from tests.flights.replays import open_recording
 from tests.peers.processes import Start
 
@@ -125,3 +127,29 @@ def test_index_with_many_schemas_is_read_in_linear_time(tmp_path: Path) -> None:
     with pytest.raises(nedbus.SourceError, match="no messages"):
         open_recording(path)
     assert time.process_time() - begin < _SECONDS
+
+
+def test_chunks_that_together_unpack_too_far_are_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit of the compression ratio counts all chunks of a file; chunks beyond it are reported as damage."""
+    path = tmp_path / "repeated.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=2000, compression=CompressionType.ZSTD)
+        writer.start()
+        channel = writer.register_channel("topic", "", 0)
+        for number in range(20):
+            writer.add_message(channel, number, bytes(1500), number)
+        writer.finish()
+
+    def read() -> tuple[int, bool, list[str]]:
+        file = ChunkFile(path)
+        count = sum(1 for block in file.blocks() for _ in records_of(block, Opcode.MESSAGE))
+        file.close()
+        return count, file.damaged, file.warnings
+
+    assert read() == (20, False, [])
+    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_BLOCK", 16_000)
+    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_RATIO", 1)
+    count, damaged, warnings = read()
+    assert 0 < count < 20
+    assert damaged
+    assert "together claim more than 16000 bytes" in warnings[0]

@@ -56,6 +56,27 @@ POSITIONS = array_of(VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": flo
 HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0})
 
 
+def test_derived_columns_are_offered_by_name() -> None:
+    """`align` computes height, speed and angles if `fields` names them: NaN while invalid and before the first message.
+
+    Angles follow from the interpolated quaternion, so they do not jump at a half turn.
+    """
+    flown = array_of(VLP, {"timestamp": 1_000_000, "z": -4.0, "z_valid": True}, {"timestamp": 1_100_000, "z": -9.0})
+    first, second = math.radians(179.0), math.radians(-179.0)
+    turned = array_of(
+        "vehicle_attitude", {"timestamp": 1_050_000, "q": yaw(first)}, {"timestamp": 1_150_000, "q": yaw(second)}
+    )
+    streams = {VLP: flown, "vehicle_attitude": turned}
+    table = nedbus.align(streams, fields=["height", "vehicle_attitude.yaw_deg"], method="linear")
+    assert table.dtype.names == ("timestamp", f"{VLP}.height", "vehicle_attitude.yaw_deg")
+    assert table[f"{VLP}.height"] == pytest.approx([4.0, math.nan], nan_ok=True)
+    assert math.isnan(table["vehicle_attitude.yaw_deg"][0])
+    assert abs(table["vehicle_attitude.yaw_deg"][1]) == pytest.approx(180.0, abs=1e-3)
+    assert f"{VLP}.height" not in (nedbus.align(streams).dtype.names or ())
+    with pytest.raises(ArgumentError, match="height, speed, roll"):
+        nedbus.align(streams, fields=["altitud"])
+
+
 def test_method_last_never_uses_future_messages() -> None:
     """With method "last" a row has the last message at or before it, and its age; earlier rows have NaN."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME})

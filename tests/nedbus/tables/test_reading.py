@@ -243,7 +243,7 @@ def test_plot_of_invalid_messages_has_explanatory_titles(tmp_path: Path) -> None
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
     texts = texts_of([(Address("1", VLP), array)], tmp_path / "a.svg", title=name)
-    assert {"altitude; thin: z invalid, dashed: z or vz reset", "speed; thin: v_xy invalid"} <= set(texts)
+    assert {"height; thin: z invalid, dashed: z or vz reset", "speed; thin: v_xy invalid"} <= set(texts)
     assert name.replace("\udcff", "?") in texts
 
 

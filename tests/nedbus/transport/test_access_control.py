@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 import zenoh
@@ -133,6 +133,26 @@ def test_message_that_is_not_built_in_is_decoded(join: Join) -> None:
             return False
 
         wait_for(is_read, what="the message")
+
+
+def test_large_puts_on_report_and_heartbeat_keys_are_not_forwarded(open_as: Open) -> None:
+    """The size filter of the secure router includes @rejected and @adv, which `**` does not match."""
+    vehicle, reader = open_as("vehicle-1"), open_as("reader")
+    keys = {f"nedbus/@rejected/1/{VLP}": 16384, f"nedbus/1/{VLP}/@adv/pub/1a/1/_": 64}
+    block = zenoh.CongestionControl.BLOCK
+    for key, limit in keys.items():
+        subscriber = reader.declare_subscriber(key, zenoh.handlers.RingChannel(10))
+        wait_for_matching(vehicle, key)
+        vehicle.put(key, bytes(limit + 1), congestion_control=block)
+        vehicle.put(key, bytes(limit), congestion_control=block)
+        received = list[int]()
+
+        def is_received(received: list[int] = received, subscriber: Any = subscriber) -> bool:
+            received.extend(len(each.payload) for each in iter(subscriber.handler.try_recv, None))
+            return bool(received)
+
+        wait_for(is_received, what="the message at the limit, which was sent last")
+        assert received == [limit]
 
 
 @pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])

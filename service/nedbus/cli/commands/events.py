@@ -193,14 +193,14 @@ def _explain_absence(bus: "Bus") -> str:
 
 def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
     yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
-    sections = {"before it": story.before, "meanwhile": story.meanwhile}
+    sections = {"evidence": story.before, "meanwhile": story.meanwhile}
     if story.end is not None:
         sections[f"ended at {times.text(story.end)}{' with' * bool(story.after)}"] = story.after
     for title, shown in sections.items():
         if shown or title.startswith("ended"):
             yield f"  {title}"
         for each in shown:
-            yield _timed(each, times, story.since if title == "before it" else None)
+            yield _timed(each, times, story.since if title == "evidence" else None)
     if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before it"
     if story.lacking:

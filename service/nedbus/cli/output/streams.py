@@ -16,6 +16,7 @@ from nedbus.log_event import about
 MAX_TEXT: Final = 1000  # maximum number of characters of an error or log line
 STRUCTURED: Final = "structured"  # name of the log handler if the log is read by a program: JSON, or the journal
 _MAX_CELL: Final = 120  # characters of a value from a peer
+_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r")
 _log = logging.getLogger("nedbus")
 
 
@@ -41,10 +42,24 @@ def counted(number: int, noun: str) -> str:
 
 
 def csv_line(cells: Iterable[object]) -> str:
-    """Format cells as a line of CSV, quoted where necessary; None is an empty cell."""
+    """Format cells as a line of CSV, quoted where necessary; None is an empty cell.
+
+    Text that a spreadsheet would evaluate as a formula is preceded by an apostrophe.
+    """
     line = io.StringIO()
-    csv.writer(line, lineterminator="").writerow(cells)
+    csv.writer(line, lineterminator="").writerow(map(_as_cell, cells))
     return line.getvalue()
+
+
+def _as_cell(value: object) -> object:
+    """Return a cell that a spreadsheet does not evaluate: the text may come from a vehicle."""
+    if not isinstance(value, str) or not value.startswith(_FORMULA_STARTS):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value  # a formatted number, such as -0.52
 
 
 def write(line: str) -> None:

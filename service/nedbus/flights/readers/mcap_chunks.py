@@ -44,7 +44,7 @@ _DESCRIPTIONS: Final[dict[int, Any]] = {
 }  # fmt: skip
 _MAX_BLOCK: Final = 2**26  # bytes of a chunk, also uncompressed, and of a summary; ROS 2 and nedbus write up to 8 MiB
 _MAX_DESCRIPTION: Final = 2**20  # bytes of a record in _DESCRIPTIONS; statistics of all possible channels have 655 kB
-_MAX_RATIO: Final = 100  # compression ratio of files above _MAX_BLOCK
+_MAX_RATIO: Final = 100  # compression ratio of files above _MAX_BLOCK, and of all chunks of a file together
 _MAX_WARNINGS: Final = 100
 _MAX_WARNING: Final = 1000  # characters
 
@@ -96,6 +96,7 @@ class ChunkFile:
 
         `only`: channels of interest; chunks without any of them may be skipped.
         """
+        unpacked, limit = 0, max(_MAX_BLOCK, _MAX_RATIO * self.size)
         for opcode, offset, end in self._listed(only) if self._chunks else self._scan(len(MCAP0_MAGIC), self.size):
             self.position = end
             if end - offset > _MAX_BLOCK:
@@ -103,6 +104,12 @@ class ChunkFile:
                 self.warn(text, lost=True)
                 continue
             record = self._read(offset, end - offset)
+            if opcode == Opcode.CHUNK:
+                unpacked += _claimed_size(record)
+                if unpacked > limit:
+                    text = f"skipped the chunks from byte {offset}: all chunks together claim more than {limit} bytes"
+                    self.warn(text, lost=True)
+                    return
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
             except READ_ERRORS:
@@ -231,6 +238,14 @@ def records_of(block: bytes, *opcodes: int) -> Iterator[McapRecord]:
             if length > _MAX_DESCRIPTION:
                 raise ValueError(length)
             yield _DESCRIPTIONS[opcode].read(ReadDataStream(BytesIO(block[start:offset])))
+
+
+def _claimed_size(chunk: bytes) -> int:
+    """Return the uncompressed size that the head of a chunk claims; 0 if it is truncated, or too large to unpack."""
+    if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
+        return 0
+    size: int = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)[2]
+    return size if size <= _MAX_BLOCK else 0
 
 
 def _unpack_chunk(record: bytes) -> bytes:

@@ -121,6 +121,32 @@ def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
     assert len({row["topic"] for row in rows}) > 1
 
 
+def test_echo_and_record_select_several_vehicles_and_topics(bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+    """`-v` several times and several topics select their product, in `echo` and `record`."""
+    for vehicle in ("a", "b", "c"):
+        bus.publisher(VLP, vehicle=vehicle).publish(message(1))
+        bus.publisher("vehicle_attitude", vehicle=vehicle).publish({"q": (1.0, 0.0, 0.0, 0.0)})
+        bus.publisher("battery_status", vehicle=vehicle, instance=0).publish({"voltage_v": 16.0})
+    selected = {f"{vehicle}/{topic}" for vehicle in ("a", "b") for topic in (VLP, "vehicle_attitude")}
+    options = [VLP, "vehicle_attitude", "-v", "a", "-v", "b"]
+    assert {line.split()[0] for line in echo(endpoint, "--count", "4", *options).out.splitlines()} == selected
+    recording = tmp_path / "two.mcap"
+    ended = run_command("record", "-c", endpoint, *options, "-o", str(recording), "--duration", "1")
+    assert ended.exit_code == 0, ended.err
+    with nedbus.open(recording) as flight:
+        assert {str(address) for address in flight.addresses} == selected
+        assert {sample.vehicle for sample in flight("*", vehicle=["b", "c"])} == {"b"}
+
+
+def test_echo_shows_flags_that_are_false(bus: nedbus.Bus, endpoint: str) -> None:
+    """A flag of a message without a line of its own is shown whether it is true or false."""
+    definition = nedbus.define_msg("Gripper", "uint64 timestamp\nbool is_open\nbool is_holding")
+    publisher = bus.publisher("gripper", vehicle="1", definition=definition)
+    publisher.publish({"timestamp": 1, "is_open": False, "is_holding": True})
+    [line] = echo(endpoint, "--once", "gripper").out.splitlines()
+    assert line.endswith("is_open False  is_holding")
+
+
 def test_echo_full_prints_every_field(simulation: str) -> None:
     """--full prints all 53 fields, one per line."""
     blocks = echo(simulation, "--full", "-n", "2", VLP).out.split("---\n")

@@ -50,7 +50,7 @@ Evidence: 5.000 dead reckoning. Not in the data: {MISSING}.
 WHY = f"""\
 {VERDICT}
 1: xy and vxy not valid from 8.000 to 12.000 s since boot (4.0 s)
-  before it
+  evidence
     5.000  dead reckoning (3.0 s before)
   ended at 12.000 with
     12.000  dead reckoning ended after 7.0 s
@@ -165,7 +165,7 @@ def test_real_flight_has_expected_events() -> None:
     fault = "xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
     begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix lost: 3D to none, satellites 10 to 0"
     assert story.startswith(begin)
-    assert f"\n\n1: {fault}\n  before it\n    23:08:59.8  GPS fix" in story
+    assert f"\n\n1: {fault}\n  evidence\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
 
 
@@ -332,7 +332,7 @@ def test_why_live_uses_service_history(
     clock = r"\d\d:\d\d:\d\d\.\d"
     fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
     begin = rf"1: was not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
-    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", result.out)
+    assert re.match(rf"{begin}\n\n1: {fault}\n  evidence\n", result.out)
     assert "to publish them, add them to PX4's dds_topics.yaml" in result.out
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # end of the fault
     assert since_boot.out.startswith("1: not usable: xy and vxy not valid")
