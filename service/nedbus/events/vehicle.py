@@ -149,15 +149,18 @@ class Vehicle:
             if time - burst.end <= rules.PAUSE and (kind != "lost" or time - burst.begin <= rules.MAX_BURST):
                 continue
             del self._bursts[kind]
-            messages, numbers = f"{burst.count} message{'s' * (burst.count > 1)}", {"messages": burst.count}
+            messages = f"{burst.count} message{'s' * (burst.count > 1)}"
+            numbers: dict[str, float] = {"messages": burst.count}
             if kind == "lost":
                 names = tuple(sorted(burst.topics - {""}))
                 streams = ", ".join(names)
                 if "" in burst.topics:
                     messages = f"about {messages}"
                     streams = f"{streams} and the ULog stream" if streams else "the ULog stream"
-                text = f"{messages} lost ({streams})"
-                self.emit(Finding(kind, "once", text, names, numbers), "", burst.begin)
+                duration = burst.end - burst.begin
+                within = f" in {format_duration(duration)}" if duration >= 1 else ""
+                text = f"{messages} lost{within} ({streams})"
+                self.emit(Finding(kind, "once", text, names, numbers | {"duration": duration}), "", burst.begin)
             elif kind == "rejected":
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
             else:

@@ -155,7 +155,7 @@ def test_burst_of_losses_is_one_event(flight: Flight) -> None:
     assert flight.update() == []
     reported = flight.wait(6.0).update()
     assert [(event.text, event.severity, event.time) for event in reported] == [
-        ("5 messages lost (vehicle_gps_position, vehicle_local_position)", "watch", first)
+        ("5 messages lost in 2.0 s (vehicle_gps_position, vehicle_local_position)", "watch", first)
     ]
     assert flight.wait(6.0).update() == []
 

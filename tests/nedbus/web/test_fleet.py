@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from nedbus import Sample
+from nedbus.client import LogStreamStatus
 from nedbus.events import EventLog, Times
 from nedbus.monitoring import Snapshot
 from nedbus.web.event_timeline import EventTimeline
@@ -146,6 +147,15 @@ def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:
     row = sim.vehicle(alive=[], link="no link to tcp/ground:7447")
     assert (row.grade, row.has_position, row.main.state.name) == ("ok", False, "disconnected")
     assert sim.fleet.snapshot.alarms == ["no link to tcp/ground:7447"]
+
+
+def test_losses_on_the_link_of_a_vehicle_are_in_the_count_of_the_page(sim: SimulatedFleet) -> None:
+    """The page has one count of lost messages: those lost after publishing, and about those of the ULog stream."""
+    sim.fly(1)
+    assert sim.poll().lost == "0"
+    log = LogStreamStatus("wing", "streaming", lost=740, lost_messages=5731, gaps=1)
+    assert sim.poll(logs={"wing": log}).lost == "about 5,731"
+    assert sim.vehicle(logs={"wing": log}).lost == 5731
 
 
 def test_vehicles_are_sorted_by_severity_then_name(sim: SimulatedFleet) -> None:
