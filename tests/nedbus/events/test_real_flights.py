@@ -508,9 +508,9 @@ def same_events(read: FileEvents) -> list[tuple[object, ...]]:
             each.change,
             each.severity,
             each.text.partition(" after ")[0],
-            0.0 if each.kind == "vision_unused" else round(each.boot or 0.0, 2),
+            round(each.boot or 0.0, 2),
         )
-        for each in events  # flags and vision differ in rate: their order decides within 0.1 s
+        for each in events
     )
 
 
