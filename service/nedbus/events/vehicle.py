@@ -50,7 +50,7 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
     `usual`: those of `usual` kinds, active since the first messages; they belong to the flight and affect no state.
     `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
-    `first`: time of the first message on the event log's clock [s].
+    `first`: time of the first position, or without one of the first message, on the event log's clock [s].
     `last_seen`: time of the last message on the event log's clock [s], or of the last update with a live publisher.
     `time`: time of the last message with a detector [s]. `boot`: the time since boot in it [s].
     `recent`: recent events, searched for evidence.
@@ -117,6 +117,8 @@ class Vehicle:
         is_queued = type(detector) is detectors.TextDetector  # a log may begin with old texts
         self._set_boot(stamp / 1e6, time, is_queued=is_queued)
         if type(detector) is PositionDetector:  # of `main`
+            if math.isinf(self._main_time):
+                self.first = time
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
@@ -414,7 +416,9 @@ class Vehicle:
             own = *own[:2], partial(self._detect_flags, instance, own[2])
         return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
 
-    def _detect_flags(self, instance: int, detect: detectors.Detect, before: Fields, after: Fields) -> Iterator[Finding]:
+    def _detect_flags(
+        self, instance: int, detect: detectors.Detect, before: Fields, after: Fields
+    ) -> Iterator[Finding]:
         if instance != self._ekf:
             return detectors.detect_unused(instance, before, after)
         flags = [after[name] for name in _VISION_FLAGS if after[name] is not None]
