@@ -30,7 +30,7 @@ class VehicleReport:
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
     `unknown`: flags that its position does not provide. `kinds`: kinds of all active conditions.
-    `first`: time of the first message that the service received, None if unknown.
+    `first`: time of the first position that the service received, else of the first message; None if unknown.
     """
 
     severity: Literal["bad", "watch", "info"]
