@@ -13,6 +13,10 @@ RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 """The PX4 releases with known layouts, oldest first."""
 ALL: Final = "all"
 """Name of the layout with every field of the model, if no release of PX4 has them all."""
+_HISTORY: Final = 20.0  # s of messages at the nominal rate in a history cache
+_MIN_KEPT: Final = 400  # messages of a topic with a nominal rate, because sources may be faster
+_KEPT_WITHOUT_RATE: Final = 100  # messages
+_KEPT_BYTES: Final = 2**18  # of payload of a topic without a rate
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -37,10 +41,15 @@ class Topic:
     plain_first: bool = False
     priority: Literal["data", "data_high"] = "data"
 
-    @property
-    def kept(self) -> int:
-        """Number of messages in a publisher's retransmission cache: 20 s at the nominal rate, at least 400."""
-        return max(400, round(20.0 * self.rate))
+    def kept(self, size: int) -> int:
+        """Return the number of messages in a publisher's history cache; `size`: bytes of a message.
+
+        20 s at the nominal rate, at least 400. A topic without a nominal rate, or published on change: 100 messages,
+        fewer if they take more than 256 KiB; PX4 logs about ninety such topics, and their rates are unknown.
+        """
+        if self.on_change or not self.rate:
+            return max(1, min(_KEPT_WITHOUT_RATE, _KEPT_BYTES // size))
+        return max(_MIN_KEPT, round(_HISTORY * self.rate))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
