@@ -52,7 +52,8 @@ def main() -> None:
     with nedbus_process(*arguments, setup=options.setup) as service:
         wait_for_router(endpoint, service)
         print(f"       before the stream {memory_mb(service):6.1f} MB", flush=True)
-        with Px4LogStream(recording, port, speed=options.speed, waits=True) as peer:
+        deadline = 2 * seconds / options.speed + 60
+        with Px4LogStream(recording, port, speed=options.speed, waits=True, deadline=deadline) as peer:
             for step in range(_STEPS):
                 (cpu_before,), before, began = cpu_seconds(service), published(http), time.monotonic()
                 peer.finished.wait(seconds / options.speed / _STEPS)

@@ -29,8 +29,8 @@ FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 class Publisher(AbstractContextManager["Publisher"]):
     """Publisher of the messages of one address; get one from `bus.publisher(...)`.
 
-    A history cache keeps messages for readers that missed some: 20 s at the topic's nominal rate, at least 400, or 100
-    messages (256 KiB) of a topic without one. The last message answers queries.
+    A history cache keeps messages for readers that missed some: 20 s at the topic's nominal rate, at least 400
+    messages. The last message answers queries.
     `publish` does not wait for readers: Zenoh drops what a link does not accept within 1 ms. A lossless publisher slows
     down to 10 messages per second while a reader in mode "every" has more than 2,000 unread messages.
     Not thread-safe. A context manager.
@@ -44,6 +44,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         registry: PublisherRegistry,
         listener: MatchingListener,
         lossless: bool,
+        short_history: bool,
         source: str | None,
         owner: object,
     ) -> None:
@@ -59,9 +60,12 @@ class Publisher(AbstractContextManager["Publisher"]):
         self._codec, self._all = codec_of(definition), definition.all_fields
         # Objects, not texts: Zenoh would copy a text into each message of the history cache, and objects are shared.
         self._encoding = zenoh.Encoding(encoding_of(definition, source))
-        self._partial: tuple[Set[str], zenoh.Encoding] = self._all, self._encoding  # of the last message with missing fields
+        # Of the last message with missing fields.
+        self._partial: tuple[Set[str], zenoh.Encoding] = self._all, self._encoding
         topic = get_topic(address.topic)
-        cache = CACHE if lossless else topic.kept(self._codec.size)
+        cache = topic.kept_for_source(self._codec.size) if short_history else topic.kept
+        if lossless:
+            cache = CACHE
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         # Not beside a router in this process: its session hands messages over without waking a thread.
         groups = lossless and registry.is_client
