@@ -121,7 +121,7 @@ class Bus(AbstractContextManager["Bus"]):
         `vehicle`: one or several; each pair of a vehicle and a topic is a subscription of Zenoh.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which caches
-        about 20 s of messages.
+        about 20 s of topics with a nominal rate, and of others 50 messages (services) or 400 (scripts).
         `limit`: unread samples kept for a slow reader, by default 65,536, or in mode "latest" the newest of 10,000
         keys, in both cases up to 64 MiB of payload; beyond that the oldest are dropped.
         In both modes `counts` reports lost, dropped and invalid samples. A slow reader delays lossless publishers only.

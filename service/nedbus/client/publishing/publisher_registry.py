@@ -55,12 +55,14 @@ class PublisherRegistry:
         definition: Definition[Any] | None = None,
         *,
         lossless: bool = False,
+        short_history: bool = False,
         source: str | None = None,
         owner: object = None,
     ) -> Publisher:
         """Return a new publisher for an address; the publisher keeps `owner` alive.
 
         `definition`: required for a topic that is not in BY_TOPIC.
+        `short_history`: for one of the many streams of a source; see `Topic.kept_for_source`.
 
         Raises AddressInUseError if the address has a publisher, AddressError for an unknown topic.
         """
@@ -76,8 +78,9 @@ class PublisherRegistry:
                 self._add_vehicle(address.vehicle)
             listener = self._rate_listeners[address.vehicle]
             publisher = self.publishers[address] = Publisher(
-                address, definition, registry=self, listener=listener, lossless=lossless, source=source, owner=owner
-            )
+                address, definition, registry=self, listener=listener, lossless=lossless, short_history=short_history,
+                source=source, owner=owner,
+            )  # fmt: skip
             undo.pop_all()
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
             if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
