@@ -12,7 +12,7 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
+from nedbus.client import Bus, ServiceStatus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
 from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
@@ -57,8 +57,10 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         hint = "start a source with 'nedbus serve'" if everything.complete else "not all streams are listed: try again"
         if others := sorted({address.vehicle for address in everything}):
             hint = f"choose one of {to_text(', '.join(others[:20]))}"
-        elif bus.services():
+        elif services := bus.services():
             hint = "a service answers: see 'nedbus info' and the access rules for it and this client (docs/security.md)"
+            if outdated := [each.service for each in services if each.is_outdated]:
+                hint = f"{hint}; update nedbus on the host of {to_text(', '.join(outdated[:5]))}, which is older"
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         known = "is published" if everything.complete else "is known yet"
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
@@ -96,8 +98,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
     for service in services[:_MAX_ROWS]:
-        name, version, role = map(to_text, (service.service, service.version, service.role))
-        write(f"\nservice {name}, nedbus {version}, as {role}")
+        write(f"\n{_head_of(service)}")
         rows = [
             [*map(to_text, (
                 each.source, each.state, each.published, each.rejected,
@@ -160,6 +161,14 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     near = get_close_matches(topic, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
     raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
+
+
+def _head_of(service: ServiceStatus) -> str:
+    name, version, role, host = map(to_text, (service.service, service.version, service.role, service.host))
+    if service.is_outdated:
+        reason = "its status does not name its vehicle, and is not shown: update nedbus on its host"
+        return f"service {name} on {host}, nedbus {version}: {reason}"
+    return f"service {name}, nedbus {version}, as {role}, vehicle {to_text(service.vehicle)}"
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

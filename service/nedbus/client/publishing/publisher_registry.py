@@ -35,10 +35,20 @@ class PublisherRegistry:
     """Create the publishers of a session, one per address, and reply to queries for their last messages.
 
     `is_client`: the session is a client, and reaches readers through a router.
+    `on_vehicle`: called before the first publisher of a vehicle.
     """
 
-    def __init__(self, session: Session, queries: QueryServer, *, prefix: str, is_client: bool) -> None:
+    def __init__(
+        self,
+        session: Session,
+        queries: QueryServer,
+        *,
+        prefix: str,
+        is_client: bool,
+        on_vehicle: Callable[[str], None] = lambda _: None,
+    ) -> None:
         self.prefix, self.is_client = prefix, is_client
+        self._on_vehicle = on_vehicle
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
         self.publishers: dict[Address, Publisher] = {}  # open publishers
@@ -136,6 +146,7 @@ class PublisherRegistry:
     def _add_vehicle(self, vehicle: str) -> None:
         prefix, selection = self.prefix, Selection(vehicle=vehicle)
         schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
+        self._on_vehicle(vehicle)
         self._directories[vehicle] = VehicleDirectory(
             partial(LivelinessTokens, self._session, selection.alive_key_expr(prefix=prefix)), prefix=prefix
         )
