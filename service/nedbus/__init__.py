@@ -56,6 +56,7 @@ if TYPE_CHECKING:
         NedbusError,
         NoDataError,
         ReceiveError,
+        RefusedError,
         SourceError,
     )
     from .flights import Flight, FlightSamples, UtcOffset, utc_of
@@ -97,6 +98,7 @@ __all__ = [
     "Publisher",
     "Quantity",
     "ReceiveError",
+    "RefusedError",
     "ResetTracker",
     "Row",
     "Sample",

@@ -84,6 +84,7 @@ class Daemon:
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
+        self._refused_at_end: list[str] = []  # vehicles of finite sources whose messages reached no reader
         self.event_log = EventLog(reader="service")
         # Random, because services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
@@ -187,7 +188,10 @@ class Daemon:
         return f"{len(plan) - unchanged} started, {before - unchanged} stopped, {unchanged} unchanged"
 
     def run(self) -> bool:
-        """Publish until done or stopped; return False if a source failed; raise ListenError or ConfigError."""
+        """Publish until done or stopped; return False if a source failed, or the router refused what was published.
+
+        Raises ListenError or ConfigError.
+        """
         session = self._session = self._open()
         if session is None:
             return True
@@ -219,7 +223,7 @@ class Daemon:
             session.close()
             if self._permission is not None:
                 self._permission.close()
-        return not any(source.state == "failed" for source in self.sources)
+        return not self._refused_at_end and not any(source.state == "failed" for source in self.sources)
 
     def _apply_plan(self, registry: PublisherRegistry) -> int:
         """Stop removed sources and start new ones, in the order of the plan; return the number of unchanged sources."""
@@ -287,6 +291,8 @@ class Daemon:
                     speeds = [each.source.options.speed for each in finite if isinstance(each.source, ReplaySource)]
                     self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
                     registry.flush(tuple(registry.publishers.values()), stop=self._stop)
+                    if self._permission is not None:
+                        self._refused_at_end = self._permission.decide()
                     return
             self._changed.wait(_POLL)
             self._changed.clear()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -75,7 +75,7 @@ class Fleet:
             yield
 
 
-def _reply(key: str, status: dict[str, object]) -> Callable[[zenoh.Query], None]:
+def _reply(key: str, status: Mapping[str, object]) -> Callable[[zenoh.Query], None]:
     def reply(query: zenoh.Query) -> None:
         now = 2e9
         report = {"service": "x", "host": "h", "now": now, "vehicles": {"2": HEALTHY}, "events": [FORGED_EVENT]}
