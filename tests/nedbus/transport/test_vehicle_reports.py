@@ -17,7 +17,7 @@ import zenoh
 
 import nedbus
 from nedbus.pki import write_access_rules
-from nedbus.transport import Session, open_client
+from nedbus.transport import Session, open_client, query, token_keys
 from tests.flights.messages import VLP
 from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import CommandResult, run_command
@@ -76,11 +76,11 @@ class Fleet:
 
 
 def _reply(key: str, status: Mapping[str, object]) -> Callable[[zenoh.Query], None]:
-    def reply(query: zenoh.Query) -> None:
+    def reply(asked: zenoh.Query) -> None:
         now = 2e9
         report = {"service": "x", "host": "h", "now": now, "vehicles": {"2": HEALTHY}, "events": [FORGED_EVENT]}
-        is_report = query.parameters.get("events") is not None
-        query.reply(key, json.dumps(report if is_report else status), encoding="application/json")
+        is_report = asked.parameters.get("events") is not None
+        asked.reply(key, json.dumps(report if is_report else status), encoding="application/json")
 
     return reply
 
@@ -177,3 +177,63 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
         assert "old-1, which is older" in fleet.run("list").err
         doctor = run_command("doctor", *fleet.options("reader")).out
         assert "nedbus 0.1.0 on flyer: its status does not name its vehicle" in " ".join(doctor.split())
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "key",
+    [f"nedbus/2/{VLP}", f"nedbus/2/{VLP}/@rate/5", f"nedbus/2/{VLP}/@adv/pub/1a/1/_", f"nedbus/@rejected/2/{VLP}",
+     "nedbus/2/@doctor/1a"],
+)  # fmt: skip
+def test_vehicle_cannot_put_on_keys_of_another(fleet: Fleet, key: str) -> None:
+    """A put of vehicle 1 on a key of vehicle 2 reaches no reader; a later one of vehicle 2 does."""
+    one, two = fleet.session("vehicle-1"), fleet.session("vehicle-2")
+    subscriber = fleet.session("reader").declare_subscriber(key, zenoh.handlers.RingChannel(10))
+    received: list[bytes] = []
+
+    def is_received() -> bool:
+        one.put(key, b"1")
+        two.put(key, b"2")
+        received.extend(sample.payload.to_bytes() for sample in iter(subscriber.handler.try_recv, None))
+        return len(received) > 2
+
+    wait_for(is_received, what="the messages of vehicle 2")
+    assert set(received) == {b"2"}
+
+
+@pytest.mark.process
+def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
+    """Vehicle 1 can neither answer queries on keys of vehicle 2 nor declare its liveliness tokens."""
+    one, reader = fleet.session("vehicle-1"), fleet.session("reader")
+    keys = ("nedbus/@schema/2/VehicleAttitude", "nedbus/@service/2/x/status", f"nedbus/2/{VLP}")
+    own = "nedbus/@service/1/x/status"
+    token = one.liveliness().declare_token(f"nedbus/2/@alive/1a/{VLP}")
+    with ExitStack() as answering:
+        for key in (*keys, own):
+            answering.enter_context(answer_queries(one, key, _reply(key, {})))
+        wait_for(lambda: query(reader, own, timeout=DEADLINE), what="the reply on its own key")
+        assert [query(reader, key, timeout=1.0) for key in keys] == [[], [], []]
+    assert token_keys(reader, "nedbus/2/@alive/**", timeout=1.0) == []
+    del token
+
+
+@pytest.mark.process
+def test_service_of_several_vehicles_has_a_certificate_that_says_so(
+    pki: Path, tmp_path: Path, start: Start, run_nedbus: Start
+) -> None:
+    """A policy that names two vehicles lets one certificate publish both, and report about both."""
+    endpoint = secure_endpoint()
+    file = write_config(pki, tmp_path / "router-secure.json5", endpoint)
+    write_access_rules(file, ["1", "2"])
+    rules = '["vehicle-1-in", "vehicle-2-in", "vehicle-out", "query-in", "query-out"]'
+    subject, policy = '{ id: "routers",', '{ rules: ["router"],'
+    text = file.read_text().replace(subject, f'{{ id: "link", cert_common_names: ["stranger"] }},\n{subject}')
+    file.write_text(text.replace(policy, f'{{ rules: {rules}, subjects: ["link"] }},\n{policy}'))
+    start_zenohd(start, "-c", str(file))
+    with ExitStack() as opened:
+        fleet = Fleet(endpoint, pki, opened)
+        run_nedbus("serve", *fleet.options("stranger"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+        reader = fleet.bus("reader")
+        wait_for(lambda: service_of(reader, "1") and service_of(reader, "2"), what="the reports about both vehicles")
+        assert service_of(reader, "1") == service_of(reader, "2")
+        assert fleet.run("health", "--expect", "1,2").exit_code == 0
