@@ -56,7 +56,6 @@ if TYPE_CHECKING:
         NedbusError,
         NoDataError,
         ReceiveError,
-        RefusedError,
         SourceError,
     )
     from .flights import Flight, FlightSamples, UtcOffset, utc_of
@@ -98,7 +97,6 @@ __all__ = [
     "Publisher",
     "Quantity",
     "ReceiveError",
-    "RefusedError",
     "ResetTracker",
     "Row",
     "Sample",

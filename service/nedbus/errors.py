@@ -147,7 +147,7 @@ class ClosedError(NedbusError, RuntimeError):
 
 
 class RefusedError(NedbusError, PermissionError):
-    """Raised if the access rules of the router drop what this process publishes for a vehicle; Zenoh reports nothing.
+    """Raised when the access rules of the router drop what this process publishes for a vehicle; Zenoh reports nothing.
 
     `vehicle`: the refused vehicle. `certificate`: the file of the certificate that may not publish it.
     """

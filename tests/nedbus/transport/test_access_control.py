@@ -19,6 +19,7 @@ import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.client.publishing.publish_permission import PublishPermission
 from nedbus.daemon.write_permission import WritePermission
+from nedbus.errors import RefusedError
 from nedbus.pki import write_access_rules
 from nedbus.timings import Timings
 from nedbus.transport import Session, Verdict, open_client, open_router, query
@@ -182,13 +183,13 @@ def test_script_learns_that_it_may_not_publish(join: Join, certificate: str) -> 
     `latest` shows it what others see: its own message, which the router dropped, is not among them.
     """
     bus = join(certificate)
-    with pytest.raises(nedbus.RefusedError, match=f"vehicle 1, .* certificate .*{certificate}.crt") as caught:
+    with pytest.raises(RefusedError, match=f"vehicle 1, .* certificate .*{certificate}.crt") as caught:
         bus.publisher(VLP, vehicle="1")
     assert caught.value.vehicle == "1"
     with bus._publishers.publisher(Address("1", VLP)) as publisher:  # as one that was made before the rules changed
         for number in range(3000):
             publisher.publish(message(number))
-        with pytest.raises(nedbus.RefusedError):
+        with pytest.raises(RefusedError):
             publisher.flush()
         assert bus.latest(VLP, vehicle="1") == []
 
