@@ -33,6 +33,10 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
         return Absence(f"choose one of {to_text(', '.join(sorted(published)[:_MAX_NAMED]))}", is_fault=False)
     if services:
         advice = "see 'nedbus info' and the access rules for it and this client (docs/security.md)"
+        outdated = [service.service for service in services if service.is_outdated]
+        if outdated:
+            names = to_text(", ".join(outdated[:_MAX_NAMED]))
+            advice = f"{advice}; update nedbus on the host of {names}, which is older"
         return Absence(f"a service answers: {advice}", is_fault=False)
     if prefixes := _other_prefixes(bus):
         names = " and ".join(f"{to_text(prefix)}/" for prefix in prefixes)

@@ -70,10 +70,23 @@ def _check_reading(seen: Observation) -> Finding:
 
 
 def check_services(seen: Observation) -> Iterator[Finding]:
-    """Yield findings on the version and the sources of each service."""
+    """Yield findings on the version and the sources of each service; it has a status for each of its vehicles."""
+    known: list[Finding] = []
+    for finding in _check_statuses(seen):
+        if finding not in known:
+            known.append(finding)
+            yield finding
+
+
+def _check_statuses(seen: Observation) -> Iterator[Finding]:
     for service in seen.services:
         name = brief(service.service)
         version = brief(service.version or "unknown")
+        if service.is_outdated:
+            where = brief(service.host or "an unknown host")
+            text = f"nedbus {version} on {where}: its status does not name its vehicle, and is not used"
+            yield Finding("service", name, "wrong", text, "update nedbus on its host")
+            continue
         if version.split(".")[:2] != seen.version.split(".")[:2]:
             advice = "install the same version on both sides; CHANGELOG.md lists changes of the wire format"
             text = f"the service runs nedbus {version}, this client {seen.version}"

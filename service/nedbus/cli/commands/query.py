@@ -13,7 +13,16 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOptio
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, Health, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
+from nedbus.client import (
+    Bus,
+    Health,
+    ServiceStatus,
+    SourceStatus,
+    StreamStatus,
+    describe_stream,
+    health_of_last,
+    stream_state,
+)
 from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
@@ -105,8 +114,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
     for service in services[:_MAX_ROWS]:
-        name, version, role = map(to_text, (service.service, service.version, service.role))
-        write(f"\nservice {name}, nedbus {version}, as {role}")
+        write(f"\n{_head_of(service)}")
         rows = [
             [*map(to_text, (
                 each.source, each.state, each.published, each.rejected,
@@ -173,6 +181,14 @@ def _ask_publisher(open_bus: Callable[[], Bus], name: str) -> Definition[Any]:
     near = get_close_matches(name, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
     raise ConfigError("message", f"unknown message {name!r}, {reason}: {hint}")
+
+
+def _head_of(service: ServiceStatus) -> str:
+    name, version, role, host = map(to_text, (service.service, service.version, service.role, service.host))
+    if service.is_outdated:
+        reason = "its status does not name its vehicle, and is not shown: update nedbus on its host"
+        return f"service {name} on {host}, nedbus {version}: {reason}"
+    return f"service {name}, nedbus {version}, as {role}, vehicle {to_text(service.vehicle)}"
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

@@ -163,10 +163,12 @@ class Publisher(AbstractContextManager["Publisher"]):
         If the process ends without a flush, messages in transit to a slow reader are lost, but not counted as lost.
         A disconnected reader detects the messages it missed, and recovers those still in the history cache.
 
-        Raises ClosedError once the bus is closed.
+        Raises ClosedError once the bus is closed, RefusedError if the access rules of the router drop the messages.
         """
         if self._group is not None:
             self._group.hand_over()
+        if self._registry.permission is not None:
+            self._registry.permission.require(self.address.vehicle)
         return self._flow_control.wait_for_reception(self._writer.published, timeout=timeout)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
