@@ -273,9 +273,9 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
     """Reply to event queries with a report of these vehicles."""
     server = QueryServer(session)
     report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
-    server.answer_json(
-        status_key(name, vehicle="1"), lambda get: [json.dumps(report if get("events") else {}).encode()]
-    )
+    for vehicle in vehicles:
+        key = status_key(name, vehicle=vehicle)
+        server.answer_json(key, lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server):
         yield
 
