@@ -101,7 +101,7 @@ def service_status(session: Session, name: str = "fake", *, offset: float = 0.0,
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
     server.answer_json(
-        status_key(name), lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()]
+        status_key(name, vehicle="1"), lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()]
     )
     with closing(server):
         yield
@@ -314,7 +314,9 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
     """Reply to event queries with a report of these vehicles."""
     server = QueryServer(session)
     report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
-    server.answer_json(status_key(name), lambda get: [json.dumps(report if get("events") else {}).encode()])
+    for vehicle in vehicles:
+        key = status_key(name, vehicle=vehicle)
+        server.answer_json(key, lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server):
         yield
 
@@ -366,7 +368,7 @@ def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, 
     """An invalid event report from a peer produces no finding and does not break a check."""
     server = QueryServer(zenoh_session)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **invalid}
-    server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
+    server.answer_json(status_key("x", vehicle="1"), lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server), service_status(zenoh_session, sources=[source(state="failed", error="the disk is gone")]):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "the disk is gone")
