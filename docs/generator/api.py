@@ -111,6 +111,7 @@ def _signature(name: str, value: Any) -> str:
 def _constant(item: tuple[str, Any]) -> list[str]:
     name, value = item
     shown = {"TOPICS": "a mapping of names to `Topic`", "DTYPE": "`numpy.dtype`", "Session": "`zenoh.Session`"}
+    shown["frames.DERIVED"] = "a mapping of names to `DerivedField`"
     return [code(name), shown.get(name) or code(str(value).replace("typing.", "")), cell(_meaning(name))]
 
 
@@ -120,7 +121,7 @@ def _meaning(name: str) -> str:
     for package in (nedbus_msgs, nedbus):
         for path in Path(package.__path__[0]).rglob("*.py"):
             for assigned, text in constants_of(ast.parse(path.read_text())):
-                if assigned == name:
+                if assigned == name.rpartition(".")[2]:
                     return text
     raise LookupError(name)
 
