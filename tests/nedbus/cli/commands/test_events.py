@@ -427,7 +427,7 @@ def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_
     event_log, address = EventLog(), Address("7", VLP)
     server = QueryServer(zenoh_session)
     server.answer_json(
-        status_key("gcs"),
+        status_key("gcs", vehicle="7"),
         lambda _: reply_parts(report_of(event_log, "gcs", "host", 200.0, within=math.inf, to_utc=1.7e9)),
     )
 
