@@ -18,6 +18,7 @@ from .table import COLUMN_GAP, fit_columns, terminal_width
 
 _TIMES: Final = ("timestamp", "timestamp_sample")
 _DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
+_MAX_FLAGS: Final = 8  # with their names, in a summary
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
 _MIN_PAGE: Final = 10  # minimum number of lines between two headers
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
@@ -94,14 +95,23 @@ def _to_state(sample: Sample[Any]) -> str:
 
 
 def _to_summary(message: Message) -> str:
-    """Return the numbers of a message by name, then its flags, false ones with their value; omit unknown numbers."""
-    numbers, flags = [], []
+    """Return the numbers of a message by name, then its flags; unknown numbers are omitted.
+
+    A false flag has its value; of a message with many flags, only the number of the false ones is shown.
+    """
+    numbers, flags, false_flags = [], [], []
     for name, kind in message.DEFINITION.types.items():
         value = getattr(message, name)
         if kind.base == "bool":
-            flags.append(name if value is True else f"{name} {_to_number(value, None)}")
+            if value is True:
+                flags.append(name)
+            else:
+                false_flags.append(f"{name} {_to_number(value, None)}")
         elif name not in _TIMES and value != kind.absent and repr(value) != repr(kind.absent):
             numbers.append(f"{name} {_to_number(value, _SUMMARY_DIGITS.get(kind.base))}")
+    if len(flags) + len(false_flags) > _MAX_FLAGS:
+        false_flags = [f"({len(false_flags)} flags False)"] if false_flags else []
+    flags += false_flags
     return "  ".join([*numbers, *flags])
 
 

@@ -144,7 +144,7 @@ def test_echo_shows_flags_that_are_false(bus: nedbus.Bus, endpoint: str) -> None
     publisher = bus.publisher("gripper", vehicle="1", definition=definition)
     publisher.publish({"timestamp": 1, "is_open": False, "is_holding": True})
     [line] = echo(endpoint, "--once", "gripper").out.splitlines()
-    assert line.endswith("is_open False  is_holding")
+    assert line.endswith("  is_holding  is_open False")
 
 
 def test_echo_full_prints_every_field(simulation: str) -> None:

@@ -12,13 +12,13 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
 
 import pytest
 import zenoh
 
 import nedbus
 from nedbus.cli.output.logs import BURST, PER_MINUTE, JournalFormatter, JsonFormatter, RateLimit, TextFormatter
+from nedbus.client import SourceStatus
 from nedbus.log_event import EVENTS, about
 from nedbus.timings import Timings
 from nedbus.transport import Session
@@ -335,10 +335,8 @@ def test_log_of_flapping_vehicles_is_rate_limited(
     wait_for(lambda: '"listening"' in service.err, what="the source")
     fleet = [Px4(zenoh_session, namespace=f"wing{number}") for number in range(VEHICLES)]
 
-    def status(name: str) -> object:
-        (answer,) = bus.services()
-        (source,) = answer.sources
-        return getattr(source, name)
+    def sources() -> list[SourceStatus]:  # of the service, for each vehicle
+        return [source for answer in bus.services() for source in answer.sources]
 
     for px4 in fleet:
         px4.put(2_000_000)
@@ -346,8 +344,8 @@ def test_log_of_flapping_vehicles_is_rate_limited(
         px4.reboot()
         px4.put(1_000_000)
         px4.raw(b"garbage")
-    wait_for(lambda: status("reboots") == VEHICLES, what="the reboots")
-    wait_for(lambda: len(cast("list[str]", status("stale"))) == VEHICLES, what="the silence")
+    wait_for(lambda: max((each.reboots for each in sources()), default=0) == VEHICLES, what="the reboots")
+    wait_for(lambda: len({stale for each in sources() for stale in each.stale}) == VEHICLES, what="the silence")
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
     total = count_lines(service.err, time.monotonic() - began)
