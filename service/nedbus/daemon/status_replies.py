@@ -13,7 +13,7 @@ from nedbus.client import QueryServer, ServiceStatus, reply_parts
 from nedbus.events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
 from nedbus_msgs import status_key
 
-_FRESH: Final = 0.1  # s; a query for all vehicles of a service asks once for each of them
+_FRESH: Final = 0.5  # s; a query for all vehicles of a service asks once for each of them
 
 
 class StatusReplies:
@@ -64,19 +64,17 @@ class StatusReplies:
             yield from reply_parts(replace(own, now=clock.utc()))
 
     def _current_status(self) -> ServiceStatus:
-        now = time.monotonic()
         known = self._status
-        if known is not None and now - known[0] < _FRESH:
+        if known is not None and time.monotonic() - known[0] < _FRESH:
             return known[1]
         status = self._make_status()
-        self._status = now, status
+        self._status = time.monotonic(), status  # after it was made, which takes longer than that with many vehicles
         return status
 
     def _current_report(self, within: float) -> AccountReport:
-        now = time.monotonic()
         known = self._report
-        if known is not None and known[1] == within and now - known[0] < _FRESH:
+        if known is not None and known[1] == within and time.monotonic() - known[0] < _FRESH:
             return known[2]
         report = self._make_report(within)
-        self._report = now, within, report
+        self._report = time.monotonic(), within, report
         return report

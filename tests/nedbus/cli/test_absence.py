@@ -38,7 +38,7 @@ def test_reason_of_a_source_comes_first(
 def test_link_of_a_missing_vehicle_explains_its_absence(endpoint: str, zenoh_session: Session, bus: nedbus.Bus) -> None:
     """For a requested vehicle, only its own link counts, and other published vehicles do not hide it."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
-    with service_status(zenoh_session, sources=[source(stale=[f"7/{VLP}"], addresses=[f"1/{VLP}"])]):
+    with service_status(zenoh_session, vehicle="7", sources=[source(stale=[f"7/{VLP}"], addresses=[f"1/{VLP}"])]):
         cut, unknown = (run_command("list", "-c", endpoint, "-v", vehicle) for vehicle in ("7", "8"))
     assert f"receives no more messages of 7/{VLP}" in cut.err
     assert unknown.err.endswith(": choose one of 1\n")

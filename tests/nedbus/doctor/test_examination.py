@@ -96,12 +96,15 @@ def publishing(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
 
 
 @contextmanager
-def service_status(session: Session, name: str = "fake", *, offset: float = 0.0, **status: object) -> Iterator[None]:
-    """Reply to status queries with this status; the service's clock is `offset` seconds ahead."""
+def service_status(
+    session: Session, name: str = "fake", *, vehicle: str = "1", offset: float = 0.0, **status: object
+) -> Iterator[None]:
+    """Reply to queries of the status of a vehicle with this status; the service's clock is `offset` seconds ahead."""
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
     server.answer_json(
-        status_key(name, vehicle="1"), lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()]
+        status_key(name, vehicle=vehicle),
+        lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()],
     )
     with closing(server):
         yield
@@ -281,7 +284,7 @@ def test_service_status_produces_findings(zenoh_session: Session, endpoint: str)
         source(source="mavlink:udpout:10.0.0.1:14580", state="waiting"),
         source(source="mavlink:satellite", warnings=["system 5: a satellite link"]),
     ]
-    with service_status(zenoh_session, version="99.1.0", sources=sources):
+    with service_status(zenoh_session, vehicle="9", version="99.1.0", sources=sources):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
     assert "first address" not in find(findings, "source", "warning", "px4-zenoh:: waiting").advice
@@ -300,7 +303,7 @@ def test_service_status_produces_findings(zenoh_session: Session, endpoint: str)
 def test_equal_findings_are_one_with_all_subjects(zenoh_session: Session, endpoint: str, bus: nedbus.Bus) -> None:
     """A fault of all streams of a vehicle is one finding, which lists streams and names service and host."""
     addresses = [f"8/{topic}" for topic in TOPICS][:12]
-    with publishing(bus, "1"), service_status(zenoh_session, sources=[source(addresses=addresses)]):
+    with publishing(bus, "1"), service_status(zenoh_session, vehicle="8", sources=[source(addresses=addresses)]):
         findings = diagnose_until(endpoint, "reported as published", "messages arrive")
     found = [each for each in findings if "reported as published" in each.seen]
     assert len(found) == 1, found
