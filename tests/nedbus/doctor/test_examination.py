@@ -29,7 +29,7 @@ from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import NO_HASH, Session, TopicKey, fleet_tokens, open_client, open_router
-from nedbus_msgs import TOPICS, dds_type, status_key
+from nedbus_msgs import TOPICS, Address, dds_type, status_key
 from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
@@ -82,8 +82,8 @@ def has_no_faults(findings: list[Finding]) -> bool:
 
 @contextmanager
 def publishing(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
-    """Publish positions of these vehicles, by default of vehicle 1."""
-    publishers = [bus.publisher(VLP, vehicle=each) for each in vehicles or "1"]
+    """Publish positions of these vehicles, by default of vehicle 1, as a service does: also those that are refused."""
+    publishers = [bus._publishers.publisher(Address(vehicle, VLP)) for vehicle in vehicles or "1"]
 
     def publish() -> None:
         for publisher in publishers:
@@ -384,7 +384,7 @@ def test_doctor_reports_bad_vehicle_from_event_report(run_nedbus: Start, tmp_pat
     log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
     run_nedbus("serve", "--listen", endpoint, "-s", f"ulog:{log}?vehicle=sick")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
-        wait_for(lambda: bus.accounts() and bus.accounts()[0].vehicles, what="the vehicle")
+        wait_for(lambda: any(report.vehicles for report in bus.accounts()), what="the vehicle")
     find(diagnose(endpoint), "vehicle", "wrong", "sick: xy not valid, since ")
 
 
