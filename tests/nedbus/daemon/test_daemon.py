@@ -223,8 +223,8 @@ def test_failing_source_does_not_affect_others(tmp_path: Path, serve: Serve) -> 
     missing = tmp_path / "later.ulg"
     service, bus = serve("-s", f"ulog:{missing}?vehicle=late", "-s", "sim:")
     wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the other source")
-    wait_for(has_state(bus, "retrying"), what="a retry")
-    assert "no such file" in str(source_of(bus).error)
+    wait_for(has_state(bus, "retrying", 1), what="a retry")
+    assert "no such file" in str(source_of(bus, 1).error)
     write_log(missing, [0, 1000])
     wait_for(lambda: bus.latest(VLP, vehicle="late"), what="the recovered source")
     assert service.popen.poll() is None

@@ -34,7 +34,7 @@ from nedbus.pki import (
     write_access_rules,
 )
 from nedbus.transport import open_client, open_router
-from nedbus_msgs import AddressError
+from nedbus_msgs import Address, AddressError
 from tests.flights.messages import VLP, message
 from tests.peers import certificates
 from tests.peers.certificates import secure_endpoint, client_tls, write_config
@@ -102,7 +102,7 @@ def join(file: Path, pki: Path) -> Iterator[Join]:
 
 def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others: list[str]) -> None:
     """Assert that a reader receives what the bus publishes as this vehicle, but nothing it published as others before."""
-    publishers = {each: bus.publisher(VLP, vehicle=each) for each in [*others, vehicle]}
+    publishers = {name: bus._publishers.publisher(Address(name, VLP)) for name in [*others, vehicle]}  # as a service
     with reader.subscribe("*", mode="every") as subscription:
 
         def publish() -> bool:
@@ -465,7 +465,7 @@ def test_rules_of_200_vehicles_are_enforced(run_router: RunRouter, file: Path, j
     write_access_rules(file, FLEET[:-1])
     run_router(file)
     removed, reader = join("vehicle-200"), join("reader")
-    removed.publisher(VLP, vehicle="200").publish(message(200))
+    removed._publishers.publisher(Address("200", VLP)).publish(message(200))
     assert_writes_only(join("vehicle-1"), reader, "1", ["200"])
     assert not reader.latest(VLP, vehicle="200")
 
