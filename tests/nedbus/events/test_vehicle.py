@@ -220,7 +220,7 @@ def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
     stories = {(event.kind, event.change): story_of(event, events) for event in events}
     reported = {key: story.what for key, story in stories.items() if story is not None}
     assert reported["reset", "once"].startswith("reset of xy by 5.0 m")
-    assert reported["reboot", "once"].startswith("reboot:")
+    assert reported["reboot", "once"].startswith("reboot (up for")
     assert reported["xy_invalid", "end"] == reported["xy_invalid", "begin"] == "xy not valid"
     assert story_of(Event("1", "jump", "once", "watch", "", 9.0), events) is None
 
