@@ -61,8 +61,8 @@ def test_gps_that_falls_silent_is_an_event_and_evidence(monkeypatch: pytest.Monk
     assert "no GPS message" in service.verdict().text
     found = service.run().verdict()
     assert [each.kind for each in found.cause if each.kind != "text"] == ["no_messages", "dead_reckoning"]
-    injected = '08:30:02.6 PX4: "inject failure unit: gps (4), type: off (1), instance: 0"'
-    assert f". Evidence: {injected}; 08:30:02.7 no GPS message; 08:30:03.8 dead reckoning; " in found.text
+    injected = '08:30:02.6 PX4: "Injected: gps off, all instances"'
+    assert f". Evidence: {injected}; 08:30:02.7 no GPS message; 08:30:03.8 dead reckoning" in found.text
     logged = read_file_events(PX4 / "gps_off_in_flight.ulg").event_log.events
     assert [each.text for each in logged if each.kind == "no_messages"] == ["no GPS message"]
 
