@@ -68,7 +68,7 @@ def repeating(action: Callable[[], object]) -> Iterator[None]:
 
 
 class Stopwatch:
-    """A clock that stands still while a busy machine does not run this process; it counts ticks of 10 ms.
+    """A clock that does not advance while a busy machine does not run this process; it counts ticks of 10 ms.
 
     For limits that tell a wait for a timeout from none: on an idle machine it is exact to a few percent.
     """

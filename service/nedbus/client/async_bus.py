@@ -211,7 +211,7 @@ class _Opening(Generic[_T]):
         self._is_abandoned = False
 
     def run(self) -> _T:
-        """Open in this thread; close at once what nobody waits for."""
+        """Open in this thread; close the result at once if the waiting task was cancelled."""
         opened = self._open()
         with self._lock:
             self._opened = opened

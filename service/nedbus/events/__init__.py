@@ -4,7 +4,16 @@ from .event import ALL, WINDOW, Condition, Event, State
 from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
-from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
+from .report import (
+    ACCOUNT_PARAMETER,
+    AccountReport,
+    VehicleReport,
+    by_vehicle,
+    from_json,
+    joined,
+    once_per_service,
+    report_of,
+)
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, events_outside, is_alarm, spans_of, state_at, stories_of, story_of
 from .times import Times, format_duration, format_since, format_utc, unit_of

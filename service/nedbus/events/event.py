@@ -25,7 +25,7 @@ ALONE: Final = "one_message"
 """Name among an event's `numbers` if only one message, between two that agree, had the value that it ends."""
 
 SUPPRESSED: Final = "suppressed"
-"""Name among the `numbers` of a text of PX4 that stands for so many equal ones."""
+"""Key in `numbers` of a PX4 text that represents several equal texts: their number."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
 """Time on the event log's clock [s]; the bounds validate reports from peers."""

@@ -1,11 +1,11 @@
 """Health checks of vehicles: the criteria, and the faults that violate them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from .event import ALL, without_wild
-from .report import AccountReport, VehicleReport, by_vehicle
+from .report import AccountReport, VehicleReport, by_vehicle, once_per_service
 from .times import format_duration, format_since, format_utc
 
 VALID: Final[Mapping[str, str]] = {"xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid"}
@@ -63,15 +63,20 @@ def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: 
 
 
 def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
+    # Selected before the events of a service are merged: what is said of one vehicle does not concern another.
+    selected = [
+        replace(report, events=tuple(without_wild(report.events)))
+        for report in reports
+        if not expected.expect or report.vehicles.keys() & {*expected.expect}
+    ]
     lines = []
-    for report in reports:
-        for event in without_wild(report.events):
-            is_recent = expected.within is not None and event.time > report.now - expected.within
-            is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
-            if is_recent and is_selected and event.severity != "info":
-                name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
-                at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
-                lines.append(f"{name}: {event.text}, at {at}")
+    for report, event in once_per_service(selected):
+        is_recent = expected.within is not None and event.time > report.now - expected.within
+        is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
+        if is_recent and is_selected and event.severity != "info":
+            name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
+            at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
+            lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_RECENT]
     if (more := len(lines) - _MAX_RECENT) > 0:
         yield f"{more} more event{'s' * (more > 1)} in the last {expected.within:g} s"

@@ -201,6 +201,9 @@ class _Kinds(dict[str, Kind]):
         return Kind(name)
 
 
+OF_SERVICE: Final = frozenset({"link_down", "overload"})
+"""Kinds of events of a service itself, which it reports for each of its vehicles."""
+
 KINDS: Final = _Kinds({kind.name: kind for kind in _ROWS})
 """All kinds of events by name, most important first; a name unknown to this version gets a default kind."""
 

@@ -14,7 +14,7 @@ from nedbus_msgs import TOPICS, check_vehicle
 
 from .event import ALL, Condition, Event, Seconds
 from .event_log import KEPT, MAX_VEHICLES, EventLog
-from .kinds import KINDS, rank_vehicle
+from .kinds import KINDS, OF_SERVICE, rank_vehicle
 
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests this report instead of the status; its value is the period [s]."""
@@ -128,6 +128,22 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
             if name not in found or found[name].vehicles[name].is_silent:
                 found[name] = report
     return dict(sorted(found.items(), key=lambda each: rank_vehicle(each[0], each[1].vehicles[each[0]].severity)))
+
+
+def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountReport, Event]]:
+    """Return the events of reports in chronological order, each with its report.
+
+    A service reports events of its link and its load for each of its vehicles; they occur once, with the vehicle ALL.
+    """
+    found: dict[object, tuple[AccountReport, Event]] = {}
+    for report in reports:
+        for event in report.events:
+            if event.kind in OF_SERVICE:
+                key: object = (report.service, report.host, event.kind, event.change, event.time)
+                found.setdefault(key, (report, replace(event, vehicle=ALL)))
+            else:
+                found[id(event)] = report, event
+    return sorted(found.values(), key=lambda each: each[1].time)
 
 
 def from_json(content: object) -> AccountReport | None:

@@ -306,3 +306,18 @@ def test_recent_events_beyond_twenty_are_counted() -> None:
     lines = faults_of([replace(report(flying()), now=30.0, events=events)], Expectation(within=60.0))
     assert len(lines) == 21
     assert lines[-1] == "10 more events in the last 60 s"
+
+
+def test_loss_of_a_link_is_one_fault_of_its_service() -> None:
+    """A service reports its link under each of its vehicles; a check lists it once, in chronological order."""
+    lost = Event(ALL, "link_down", "begin", "bad", "no link to tcp/a", 50.0)
+    resets = [Event(name, "reset", "once", "watch", "reset of xy", time) for name, time in (("1", 40.0), ("2", 60.0))]
+    vehicles = {name: VehicleReport("info", "ok", has_position=True) for name in ("1", "2")}
+    whole = AccountReport("gcs", "host", 100.0, vehicles, (resets[0], lost, resets[1]))
+    found = faults_of([whole.about("1"), whole.about("2")], Expectation(within=90.0))
+    assert [fault.partition(", at")[0] for fault in found] == [
+        "vehicle 1: reset of xy", "host: no link to tcp/a", "vehicle 2: reset of xy",
+    ]  # fmt: skip
+    forged = whole.about("1")
+    other = AccountReport("other", "host", 100.0, {"3": vehicles["1"]})
+    assert faults_of([forged, other], Expectation(expect=("3",), within=90.0)) == []

@@ -139,7 +139,7 @@ def test_events_and_verdicts_of_a_vehicle_are_its_own(fleet: Fleet, run_nedbus: 
 
 @pytest.mark.process
 def test_vehicle_without_a_service_has_no_forged_verdict(fleet: Fleet) -> None:
-    """`why -v 2` says that nobody reports vehicle 2, although vehicle 1 reports that it has no faults."""
+    """`why -v 2` says that no service reports vehicle 2, although vehicle 1 reports that it has no faults."""
     with fleet.forging():
         result = fleet.run("why", "-v", "2")
     assert result.exit_code != 0

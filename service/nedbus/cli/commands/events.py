@@ -35,6 +35,7 @@ from nedbus.events import (
     by_vehicle,
     events_outside,
     format_duration,
+    once_per_service,
     report_of,
     verdict_of,
 )
@@ -104,7 +105,12 @@ def events(
         begin(times := Times(is_live=True), {"host"})
         with open_bus() as bus:
             if within is not None:
-                show(_in_order(each for report in bus.accounts(within=within) for each in report.events), times)
+                reports = [
+                    report
+                    for report in bus.accounts(within=within)
+                    if not report.vehicles or any(map(selection.matches_vehicle, report.vehicles))
+                ]
+                show([event for _, event in once_per_service(reports)], times)
             _follow(bus, selection, lambda found: show(found, times), duration)
         return
     if within is not None or duration is not None:
