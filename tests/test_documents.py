@@ -240,7 +240,6 @@ def test_every_block_has_a_known_language_and_marker() -> None:
         "python",
         "toml",
         "json",
-        "json5",
         "ini",
         "text",
         "javascript",
