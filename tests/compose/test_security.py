@@ -68,7 +68,9 @@ def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, n
     """Another vehicle, a reader and an operator may put neither messages of vehicles 1 and 3 nor a rejection."""
     with join(secure, pki, name) as intruder:
         for vehicle in ("1", "3"):
-            publisher = intruder.publisher(VLP, vehicle=vehicle)
+            with pytest.raises(nedbus.errors.RefusedError, match=f"vehicle {vehicle}"):
+                intruder.publisher(VLP, vehicle=vehicle)
+            publisher = intruder._publishers.publisher(Address(vehicle, VLP))  # without asking the router
             for timestamp in range(1, 100):
                 publisher.publish(message(timestamp))
         intruder._session.put("nedbus/@rejected/1/vehicle_local_position", b"{}")
@@ -79,10 +81,11 @@ def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, n
 
 
 def test_certificate_cannot_publish_another_vehicle(secure: Stack, reader: Recorder) -> None:
-    """Messages of vehicle 2 that are published with the certificate of vehicle 1 do not arrive."""
+    """Messages of vehicle 2 published with the certificate of vehicle 1 do not arrive, and the service fails."""
     impostor = secure.run("service", "serve", "-s", "sim:?vehicle=2&duration=3", "--until-done")
-    assert impostor.wait(60.0) == 0, impostor.err
+    assert impostor.wait(60.0) == 1, impostor.err
     assert "published" in impostor.err
+    assert "the router refuses messages of vehicle 2" in impostor.err
     check_genuine(reader)
 
 
