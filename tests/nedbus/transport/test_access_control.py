@@ -298,9 +298,13 @@ def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Pa
     environment = {"NEDBUS_CONNECT": secure, **{f"NEDBUS_TLS_{name}": f"{pki / file}" for name, file in files.items()}}
     echo = run_command("echo", "-n", "20", **environment)
     assert (echo.exit_code, len(echo.out.splitlines())) == (0, 20), echo.err
-    info = run_command("info", **environment)
-    assert info.exit_code == 0
-    assert "sim:" in info.out
+
+    def has_sources() -> bool:
+        info = run_command("info", **environment)
+        assert info.exit_code == 0
+        return "sim:" in info.out
+
+    wait_for(has_sources, what="a status in time, without which `info` lists the service without its sources")
 
     def is_refused() -> bool:
         refused = run_command("health", "-v", "2", **environment)

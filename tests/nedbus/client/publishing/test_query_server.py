@@ -10,7 +10,7 @@ import zenoh
 import nedbus
 from nedbus.client import QueryServer
 from nedbus.transport import Session, query
-from tests.waits import DEADLINE
+from tests.waits import DEADLINE, wait_for
 
 
 class Panic(BaseException):
@@ -37,7 +37,13 @@ def test_panic_in_a_reply_does_not_end_the_server(
         request.reply("a/key", b"found")
 
     server.answer("a/key", reply)
-    assert query(bus._session, "a/key", timeout=DEADLINE) == []
+
+    def has_failed() -> bool:
+        assert query(bus._session, "a/key", timeout=DEADLINE) == []
+        return not faults
+
+    # Until the queryable is known to the other session, queries do not reach it.
+    wait_for(has_failed, what="a reply that fails")
     assert [each.payload.to_bytes() for each in query(bus._session, "a/key", timeout=DEADLINE)] == [b"found"]
     assert [record.getMessage() for record in caplog.records] == [
         "a/key: unexpected error in a query reply (logged once)"
