@@ -14,6 +14,10 @@ from nedbus.events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
 from nedbus_msgs import status_key
 
 _FRESH: Final = 0.5  # s; a query for all vehicles of a service asks once for each of them
+_REST: Final = (
+    4  # a status or report is kept at least this many times as long as it took: a thousand vehicles, or a busy
+)
+# host, would otherwise make it again for every few vehicles of a query, and readers stop waiting
 
 
 class StatusReplies:
@@ -35,7 +39,7 @@ class StatusReplies:
         self._make_status, self._make_report = status, report
         self._lock = threading.Lock()
         self._vehicles: set[str] = set()
-        self._status: tuple[float, ServiceStatus] | None = None  # with the time at which it was made
+        self._status: tuple[float, ServiceStatus] | None = None  # with the time until which it is fresh
         self._report: tuple[float, float, AccountReport] | None = None  # with that time, and the period it covers
 
     def add(self, vehicle: str) -> None:
@@ -65,16 +69,24 @@ class StatusReplies:
 
     def _current_status(self) -> ServiceStatus:
         known = self._status
-        if known is not None and time.monotonic() - known[0] < _FRESH:
+        begin = time.monotonic()
+        if known is not None and begin < known[0]:
             return known[1]
         status = self._make_status()
-        self._status = time.monotonic(), status  # after it was made, which takes longer than that with many vehicles
+        self._status = _fresh_until(begin), status
         return status
 
     def _current_report(self, within: float) -> AccountReport:
         known = self._report
-        if known is not None and known[1] == within and time.monotonic() - known[0] < _FRESH:
+        begin = time.monotonic()
+        if known is not None and known[1] == within and begin < known[0]:
             return known[2]
         report = self._make_report(within)
-        self._report = time.monotonic(), within, report
+        self._report = _fresh_until(begin), within, report
         return report
+
+
+def _fresh_until(begin: float) -> float:
+    """Return until when a reply is fresh that was made from `begin` until now."""
+    end = time.monotonic()
+    return end + max(_FRESH, _REST * (end - begin))
