@@ -207,10 +207,10 @@ class Daemon:
             session, queries, prefix=settings.prefix, is_client=is_client, on_vehicle=replies.add
         )
         try:
-            replies.add(settings.vehicle)  # reports sources that have not published a vehicle yet
             with self._workers_lock:
                 self._registry = registry
                 self._apply_plan(registry)
+            replies.add(settings.vehicle)  # reports sources that have not published a vehicle yet
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
             self._wait(registry, replies, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
@@ -243,9 +243,9 @@ class Daemon:
             if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
                 text = "%s: still stopping after %.0f s, possibly because of a slow reader"
                 _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
+        self._workers = ordered  # before the first message, whose readers may query the status of its source
         for worker in new:  # after the removed workers have stopped, because both may use the same addresses
             worker.thread.start()
-        self._workers = ordered
         return len(ordered) - len(new)
 
     def _make_plan(self, settings: Settings) -> list[PlannedSource]:
