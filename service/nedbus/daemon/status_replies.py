@@ -14,10 +14,8 @@ from nedbus.events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
 from nedbus_msgs import status_key
 
 _FRESH: Final = 0.5  # s; a query for all vehicles of a service asks once for each of them
-_REST: Final = (
-    4  # a status or report is kept at least this many times as long as it took: a thousand vehicles, or a busy
-)
-# host, would otherwise make it again for every few vehicles of a query, and readers stop waiting
+# A reply is kept for at least this many times as long as it took: a query of a thousand vehicles makes it once.
+_REST: Final = 4
 
 
 class StatusReplies:

@@ -302,4 +302,6 @@ def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = Fal
         worker.stop(release=release)
     deadline = time.monotonic() + grace
     for worker in workers:
+        if worker.thread.ident is None:  # not started, because another one could not be
+            continue
         worker.thread.join(max(0.0, deadline - time.monotonic()))

@@ -304,7 +304,7 @@ def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Pa
         assert info.exit_code == 0
         return "sim:" in info.out
 
-    wait_for(has_sources, what="a status in time, without which `info` lists the service without its sources")
+    wait_for(has_sources, what="the sources of the service in `info`")
 
     def is_refused() -> bool:
         refused = run_command("health", "-v", "2", **environment)
