@@ -18,7 +18,8 @@ import zenoh
 import nedbus
 from nedbus.pki import write_access_rules
 from nedbus.transport import Session, open_client, query, token_keys
-from nedbus_msgs import ack_key
+from nedbus.web.server import LiveFleet
+from nedbus_msgs import Selection, ack_key
 from tests.flights.messages import VLP
 from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import CommandResult, run_command
@@ -138,6 +139,8 @@ def test_events_and_verdicts_of_a_vehicle_are_its_own(fleet: Fleet, run_nedbus: 
         assert "forged" not in str(reports)
         assert "forged" not in fleet.run("events", "--within", "1e9", "--duration", "1").out
         assert "forged" not in fleet.run("why", "-v", "2").out
+        page = LiveFleet(reader, Selection(), version="0")
+        assert "forged" not in str(page.timeline.events)
 
 
 @pytest.mark.process
