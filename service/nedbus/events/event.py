@@ -48,7 +48,8 @@ class Event:
     `numbers`: values by name, in SI units and NED. `names`: flags, quantities, topics, or values before and after.
     `lasted`: duration of the condition that ends [s], None if it began before the first message.
     `evidence`: possible causes, which occurred at most WINDOW seconds earlier or began a condition still active.
-    `author`: the autopilot that the vehicle's HEARTBEAT names, which wrote its log messages.
+    `author`: of a log message, the autopilot that the vehicle's HEARTBEAT names; None for all other events, and in the
+    reports of older services.
     """
 
     vehicle: str
@@ -63,7 +64,7 @@ class Event:
     names: tuple[str, ...] = ()
     lasted: float | None = None
     evidence: tuple[Event, ...] = ()
-    author: Author = "PX4"
+    author: Author | None = None
 
     @property
     def identity(self) -> tuple[object, ...]:
@@ -89,7 +90,7 @@ class Event:
         if self.origin != "px4":
             return self.text
         count = self.numbers.get(SUPPRESSED)
-        return f'{self.author}: "{self.text}"{f", the last of {count:.0f} suppressed texts" if count else ""}'
+        return f'{self.author or "PX4"}: "{self.text}"{f", the last of {count:.0f} suppressed texts" if count else ""}'
 
     def later(self, seconds: float) -> Event:
         """Return this event and its evidence on a clock that is ahead by `seconds`."""

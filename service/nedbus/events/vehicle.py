@@ -318,9 +318,10 @@ class Vehicle:
             numbers["armed"] = 1
         if is_alone:
             numbers[ALONE] = 1
+        author = self.author if found.kind == "text" else None
         return Event(
             self.name, found.kind, found.change, self._severity(found, time), found.text, time, boot, topic, numbers,
-            found.names, lasted, author=self.author,
+            found.names, lasted, author=author,
         )  # fmt: skip
 
     def _severity(self, found: Finding, time: float) -> Severity:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import struct
 from collections.abc import Iterable
 from pathlib import Path
@@ -147,3 +148,5 @@ def test_texts_name_the_autopilot_of_the_heartbeat(tmp_path: Path, autopilot: in
         assert texts == [f'{author}: "Leak Detected"'], file
         shown = run_command("events", str(file)).out
         assert f'{author}: "Leak Detected"' in shown
+        rows = list(csv.DictReader(run_command("events", str(file), "--csv").out.splitlines()))
+        assert {(row["kind"] == "text", row["author"]) for row in rows} <= {(True, author), (False, "")}
