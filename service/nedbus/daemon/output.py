@@ -172,7 +172,15 @@ class SourceOutput:
         if message.dropout:
             self._event_log.add_dropout(address.vehicle, message.dropout, clock.steady() - message.dropout)
         is_estimate = message.source == _ULOG_STREAM
-        self._event_log.add(address, row, clock.steady(), missing=missing, lost=lost, is_estimate=is_estimate)
+        self._event_log.add(
+            address,
+            row,
+            clock.steady(),
+            missing=missing,
+            lost=lost,
+            is_estimate=is_estimate,
+            source=message.source,
+        )
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source; claim its address first if necessary."""

@@ -11,9 +11,10 @@ from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, position_at
 from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
-from nedbus.transport import check_endpoints, read_router_config, router_endpoints, split_endpoint
+from nedbus.transport import RouterConfig, check_endpoints, read_router_config, router_endpoints, split_endpoint
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
+from .access_rules import find_rule_mistakes
 from .finding import Finding
 from .prober import check_pem_file, check_tls_files, reach_endpoint
 
@@ -59,9 +60,21 @@ def check_router_file(
         config = read_router_config(path)
     except ConfigError as exc:
         return [exc]
-    if offline:
-        return []
-    found: list[tuple[str, str]] = []  # (value in the file, mistake or "")
+    text = path.read_text(errors="replace")
+    subjects = max(0, text.find("cert_common_names"))  # names of certificates also occur before
+    located = [
+        (mistake.reason, position_at(text, text.find(f'"{mistake.certificate}"', subjects)))
+        for mistake in find_rule_mistakes(config.access)
+    ]
+    if not offline:
+        found = _check_router_access(config, replaced)
+        located += [(reason, position_at(text, text.find(value))) for value, reason in found if reason]
+    return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
+
+
+def _check_router_access(config: RouterConfig, replaced: Collection[str]) -> list[tuple[str, str]]:
+    """Return endpoints and TLS files of a router, each with its mistake, or "" if it is usable."""
+    found = list[tuple[str, str]]()
     for name, endpoints, probe in (("listen", config.listen, _try_listen), ("connect", config.connect, reach_endpoint)):
         for endpoint in endpoints if name not in replaced else ():
             try:
@@ -73,9 +86,7 @@ def check_router_file(
     for name, file in config.tls_files.items():
         reason = _reason(check_pem_file(name, file, "it is"))
         found.append((str(file), reason and f"{name}: {reason}"))
-    text = path.read_text(errors="replace")
-    located = ((reason, position_at(text, text.find(value))) for value, reason in found if reason)
-    return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
+    return found
 
 
 def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:

@@ -6,17 +6,20 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from nedbus import client
 from nedbus.errors import NedbusError
 from nedbus.extras import import_optional
 from nedbus.log_event import about
+from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.timings import TIMINGS
-from nedbus.transport import Tls, probe_writes
+from nedbus.transport import AccessControl, Tls, probe_writes, read_router_config
 
+from .access_rules import explain_permissions
 from .configuration import check_sources
 from .finding import Finding, limit_findings, sort_findings
 from .network_checks import NETWORK_CHECKS
@@ -32,15 +35,22 @@ _MAX_ROUTERS: Final = 8
 
 
 def examine(
-    settings: Settings, *, version: str, vehicle: str | None = None, mavlink: str | None = None
+    settings: Settings,
+    *,
+    version: str,
+    vehicle: str | None = None,
+    mavlink: str | None = None,
+    rules: Path | None = None,
 ) -> list[Finding]:
     """Run all checks and return their findings, the worst last; takes up to 10 s if no router answers.
 
     `version`: version of this nedbus. `vehicle`: check only this vehicle, and test the permission to publish it.
     `mavlink`: link to check, such as `udpin:0.0.0.0:14540`.
+    `rules`: configuration of the router, to name the rules that decide about this client's certificate.
 
-    Raises ConfigError for an invalid link.
+    Raises ConfigError for an invalid link, and for an invalid file of rules.
     """
+    access = None if rules is None else read_router_config(rules).access
     tls_findings, tls = check_tls_files(settings)
     findings = [*_describe_settings(settings), *(finding for _, finding in tls_findings)]
     checks: dict[tuple[str, str], Check] = {("settings", ""): partial(_check_sources, settings)}
@@ -51,13 +61,15 @@ def examine(
         checks["endpoint", endpoint] = partial(check_endpoint, endpoint, tls)
     findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
     answering = [each.subject for each in findings if (each.check, each.state) == ("endpoint", "ok")]
+    seen = Observation(settings.prefix, version, vehicle)
     if answering:
         for index, each in enumerate(findings):  # one router is enough, so the others do not explain missing data
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
-        seen = Observation(settings.prefix, version, vehicle)
         checks = {("network", ""): partial(check_network, seen, answering[0], tls)}
         findings += _run_together(checks, _NETWORK_TIMEOUT)
+    if access is not None:
+        findings += _explain_rules(settings, access, seen)
     return sort_findings(findings)
 
 
@@ -71,6 +83,23 @@ def _describe_settings(settings: Settings) -> Iterator[Finding]:
     yield Finding("settings", "connect", "ok", f"{' or '.join(settings.routers)}, {text}", advice)
     if others := ", ".join(f"{name} by {setter}" for name, setter in setters.items() if name != "connect"):
         yield Finding("settings", "others", "ok", f"set: {others}")
+
+
+def _explain_rules(settings: Settings, access: AccessControl, seen: Observation) -> Iterator[Finding]:
+    """Yield the rules that decide about this client's certificate."""
+    if not access.is_enabled:
+        yield Finding("rules", "", "ok", "the file has no access rules: every client may write every key")
+        return
+    if settings.tls_certificate is None:
+        advice = "use --tls-certificate and --tls-key with the files of this client"
+        yield Finding("rules", "", "unknown", "this client has no certificate", advice)
+        return
+    try:
+        name = Certificate.read(settings.tls_certificate).subject
+    except (OSError, ValueError) as exc:  # also without the extra `pki`
+        yield Finding("rules", str(settings.tls_certificate), "unknown", "name of the certificate not read", str(exc))
+        return
+    yield from explain_permissions(access, name, vehicle=seen.vehicle, prefix=seen.prefix, verdict=seen.verdict)
 
 
 def _check_sources(settings: Settings) -> Iterator[Finding]:

@@ -9,6 +9,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from nedbus.samples import ARDUPILOT, OTHER_AUTOPILOT
+
 from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import MAX_ALONE
 
@@ -27,6 +29,11 @@ ALONE: Final = "one_message"
 SUPPRESSED: Final = "suppressed"
 """Key in `numbers` of a PX4 text that represents several equal texts: their number."""
 
+Author = Literal["PX4", "ArduPilot", "autopilot"]
+
+AUTHORS: Final[Mapping[str | None, Author]] = {ARDUPILOT: "ArduPilot", OTHER_AUTOPILOT: "autopilot"}
+"""The author of log messages by their source; all others are of PX4."""
+
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
 """Time on the event log's clock [s]; the bounds validate reports from peers."""
 
@@ -41,6 +48,8 @@ class Event:
     `numbers`: values by name, in SI units and NED. `names`: flags, quantities, topics, or values before and after.
     `lasted`: duration of the condition that ends [s], None if it began before the first message.
     `evidence`: possible causes, which occurred at most WINDOW seconds earlier or began a condition still active.
+    `author`: of a log message, the autopilot that the vehicle's HEARTBEAT names; None for all other events, and in the
+    reports of older services.
     """
 
     vehicle: str
@@ -55,6 +64,7 @@ class Event:
     names: tuple[str, ...] = ()
     lasted: float | None = None
     evidence: tuple[Event, ...] = ()
+    author: Author | None = None
 
     @property
     def identity(self) -> tuple[object, ...]:
@@ -63,7 +73,7 @@ class Event:
 
     @property
     def origin(self) -> str:
-        """The author: "px4" for PX4's own log messages, "nedbus" for events derived from messages."""
+        """The author: "px4" for log messages of an autopilot, "nedbus" for events derived from messages."""
         return "px4" if self.kind == "text" else "nedbus"
 
     @property
@@ -76,11 +86,11 @@ class Event:
 
     @property
     def words(self) -> str:
-        """The text, in quotes if it is PX4's own, with the number of equal ones that it stands for."""
+        """The text; of an autopilot in quotes after its author, with the number of equal ones that it stands for."""
         if self.origin != "px4":
             return self.text
         count = self.numbers.get(SUPPRESSED)
-        return f'PX4: "{self.text}"{f", the last of {count:.0f} suppressed texts" if count else ""}'
+        return f'{self.author or "PX4"}: "{self.text}"{f", the last of {count:.0f} suppressed texts" if count else ""}'
 
     def later(self, seconds: float) -> Event:
         """Return this event and its evidence on a clock that is ahead by `seconds`."""

@@ -13,7 +13,7 @@ from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 
 from .detectors import Change, Finding
-from .event import ALL, Condition, Event, State, state_of
+from .event import ALL, AUTHORS, Condition, Event, State, state_of
 from .kinds import SEVERITIES, Severity
 from .rules import MAX_SILENCE, PAUSE, RECENT
 from .vehicle import Vehicle
@@ -71,12 +71,13 @@ class EventLog:
 
     def add(
         self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0,
-        is_estimate: bool = False,
+        is_estimate: bool = False, source: str | None = None,
     ) -> None:  # fmt: skip
         """Add a message: a model, a row, or a dict of fields.
 
         `missing`: names of fields that were not provided. `lost`: messages lost before this one; with `is_estimate`
-        about as many, of any topic, as in the vehicle's ULog stream.
+        about as many, of any topic, as in the vehicle's ULog stream. `source`: its source, which names the author of a
+        log message that is not of PX4.
         """
         vehicle = self.vehicles.get(address.vehicle)
         if vehicle is not None and not lost and vehicle.skips(address, time):  # most messages; needs no lock
@@ -85,6 +86,7 @@ class EventLog:
             if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
                 if lost:
                     vehicle.count_lost(lost, "" if is_estimate else address.stream, time)
+                vehicle.author = AUTHORS.get(source, vehicle.author)
                 vehicle.add(address, message, time, missing)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:

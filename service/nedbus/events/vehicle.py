@@ -15,7 +15,7 @@ from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
 from . import detectors, rules
 from .contradictions import AIR_DATA, REFERENCES, Comparison, ReferenceDetector
 from .detectors import AidDetector, ChangeDetector, Fields, Finding, VisionDetector
-from .event import ALONE, SUPPRESSED, WINDOW, Condition, Event, State, explain, state_of, without_wild
+from .event import ALONE, SUPPRESSED, WINDOW, Author, Condition, Event, State, explain, state_of, without_wild
 from .kinds import KINDS, Severity
 from .position import PositionDetector
 from .times import format_duration
@@ -68,6 +68,7 @@ class Vehicle:
         self.armed: bool | None = None
         self.time = self.last_seen = 0.0
         self.first = first
+        self.author: Author = "PX4"  # of its log messages
         self.boot: float | None = None
         self._before = -math.inf  # time of the message before the last one in its stream
         self._is_off = False  # the last time since boot was not the expected one
@@ -317,9 +318,10 @@ class Vehicle:
             numbers["armed"] = 1
         if is_alone:
             numbers[ALONE] = 1
+        author = self.author if found.kind == "text" else None
         return Event(
             self.name, found.kind, found.change, self._severity(found, time), found.text, time, boot, topic, numbers,
-            found.names, lasted,
+            found.names, lasted, author=author,
         )  # fmt: skip
 
     def _severity(self, found: Finding, time: float) -> Severity:

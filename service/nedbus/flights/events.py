@@ -83,7 +83,7 @@ def follow(
         if reason is None:
             try:
                 row, payload, _, missing = message.encode()
-                event_log.add(message.address, row, due, missing=missing)
+                event_log.add(message.address, row, due, missing=missing, source=message.source)
             except InvalidMessageError as exc:
                 reason = exc.reason
         if reason is not None:

@@ -5,6 +5,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.samples import ARDUPILOT, OTHER_AUTOPILOT
+
 from .fields import DECODED, HIGH_LATENCY
 
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations should have others
@@ -77,6 +79,13 @@ class Senders:
         if component != AUTOPILOT or not system:
             return True
         return system in self._others and system not in self._autopilots
+
+
+def text_source(autopilot: int) -> str | None:
+    """Return the source of the log messages of this MAV_AUTOPILOT; None for PX4, and for a generic one."""
+    if autopilot in {dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_GENERIC}:
+        return None
+    return ARDUPILOT if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else OTHER_AUTOPILOT
 
 
 def _why_no_autopilot(kind: int, autopilot: int) -> str:

@@ -17,6 +17,7 @@ from nedbus_msgs.frames import wrap
 
 from .boot_clock import BootClock
 from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
+from .senders import text_source
 
 _log = logging.getLogger(__name__)
 
@@ -107,6 +108,7 @@ class Vehicle:
         self._last_heartbeat = self._high_latency = -math.inf  # time of the last HEARTBEAT and HIGH_LATENCY2
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self.rebooted = False
+        self._text_source: str | None = None  # of its log messages, if it is not PX4
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
@@ -173,7 +175,7 @@ class Vehicle:
         """Convert a message as `handle` does; HIGH_LATENCY2 contains several topics."""
         kind = message.get_type()
         if kind == "HEARTBEAT":
-            self._last_heartbeat = now
+            self._last_heartbeat, self._text_source = now, text_source(message.autopilot)
         if kind != HIGH_LATENCY:
             item = self.handle(message, now, log)
             return [] if item is None else [item]
@@ -229,7 +231,8 @@ class Vehicle:
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(address.topic, fields, timestamp, now)
-        return self.report(SourceMessage(now, address, fields), log)
+        source = self._text_source if address == self._text_address else None
+        return self.report(SourceMessage(now, address, fields, source=source), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:

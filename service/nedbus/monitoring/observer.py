@@ -58,7 +58,9 @@ class Observer:
         """Add a sample just read; a retained one is no event, because its stream may have ended long ago."""
         if self.monitor.add(sample):
             missing, now = sample.provenance.missing, clock.steady()
-            self.event_log.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
+            self.event_log.add(
+                sample.address, sample.message, now, missing=missing, lost=sample.lost, source=sample.source
+            )
 
     def poll(self) -> Snapshot:
         """Poll streams, rejections and the link, and record changes in the event log."""

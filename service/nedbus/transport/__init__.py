@@ -2,6 +2,7 @@
 
 from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
 
+from .access_control import AccessControl
 from .liveliness import LivelinessTokens, token_keys
 from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (
@@ -16,7 +17,7 @@ from .rmw_zenoh import (
     node_token,
     px4_publishers_key_expr,
 )
-from .router import RouterState, open_router, query_routers, read_router_config, router_endpoints
+from .router import RouterConfig, RouterState, open_router, query_routers, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals
 from .session import (
     MAX_REPLY_BYTES,

@@ -19,6 +19,7 @@ from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
+from .access_control import AccessControl
 from .queries import query
 from .session import COMMON_SETTINGS, Session, error_reason, insert_settings, open_session, random_backoff
 from .tls import Tls
@@ -122,12 +123,13 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
 
 
 class RouterConfig(NamedTuple):
-    """Configuration of a router: endpoints, PEM files of the TLS section by name, and session limit."""
+    """Configuration of a router: endpoints, PEM files of the TLS section by name, session limit and access rules."""
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
     tls_files: Mapping[str, Path]
     max_sessions: int
+    access: AccessControl
 
 
 def read_router_config(path: Path | None = None) -> RouterConfig:
@@ -137,7 +139,10 @@ def read_router_config(path: Path | None = None) -> RouterConfig:
     """
     config = zenoh.Config() if path is None else _parse_config(path)
     sessions = int(_get(config, "transport/unicast/max_sessions"))
-    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config), sessions)
+    access = AccessControl(_get(config, "access_control"), _get(config, "low_pass_filter"))
+    return RouterConfig(
+        _endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config), sessions, access
+    )
 
 
 def _get(config: zenoh.Config, key: str) -> Any:

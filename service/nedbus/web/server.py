@@ -28,7 +28,7 @@ from tornado.web import HTTPError, RequestHandler
 from nedbus import clock
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError
-from nedbus.events import ALL, Times
+from nedbus.events import Times, once_per_service
 from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, why_refused
 from nedbus.settings import is_loopback
@@ -107,8 +107,8 @@ class LiveFleet(Exporter):
         super().__init__(bus, selection, version=version)
         self.fleet = Fleet(self.monitor)
         now = clock.utc()
-        before = (event for report in bus.accounts(within=PAST) for event in report.events if event.time < now)
-        remembered = [each for each in before if each.vehicle != ALL and selection.matches_vehicle(each.vehicle)]
+        reports = [each for each in bus.accounts(within=PAST) if any(map(selection.matches_vehicle, each.vehicles))]
+        remembered = [event for _, event in once_per_service(reports) if event.time < now]
         self.timeline = EventTimeline(self.event_log, before=remembered)
 
     def add(self, sample: Sample[Any]) -> None:

@@ -18,11 +18,13 @@ import zenoh
 import nedbus
 from nedbus.pki import write_access_rules
 from nedbus.transport import Session, open_client, query, token_keys
+from nedbus.web.server import LiveFleet
+from nedbus_msgs import Selection, ack_key
 from tests.flights.messages import VLP
 from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import CommandResult, run_command
 from tests.peers.processes import Start
-from tests.peers.queryables import answer_queries
+from tests.peers.queryables import answer_queries, reply_with
 from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, wait_for
 
@@ -129,12 +131,16 @@ def test_events_and_verdicts_of_a_vehicle_are_its_own(fleet: Fleet, run_nedbus: 
     service = service_of(reader, "2")
     assert service is not None
     with fleet.forging(service):
-        reports = reader.accounts(within=1e9)  # what the page, `events` and `why` show
+        # What the page, `events` and `why` show.
+        wait_for(lambda: reader.accounts(within=1e9), what="the report about vehicle 2")
+        reports = reader.accounts(within=1e9)
         assert {name for report in reports for name in report.vehicles} == {"2"}
         assert {report.service for report in reports if report.vehicles} == {service}
         assert "forged" not in str(reports)
         assert "forged" not in fleet.run("events", "--within", "1e9", "--duration", "1").out
         assert "forged" not in fleet.run("why", "-v", "2").out
+        page = LiveFleet(reader, Selection(), version="0")
+        assert "forged" not in str(page.timeline.events)
 
 
 @pytest.mark.process
@@ -215,6 +221,31 @@ def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
         assert [query(reader, key, timeout=1.0) for key in keys] == [[], [], []]
     assert token_keys(reader, "nedbus/2/@alive/**", timeout=1.0) == []
     del token
+
+
+@pytest.mark.process
+def test_only_readers_acknowledge(fleet: Fleet) -> None:
+    """A query for the acknowledgements of vehicle 1 is answered by readers, and not by another vehicle."""
+    one, two, reader = fleet.session("vehicle-1"), fleet.session("vehicle-2"), fleet.session("reader")
+    key = ack_key(f"nedbus/1/{VLP}")
+    with answer_queries(two, key, reply_with({key: b"2"})), answer_queries(reader, key, reply_with({key: b"reader"})):
+
+        def answers() -> list[bytes]:
+            return [reply.payload.to_bytes() for reply in query(one, key, timeout=DEADLINE)]
+
+        wait_for(answers, what="the reply of the reader")
+        assert answers() == [b"reader"]
+
+
+@pytest.mark.process
+def test_only_the_refusal_of_another_vehicle_is_believed(fleet: Fleet) -> None:
+    """Vehicle 1 can report that the router refuses vehicle 2, which no vehicle could report itself."""
+    session, key = fleet.session("vehicle-1"), "nedbus/@service/1/x/status"
+    status = {"host": "flyer", "version": nedbus.__version__, "refused": ["2"], "sources": []}
+    with answer_queries(session, key, _reply(key, status)):
+        assert "vehicles refused by the router: 2" in fleet.run("info").out
+        reports = fleet.bus("reader").accounts(within=1e9)
+        assert [(report.vehicles, report.events) for report in reports] == [({}, ())]
 
 
 @pytest.mark.process

@@ -6,9 +6,10 @@ import json
 import math
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, cast
 
 import numpy as np
@@ -21,7 +22,8 @@ from bokeh.plotting import figure
 from hypothesis import given, strategies as st
 
 import nedbus
-from nedbus.client import LogStreamStatus, RejectionReport
+from nedbus.client import LogStreamStatus, RejectionReport, reply_parts
+from nedbus.events import AccountReport, Event, VehicleReport
 from nedbus.transport import Session, open_router
 from nedbus.web.column_data import LINE_TYPES, Track, Tracks
 from nedbus.web.fleet import TRUTH
@@ -33,6 +35,7 @@ from nedbus_msgs import Address, Selection
 from tests.flights.messages import VALID, VLP
 from tests.nedbus.web.page import QUAD, WING, RenderedPage, SimulatedFleet, flying, models_of, sim
 from tests.peers.ports import free_endpoint
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import wait_for
 
 __all__ = ["sim"]  # a fixture
@@ -844,6 +847,24 @@ def open_page(endpoint: str) -> Iterator[tuple[RenderedPage, Callable[[Callable[
         finally:
             stop.set()
         reading.result()
+
+
+def test_past_loss_of_a_link_is_on_the_page_once(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """A loss of the link that a service reports for each of its vehicles is one event of the page, not one of each."""
+    now = time.time()
+    with ExitStack() as answering:
+        for vehicle in ("quad", "wing"):
+            key = f"nedbus/@service/{vehicle}/x/status"
+            event = Event(vehicle, "link_down", "begin", "bad", "no link", now - 60)
+            own = Event(vehicle, "takeoff", "once", "info", f"takeoff of {vehicle}", now - 50)
+            report = AccountReport("x", "h", now, {vehicle: VehicleReport("info", "ok")}, (event, own))
+            [payload] = reply_parts(report)
+            answering.enter_context(answer_queries(zenoh_session, key, reply_with({key: payload})))
+        events = LiveFleet(bus, Selection(), version="0").timeline.events
+        only = LiveFleet(bus, Selection(vehicle="wing"), version="0").timeline.events
+    shown = sorted((event.vehicle, event.text) for event in events)
+    assert shown == [("*", "no link"), ("quad", "takeoff of quad"), ("wing", "takeoff of wing")]
+    assert sorted(event.text for event in only) == ["no link", "takeoff of wing"]
 
 
 def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:

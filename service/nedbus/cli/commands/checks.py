@@ -26,6 +26,7 @@ _REQUIRED: Final = "Require a message of this vehicle, from any publisher"
 _WITHIN: Final = "Require no bad or watch event in the last SECONDS"
 _EXAMINED: Final = "Examine only this vehicle; also test the write permission"
 _LINK: Final = "Also listen on a MAVLink link, such as udpin:0.0.0.0:14540"
+_RULES: Final = "Router's configuration: name the rules for this client's certificate"
 _CONFIGS: Final = "Settings (.toml) or router files (.json5); default: the settings of serve"
 _REFUSED: Final = (
     ", although its service reports it as published: check that the access rules of the router allow the service to"
@@ -223,6 +224,7 @@ def doctor(
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help=_EXAMINED)] = None,
     mavlink: Annotated[str | None, typer.Option(metavar="LINK", help=_LINK)] = None,
+    rules: Annotated[Path | None, typer.Option(metavar="FILE", help=_RULES, show_default=False)] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Diagnose why no messages arrive.
@@ -232,7 +234,7 @@ def doctor(
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    findings = examine(read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink)
+    findings = examine(read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink, rules=rules)
     state = worst_state(findings)
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))

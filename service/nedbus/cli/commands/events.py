@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
+    "author",
 )  # fmt: skip
 _MAX_TEXT: Final = 400  # characters of a peer's text
 _WITHIN: Final = "First show the events of the last SECONDS"

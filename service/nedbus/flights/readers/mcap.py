@@ -13,7 +13,7 @@ from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from nedbus.errors import AddressError, DecodeError, SourceError
-from nedbus.samples import SourceMessage
+from nedbus.samples import OF_OTHER_AUTOPILOTS, SourceMessage
 from nedbus_msgs import (
     BY_TOPIC,
     Address,
@@ -47,6 +47,7 @@ class RecordedStream:
     """A channel: its ROS 2 topic, address, layout of the messages, and the fields that its source did not provide."""
 
     converted: Mapping[str, Any] = {}
+    source: str | None = None  # of log messages of another autopilot than PX4
     head = b"\x00\x01"  # little-endian XCDR1
 
     def __init__(
@@ -164,13 +165,15 @@ class McapReader(FlightReader):
             self.damaged = self._is_damaged
 
     def message_of(self, record: Record) -> SourceMessage:
-        """Return a record as a message; those to a vehicle have their own source."""
+        """Return a record as a message; those to a vehicle, and texts not of PX4, have their own source."""
         message = super().message_of(record)
         self._number += 1
         if message.error is not None:
             message.error += f" (message {self._number} of the recording)"
         if is_vehicle_input(record.stream.ros2_topic):  # type: ignore[attr-defined] # its streams are RecordedStream
             message.source = _INPUT
+        elif record.stream.source is not None:  # type: ignore[attr-defined]
+            message.source = record.stream.source  # type: ignore[attr-defined]
         return message
 
     def layouts(self, definition: Definition[Any]) -> set[str]:
@@ -300,7 +303,10 @@ class _RecordedFile:
         if (boot := metadata.get("boot_time_utc_us", "")[:20]).isdecimal():
             self._reader.add_boot_time(int(boot))
         missing = frozenset(metadata.get("missing", "").split()).intersection(definition.names)
-        return RecordedStream(channel.topic, address, definition, layout, missing)
+        stream = RecordedStream(channel.topic, address, definition, layout, missing)
+        if metadata.get("source") in OF_OTHER_AUTOPILOTS:
+            stream.source = metadata["source"]
+        return stream
 
     def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:
         """Return the definition and layout of a schema; raise ValueError if they do not match the message."""

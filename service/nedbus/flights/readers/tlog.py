@@ -69,6 +69,7 @@ class TlogReader(FlightReader):
         self._end = self.total  # the rest of the file is zeros
         self._is_cut = False  # the file ends within a record, or in zeros
         self._rebooted = False
+        self._source = self.kind  # of the next message
         self._streams: dict[Address, _ConvertedStream] = {}
         self._shrinkage: list[str] = []
 
@@ -115,15 +116,17 @@ class TlogReader(FlightReader):
                         self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
                         self.boot_utc = next(iter(self._boots)) if len(self._boots) == 1 else 0
                     self._lost, self._rebooted = found.lost, found.rebooted
+                    self._source = found.source or self.kind
                     yield Record(stream, found.fields, stamp)
         if not self.definitions:
             reason = "this file has no autopilot messages for these topics"
             raise SourceError(str(self.path), "; ".join([reason, *self.warnings]))
 
     def message_of(self, record: Record) -> SourceMessage:
-        """Return a record as a message, with the losses and the reboot before it."""
+        """Return a record as a message, with its author, and the losses and the reboot before it."""
         message = super().message_of(record)
         message.lost, message.rebooted, self._lost, self._rebooted = self._lost, self._rebooted, 0, False
+        message.source = self._source
         return message
 
     def _stream(self, own: Address) -> _ConvertedStream:

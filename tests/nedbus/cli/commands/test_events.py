@@ -126,6 +126,7 @@ def test_json_and_csv_events_have_every_field(log: Path) -> None:
     assert events[1] == {
         "time": None, "clock": "boot", "vehicle": "1", "kind": "xy_invalid", "change": "begin", "severity": "bad",
         "text": "xy not valid", "boot": 8.0, "topic": VLP, "numbers": {}, "names": ["xy_valid"], "lasted": None,
+        "author": None,
         "evidence": [
             {"kind": "dead_reckoning", "change": "begin", "text": "dead reckoning", "topic": VLP, "before": 3.0}
         ],

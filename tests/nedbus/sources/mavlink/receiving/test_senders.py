@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import struct
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,8 +12,10 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 import nedbus
+from nedbus.flights import read_file_events
 from nedbus.mavlink.parser import Received, new_parser, parse
 from tests.nedbus.sources.mavlink.test_source import Autopilot
+from tests.peers.command_line import run_command
 from tests.peers.live_source import Listener
 from tests.peers.ports import free_port
 
@@ -121,3 +124,29 @@ def test_damaged_messages_of_ignored_senders_are_no_damage() -> None:
             frame = bytearray(position(1).pack(encoder, force_mavlink1=is_old))
             frame[-1] ^= 1
             assert len([*parse(new_parser(), bytes(frame), "link", None, 0)]) == is_damage
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "author"),
+    [(PX4, "PX4"), (ARDUPILOT, "ArduPilot"), (dialect.MAV_AUTOPILOT_PPZ, "autopilot"), (0, "PX4")],
+)
+def test_texts_name_the_autopilot_of_the_heartbeat(tmp_path: Path, autopilot: int, author: str) -> None:
+    """A text is quoted after its author, which HEARTBEAT names; also in an MCAP file of the log."""
+    path, copied = tmp_path / "flight.tlog", tmp_path / "flight.mcap"
+    messages: list[tuple[float, int, Any]] = []
+    for number in range(100):
+        seconds = 1 + number / 10
+        if number % 10 == 0:
+            messages.append((seconds, 1, heartbeat(SUBMARINE, autopilot)))
+        messages.append((seconds, 1, position(1000 + 100 * number)))
+        if number == 50:
+            messages.append((seconds, 1, dialect.MAVLink_statustext_message(2, b"Leak Detected")))
+    write_tlog(path, messages)
+    assert run_command("convert", "--topics", "*", str(path), str(copied)).exit_code == 0
+    for file in (path, copied):
+        texts = [event.words for event in read_file_events(file).event_log.events if event.kind == "text"]
+        assert texts == [f'{author}: "Leak Detected"'], file
+        shown = run_command("events", str(file)).out
+        assert f'{author}: "Leak Detected"' in shown
+        rows = list(csv.DictReader(run_command("events", str(file), "--csv").out.splitlines()))
+        assert {(row["kind"] == "text", row["author"]) for row in rows} <= {(True, author), (False, "")}

@@ -1,0 +1,120 @@
+"""Access control of a router, evaluated from its configuration: which rule decides about a key of a certificate."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import zenoh
+
+Flow = Literal["ingress", "egress"]
+_BOTH_FLOWS: Final = ("ingress", "egress")
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What a router does with a message.
+
+    `rules`: the rule that allows it, or that denies it explicitly; without such a rule, all rules of the certificate
+    for this kind of message, none of which includes the key.
+    """
+
+    is_allowed: bool
+    rules: tuple[str, ...] = ()
+    is_default: bool = False
+
+    def __str__(self) -> str:
+        if not self.is_default:
+            return f"rule {self.rules[0]} {'allows' if self.is_allowed else 'denies'} it"
+        if self.is_allowed:
+            return "no rule denies it"
+        if not self.rules:
+            return "no rule is for such messages of this certificate"
+        return f"none of its rules includes this key: {', '.join(self.rules)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One rule: kinds of messages, directions, and the key expressions whose keys it includes."""
+
+    name: str
+    is_allowed: bool
+    flows: tuple[str, ...]
+    messages: tuple[str, ...]
+    key_exprs: tuple[zenoh.KeyExpr, ...]
+
+    def is_for(self, message: str, flow: Flow) -> bool:
+        """Return whether the rule is for this kind of message in this direction."""
+        return message in self.messages and flow in self.flows
+
+    def includes(self, key: zenoh.KeyExpr) -> bool:
+        """Return whether one of the key expressions includes all keys of `key`, as Zenoh requires for a rule."""
+        return any(own.includes(key) for own in self.key_exprs)
+
+
+class AccessControl:
+    """The rules of a router, and the certificates to which they apply.
+
+    Subjects are compared by the common name of the certificate only: a subject that also requires an interface, a user
+    name or a protocol counts as matched.
+    """
+
+    def __init__(self, section: Mapping[str, Any], filters: Iterable[Mapping[str, Any]] = ()) -> None:
+        """Parse `access_control` and `low_pass_filter` of a configuration that Zenoh has accepted."""
+        self.is_enabled: bool = section["enabled"]
+        self._is_allowed_by_default = section["default_permission"] == "allow"
+        rules = {rule["id"]: _parse_rule(rule) for rule in section["rules"] or ()}
+        self._rules = defaultdict[str, list[Rule]](list)  # by subject
+        for policy in section["policies"] or ():
+            for subject in policy["subjects"]:
+                self._rules[subject] += [rules[name] for name in policy["rules"] if name in rules]
+        self._subjects = defaultdict[str | None, list[str]](list)  # by common name; None: those of every certificate
+        for subject in section["subjects"] or ():
+            for certificate in subject["cert_common_names"] or (None,):
+                self._subjects[certificate].append(subject["id"])
+        self._limited = [
+            zenoh.KeyExpr(key)
+            for each in filters
+            if "put" in each["messages"] and "ingress" in (each["flows"] or _BOTH_FLOWS)
+            for key in each["key_exprs"]
+        ]
+
+    @property
+    def certificates(self) -> list[str]:
+        """The common names in the configuration, in its order."""
+        return [name for name in self._subjects if name is not None]
+
+    def rules_of(self, certificate: str) -> list[Rule]:
+        """Return the rules that apply to the certificate with this common name."""
+        subjects = [*self._subjects.get(None, ()), *self._subjects.get(certificate, ())]
+        return [rule for subject in subjects for rule in self._rules.get(subject, ())]
+
+    def decide(self, certificate: str, message: str, flow: Flow, key: str) -> Decision:
+        """Return what the router does with a message of a certificate: `message` and `flow` as in its rules.
+
+        As in Zenoh, an explicit denial takes precedence; if no rule includes the key, the default permission applies.
+        """
+        if not self.is_enabled:
+            return Decision(is_allowed=True, is_default=True)
+        wanted = zenoh.KeyExpr(key)
+        rules = [rule for rule in self.rules_of(certificate) if rule.is_for(message, flow)]
+        including = [rule for rule in rules if rule.includes(wanted)]
+        for rule in including:
+            if not rule.is_allowed:
+                return Decision(is_allowed=False, rules=(rule.name,))
+        if including:
+            return Decision(is_allowed=True, rules=(including[0].name,))
+        names = tuple(rule.name for rule in rules)
+        return Decision(self._is_allowed_by_default, names, is_default=True)
+
+    def limits_size(self, key: str) -> bool:
+        """Return whether the router limits the size of messages that clients put on this key."""
+        wanted = zenoh.KeyExpr(key)
+        return any(own.includes(wanted) for own in self._limited)
+
+
+def _parse_rule(rule: Mapping[str, Any]) -> Rule:
+    is_allowed = rule["permission"] == "allow"
+    flows = tuple(rule["flows"] or _BOTH_FLOWS)
+    key_exprs = tuple(zenoh.KeyExpr(key) for key in rule["key_exprs"])
+    return Rule(rule["id"], is_allowed, flows, tuple(rule["messages"]), key_exprs)
