@@ -91,12 +91,20 @@ def test_tokens_are_queried_while_the_subscription_lists_none(
 
 
 def test_slow_list_is_complete(endpoint: str, zenoh_session: Session, timings: Timings) -> None:
-    """A router that takes long to list the tokens of a large fleet is queried once, and the list is complete."""
+    """A router that takes long to list the tokens of a large fleet is queried once, and the list is complete.
+
+    Zenoh 1.10 can miss the end of a token while it subscribes (findings/zenoh-missed-token-end.sh); a further token shows
+    that it has subscribed.
+    """
     timings.slow_list = 0.0
     tokens = [declare(zenoh_session, vehicle, 1) for vehicle in OTHERS]
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: bus.vehicles().complete, what="a complete list")
         assert list(bus.vehicles()) == sorted(OTHERS)
+        declared_later = declare(zenoh_session, "later", 1)
+        wait_for(lambda: "later" in bus.vehicles(), what="a vehicle after the list")
+        declared_later.pop().undeclare()
+        wait_for(lambda: "later" not in bus.vehicles(), what="the departure of that vehicle")
         for token in tokens.pop(0):
             token.undeclare()
         wait_for(lambda: list(bus.vehicles()) == sorted(OTHERS[1:]), what="the departure of a vehicle")
