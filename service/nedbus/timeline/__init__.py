@@ -12,4 +12,4 @@
 | STEP | a synchronised (Unix) time was set: no reboot | as received |
 """
 
-from .vehicle_clock import Reading, TimeKind, VehicleClock, is_boot_possible
+from .vehicle_clock import Reading, RecentTimes, TimeKind, VehicleClock, is_boot_possible

@@ -47,6 +47,28 @@ def is_boot_possible(time: int, elapsed: float | None) -> bool:
     return elapsed is None or time <= 1e6 * elapsed + _MARGIN
 
 
+class RecentTimes:
+    """The last 512 times of each stream, of up to 1000 streams."""
+
+    def __init__(self) -> None:
+        self._times: dict[Hashable, OrderedDict[int, None]] = {}
+
+    def contains(self, stream: Hashable, time: int) -> bool:
+        """Return whether a stream had this time."""
+        return time in self._times.get(stream, ())
+
+    def add(self, stream: Hashable, time: int) -> None:
+        """Add the time of a message."""
+        times = self._times.get(stream)
+        if times is None:
+            if len(self._times) >= _MAX_STREAMS:
+                return
+            times = self._times[stream] = OrderedDict()
+        times[time] = None
+        if len(times) > _MAX_REMEMBERED:
+            times.popitem(last=False)
+
+
 class VehicleClock:
     """One vehicle's own time, from the times of its messages on any stream.
 
@@ -70,15 +92,17 @@ class VehicleClock:
         self._ahead = math.inf  # time in the last message, if it was too far ahead [us]
         self._last: dict[Hashable, int] = {}  # time of the last message of each stream [us]
         self._older: dict[Hashable, float] = {}  # streams that went back since the last current message, and when
-        self._known: dict[Hashable, OrderedDict[int, None]] = {}  # recent times of each stream
+        self._known = RecentTimes()
 
     def add(self, stream: Hashable, time: int, now: float | None = None) -> Reading:
         """Return what a message shows whose time is `time` [us]; it arrived at `now` [s], None if unknown."""
         if self.newest is None:
             return self._begin(stream, time, now, TimeKind.NEW)
-        time = self._unwrap(time, self.newest, now)
-        if self._is_copy(stream, time):
+        time = self.unwrap(time, now)
+        if self._known.contains(stream, time):
             self.copies += 1
+            if time >= self.newest - _MAX_LATE:
+                self._older.clear()  # a current message: the vehicle continues to run
             return Reading(TimeKind.COPY, time, self.boot)
         last = self._last.get(stream, time)
         if stream in self._last or len(self._last) < _MAX_STREAMS:
@@ -98,7 +122,7 @@ class VehicleClock:
         self.newest = max(time, newest)
         self._arrived = now
         self._older.clear()
-        self._remember(stream, time)
+        self._known.add(stream, time)
         return Reading(TimeKind.STEP if is_step else TimeKind.NEW, time, self.boot)
 
     def _add_older(self, stream: Hashable, time: int, last: int, newest: int, now: float | None) -> Reading:
@@ -115,7 +139,7 @@ class VehicleClock:
         if is_other:
             kind = TimeKind.STEP if is_unix_time(time) else TimeKind.REBOOT
             return self._begin(stream, time, now, kind)
-        self._remember(stream, time)
+        self._known.add(stream, time)
         return Reading(TimeKind.LATE, time, self.boot)
 
     def _begin(self, stream: Hashable, time: int, now: float | None, kind: TimeKind) -> Reading:
@@ -127,8 +151,8 @@ class VehicleClock:
         self._ahead = math.inf
         self._last = {stream: time}
         self._older.clear()
-        self._known.clear()
-        self._remember(stream, time)
+        self._known = RecentTimes()
+        self._known.add(stream, time)
         return Reading(kind, time, self.boot)
 
     def _elapsed(self, now: float | None) -> float | None:
@@ -136,9 +160,10 @@ class VehicleClock:
             return None
         return max(0.0, now - self._arrived)
 
-    def _unwrap(self, time: int, newest: int, now: float | None) -> int:
+    def unwrap(self, time: int, now: float | None = None) -> int:
         """Return a time with the wraps before it, if it then is one that the vehicle can have."""
-        if self._modulus is None:
+        newest = self.newest
+        if self._modulus is None or newest is None:
             return time
         elapsed = self._elapsed(now)
         passed = _UNKNOWN_PAUSE if elapsed is None else 1e6 * elapsed + _MARGIN
@@ -150,19 +175,6 @@ class VehicleClock:
             return before  # a late message from before the wrap
         is_reboot = same > newest + passed and time <= passed
         return time if is_reboot or same < newest - _UNKNOWN_PAUSE else same
-
-    def _is_copy(self, stream: Hashable, time: int) -> bool:
-        return time in self._known.get(stream, ())
-
-    def _remember(self, stream: Hashable, time: int) -> None:
-        known = self._known.get(stream)
-        if known is None:
-            if len(self._known) >= _MAX_STREAMS:
-                return
-            known = self._known[stream] = OrderedDict()
-        known[time] = None
-        if len(known) > _MAX_REMEMBERED:
-            known.popitem(last=False)
 
     def _is_wild(self, time: int, newest: int, now: float | None) -> bool:
         """Return whether a time is too far ahead, and the message before does not confirm it."""
