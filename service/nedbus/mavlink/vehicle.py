@@ -253,6 +253,7 @@ class Vehicle:
             if now - self._copied <= _COPY_TIMEOUT:  # lost on the faster link
                 self._count_copy(now)
                 return None
+            self._copied = now  # further late ones are those of a second link, whose times need not be equal
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
