@@ -15,9 +15,11 @@ LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-hea
 
 .PHONY: run check api api-baseline generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
 
+# The shell waits for a service in the background: only then does a trap run at once, when make is killed and kills it.
 run: $(READY)  ## run the service with a simulated flight, or with ARGS; it prints a command for a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
-	@trap : INT; $(BIN)/nedbus serve $(ARGS); code=$$?; case $$code in \
+	@$(BIN)/nedbus serve $(ARGS) & service=$$!; trap : INT; trap 'kill $$service' TERM; \
+	while wait $$service; code=$$?; kill -0 $$service 2>/dev/null; do :; done; case $$code in \
 	130) exit 0 ;; \
 	1) echo 'for other options: make run ARGS="--source sim: --vehicle 2 --connect tcp/127.0.0.1:7447"' >&2 ;; \
 	esac; exit $$code
@@ -44,10 +46,10 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from other hosts
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## run the tests without routers or processes: under a minute on two cores
-	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
+quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
+	$(BIN)/pytest -q -n 2 -m "quick or not (slow or router or process or compose)"
 
-test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two cores
+test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two idle cores
 
 behaviour: $(DEV)
 	$(BIN)/pytest -q -n 6 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
@@ -78,6 +80,10 @@ wheel: $(DEV)  ## build the wheel, install it in a clean environment, use it, an
 	$(PYTHON) -m venv --without-pip build/wheel-venv
 	$(BIN)/pip --python build/wheel-venv install -q "$$(echo dist/nedbus-*.whl)[all]"
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
+	for extras in "" metrics; do \
+	$(PYTHON) -m venv --without-pip --clear build/bare-venv && \
+	$(BIN)/pip --python build/bare-venv install -q "$$(echo dist/nedbus-*.whl)$${extras:+[$$extras]}" && \
+	(cd build && bare-venv/bin/python ../tests/release/every_command.py $$extras) || exit 1; done
 	rm -rf build/pki build/vehicle-1
 	cd build && wheel-venv/bin/nedbus pki ca pki && wheel-venv/bin/nedbus pki enroll pki 1 -r tls/127.0.0.1:7447
 	PATH=$(abspath $(BIN)):$$PATH packaging/sbom build/wheel-venv "$$(echo dist/nedbus-*.whl | sed 's/-py3.*/.cdx.json/')"

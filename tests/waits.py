@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from typing import cast
+from typing import Self, cast
 
 import zenoh
 
@@ -65,3 +65,27 @@ def repeating(action: Callable[[], object]) -> Iterator[None]:
     finally:
         stop.set()
         thread.join(DEADLINE)
+
+
+class Stopwatch:
+    """A clock that stands still while a busy machine does not run this process; it counts ticks of 10 ms.
+
+    For limits that tell a wait for a timeout from none: on an idle machine it is exact to a few percent.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            self.seconds += 0.01

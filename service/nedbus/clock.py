@@ -1,4 +1,4 @@
-"""Clocks of this host: monotonic time for all decisions, Unix time only for timestamps.
+"""Clocks of this host, and durations as text: monotonic time for all decisions, Unix time only for timestamps.
 
 NTP, a GNSS receiver or a user may step the Unix clock forward or back at any time.
 """
@@ -31,3 +31,12 @@ def now() -> datetime:
 def to_utc() -> float:
     """Return the offset from `steady` to Unix time [s], rounded to ms."""
     return round(utc() - steady(), 3)
+
+
+def format_duration(seconds: float) -> str:
+    """Format a duration [s] in ms, s, min or h."""
+    if seconds < 1:
+        return f"{max(0.0, seconds) * 1e3:.0f} ms"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"

@@ -3,6 +3,7 @@
 from .client import (
     Health,
     Histogram,
+    LinkCallback,
     LogStreamStatus,
     Monitor,
     NewestMessage,
@@ -18,7 +19,7 @@ from .client import (
 from .events import AccountReport, Condition, Event, VehicleReport
 
 __all__ = [
-    "AccountReport", "Condition", "Event", "Health", "Histogram", "LogStreamStatus", "Monitor", "NewestMessage",
-    "Publishers", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamStatus",
-    "VehicleReport", "Vehicles",
+    "AccountReport", "Condition", "Event", "Health", "Histogram", "LinkCallback", "LogStreamStatus", "Monitor",
+    "NewestMessage", "Publishers", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth",
+    "StreamStatus", "VehicleReport", "Vehicles",
 ]  # fmt: skip

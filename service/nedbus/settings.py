@@ -12,9 +12,8 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
@@ -69,17 +68,17 @@ def _checked(check: Callable[[str], object]) -> AfterValidator:
 
 
 _Endpoint = Annotated[str, _checked(lambda endpoint: check_endpoints((endpoint,), where="endpoint"))]
-Endpoints = Annotated[tuple[_Endpoint, ...], NoDecode, BeforeValidator(split_values)]
+Endpoints = Annotated[tuple[_Endpoint, ...], BeforeValidator(split_values)]
 
 
-class Settings(BaseSettings):
-    """All settings, also read from the environment as NEDBUS_<FIELD>, with multiple values separated by commas.
+class Settings(BaseModel):
+    """All settings; in the environment they are NEDBUS_<FIELD>, with multiple values separated by commas.
 
     Separate sources by semicolons if their options contain commas.
     Create an instance with `load_settings`, whose errors name the flag, the variable, or file, line and column.
     """
 
-    model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     connect: Endpoints = Field((), description="Endpoints of Zenoh routers; the first that answers is used")
     tls_ca: Path | None = Field(None, description="CA certificate for the routers of tls/ endpoints, PEM")
@@ -91,7 +90,7 @@ class Settings(BaseSettings):
     vehicle: Annotated[str, BeforeValidator(vehicle_name), _checked(check_vehicle)] = Field(
         "1", description="Default vehicle id of sources"
     )
-    source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
+    source: Annotated[tuple[str | dict[str, Any], ...], BeforeValidator(split_sources)] = Field(
         (), description="Sources to publish: strings, or TOML tables"
     )
     http: Annotated[str, _checked(split_http)] | None = Field(
@@ -178,7 +177,7 @@ def find_mistakes(
     except ConfigError as exc:
         mistakes.append(exc)
     is_read, details = not mistakes, list[ErrorDetails]()
-    values: dict[str, Any] = {name: value for name, value in content.items() if not _from_environment(name)} | flags
+    values: dict[str, Any] = content | _read_environment() | flags
     try:
         settings = Settings(**values)
     except ValidationError as exc:
@@ -235,6 +234,11 @@ def _from_environment(name: str) -> str | None:
     return os.environ.get(_variable(name))
 
 
+def _read_environment() -> dict[str, str]:
+    """Return the settings in the environment as text, which `Settings` parses; an empty variable is not set."""
+    return {name: text for name in Settings.model_fields if (text := _from_environment(name))}
+
+
 def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
     """Return the values with invalid settings replaced by their defaults; a list loses only its invalid items."""
     wrong: dict[str, set[int | str]] = defaultdict(set)
@@ -242,7 +246,7 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
     valid = {name: value for name, value in values.items() if name not in wrong}
     for name in wrong.keys() & Settings.model_fields.keys():
-        value = values.get(name) or _from_environment(name)
+        value = values.get(name)
         items = split_sources(value) if name == "source" else split_values(value)
         if wrong[name] and isinstance(items, list | tuple):
             valid[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])

@@ -46,6 +46,7 @@ def test_clients_recover_from_router_restart(make_stack: StartStack, record: Rec
         latest.wait_for_more(100)
         stack.compose("kill", "--signal", "KILL", "router")
         wait_for(lambda: not bus.connected, what="the loss of the link")
+        wait_for(lambda: not every.subscription.waiting, what="the end of what has been received")
         silent = len(every.samples)
         time.sleep(3.0)  # the outage
         assert len(every.samples) == silent
@@ -85,7 +86,7 @@ def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Rec
         link, router = stack.network("link"), stack.container("vehicle-router")
         docker("network", "disconnect", link, router)
         time.sleep(OUTAGE)
-        assert bus.vehicles() == {}, "the remote vehicles are gone after the lease"
+        wait_for(lambda: bus.vehicles() == {}, what="the end of the lease, after which the remote vehicles are gone")
         restored = time.time_ns()
         docker("network", "connect", link, router)
         latest.wait_for_more(500)

@@ -27,8 +27,57 @@ assert {*nedbus.__all__, "VehicleAttitude", "frames", "__version__"} <= {*shown}
 absent("zenoh")
 assert rlcompleter.Completer(globals()).complete("nedbus.connect_", 0).startswith("nedbus.connect_async")
 absent("numpy typer rich cryptography")
-import nedbus.cli.app
-absent("numpy rich.progress cryptography")
+"""
+    process = start("-c", program, fresh=True)
+    assert process.wait() == 0, process.err
+
+
+def test_list_of_commands_imports_no_command(start: Start) -> None:
+    """`nedbus --help`, and `nedbus` alone, load no message, no setting and no session."""
+    program = """
+import sys
+from nedbus.cli import main
+for arguments in ["--help"], []:
+    sys.argv = ["nedbus", *arguments]
+    try:
+        main()
+    except SystemExit:
+        pass
+    assert not {"pydantic", "nedbus_msgs", "zenoh", "numpy", "nedbus.settings"} & set(sys.modules), arguments
+"""
+    process = start("-c", program, fresh=True)
+    assert process.wait() == 0, process.err
+
+
+def test_connecting_imports_no_analysis(start: Start) -> None:
+    """`nedbus.connect` needs neither the analysis of events, nor arrays, nor asyncio, nor OpenSSL.
+
+    No validator is compiled before a bus is opened: Pydantic first looks for plugins, in all installed packages.
+    """
+    program = """
+import sys
+import nedbus
+assert callable(nedbus.connect)
+unused = {"numpy", "nedbus.events", "nedbus.flights", "nedbus.pki", "asyncio", "ssl", "typer", "rich"}
+unused.add("pydantic.plugin._loader")
+assert not unused & set(sys.modules), unused & set(sys.modules)
+"""
+    process = start("-c", program, fresh=True)
+    assert process.wait() == 0, process.err
+
+
+def test_list_loads_only_the_client(start: Start, endpoint: str) -> None:
+    """`nedbus list` of an empty host loads neither arrays, nor events, nor asyncio, nor rich's tables and Markdown."""
+    program = f"""
+import sys
+from nedbus.cli import main
+sys.argv = ["nedbus", "list", "-c", {endpoint!r}]
+try:
+    main()
+except SystemExit as exc:
+    assert not exc.code
+unused = "numpy nedbus.events nedbus.flights nedbus.pki nedbus.doctor asyncio ssl rich cryptography http.server"
+assert not set(unused.split()) & set(sys.modules), set(unused.split()) & set(sys.modules)
 """
     process = start("-c", program, fresh=True)
     assert process.wait() == 0, process.err

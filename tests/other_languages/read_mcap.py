@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory  # type: ignore[import-not-found] # installed by the test
+from mcap_ros2.decoder import DecoderFactory  # installed by the test
 
 with Path(sys.argv[1]).open("rb") as file:
     for _, channel, message, decoded in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():

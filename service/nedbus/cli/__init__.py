@@ -27,7 +27,9 @@ def main() -> None:
     gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
     from .app import make_app
 
-    app = make_app(sys.argv[1:])
+    is_completing = "_NEDBUS_COMPLETE" in os.environ  # by a shell, which passes the command line in COMP_WORDS
+    app = make_app(None if is_completing else sys.argv[1:])
+    gc.freeze()  # what was imported stays: the first collection would search all of it, for a tenth of a short command
     gc.enable()
     app()
 

@@ -69,7 +69,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(function)
     def run(**values: Any) -> None:
-        with _exit_on_errors(), ExitStack() as stack:
+        with exit_on_errors(), ExitStack() as stack:
             for name, factory in factories.items():
                 make = functools.partial(factory, **{each.name: values.pop(each.name) for each in expanded[name]})
                 if name == "selection":
@@ -93,7 +93,7 @@ def _options_of(factory: Callable[..., object]) -> list[inspect.Parameter]:
 
 
 @contextmanager
-def _exit_on_errors() -> Iterator[None]:
+def exit_on_errors() -> Iterator[None]:
     """Report errors in one line and exit: 1 for a failure, 2 for wrong usage, 130 for an interrupt."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # set by `main` for the imports
         signal.signal(signal.SIGINT, signal.default_int_handler)

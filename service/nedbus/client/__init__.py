@@ -1,10 +1,12 @@
 """The client API: connect to a router, subscribe, query last messages, publish; blocking and asyncio."""
 
-from nedbus.events import format_duration
+from typing import TYPE_CHECKING
+
+from nedbus.clock import format_duration
+from nedbus.extras import lazy_exports
 from nedbus.samples import Counts, Mode, Sample
 from nedbus.transport import Publishers
 
-from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect
 from .discovery import (
     LogStreamStatus,
@@ -18,10 +20,25 @@ from .discovery import (
     reply_parts,
 )
 from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
-from .newest import AsyncNewest, Monitor, Newest, NewestMessage
+from .link import LinkCallback
+from .newest import Monitor, Newest, NewestMessage
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .publishing.writer import HEARTBEAT
 from .rate_gate import check_max_rate
-from .subscription import AsyncSubscription, Subscription
+from .subscription import Subscription
+
+if TYPE_CHECKING:
+    from .async_bus import AsyncBus, AsyncPublisher, connect_async
+    from .async_newest import AsyncNewest
+    from .async_subscription import AsyncSubscription
+else:  # lazy: few scripts and no command use asyncio
+    _NAMES = {
+        "async_bus": "AsyncBus AsyncPublisher connect_async",
+        "async_newest": "AsyncNewest",
+        "async_subscription": "AsyncSubscription",
+    }
+    __getattr__ = lazy_exports(
+        __name__, {name: ("", module) for module, names in _NAMES.items() for name in names.split()}
+    )

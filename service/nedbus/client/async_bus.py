@@ -10,7 +10,7 @@ from contextlib import AbstractAsyncContextManager, suppress
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar, Unpack, cast, overload
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, Unpack, cast, overload
 
 from nedbus.errors import ClosedError
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
@@ -18,11 +18,12 @@ from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
 from nedbus_msgs import ANY, Definition, Message, Selection
 
+from .async_newest import AsyncNewest
+from .async_subscription import AsyncSubscription
 from .bus import Bus, require_callable, select
-from .newest import AsyncNewest
+from .link import LinkCallback
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .receiving import Receiver
-from .subscription import AsyncSubscription
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -125,10 +126,10 @@ class AsyncBus:
             partial(self._in_thread, open_receiver), inbox, (each.topic for each in selections), owner=bus
         )
 
-    def on_link(self, call: Callable[[bool], object]) -> None:
+    def on_link(self, call: Callable[[bool], object]) -> LinkCallback:
         """Call a function in the running event loop when the link to the router is lost or up; see `Bus.on_link`."""
         require_callable(call)
-        self._blocking.on_link(partial(_call_in, asyncio.get_running_loop(), call))
+        return self._blocking.on_link(partial(_call_in, asyncio.get_running_loop(), call))
 
     @overload
     async def latest(
@@ -158,10 +159,18 @@ class AsyncBus:
         definition: Definition[Any] | None = None,
     ) -> AsyncPublisher:
         """Return a publisher with awaitable methods; see `Bus.publisher`."""
-        call = partial(
-            self._blocking.publisher, message, topic=topic, vehicle=vehicle, instance=instance, definition=definition
-        )
-        return AsyncPublisher(await self._in_thread(call, lossless=lossless, source=source))
+        opening = _Opening(
+            partial(
+                self._blocking.publisher, message, topic=topic, vehicle=vehicle, instance=instance, lossless=lossless,
+                source=source, definition=definition,
+            ),
+            close=lambda publisher: publisher.close(timeout=0.0),
+        )  # fmt: skip
+        try:
+            return AsyncPublisher(await self._in_thread(opening.run))
+        except asyncio.CancelledError:
+            opening.abandon()
+            raise
 
     async def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Close the bus; see `Bus.close`. Cancellation closes the bus at once, without waiting for readers."""
@@ -171,14 +180,16 @@ class AsyncBus:
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
-        opening = asyncio.create_task(self._in_thread(self._open_bus, cancelled))
+        opening = _Opening(partial(self._open_bus, cancelled), close=lambda bus: bus.close(0.0))
+        running = asyncio.create_task(self._in_thread(opening.run))
         try:
-            while not opening.done():  # asyncio can miss a Ctrl-C just before it blocks: wake it regularly
-                await asyncio.wait({opening}, timeout=1.0)
-            self._bus = opening.result()
+            while not running.done():  # asyncio can miss a Ctrl-C just before it blocks: wake it regularly
+                await asyncio.wait({running}, timeout=1.0)
+            self._bus = running.result()
         except asyncio.CancelledError:
             cancelled.set()  # otherwise the thread keeps connecting and blocks interpreter exit
-            opening.cancel()
+            running.cancel()
+            opening.abandon()
             raise
         return self
 
@@ -187,6 +198,34 @@ class AsyncBus:
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(call, *args, **kwargs))
+
+
+class _Opening(Generic[_T]):
+    """What a thread opens for a task: if the task is cancelled meanwhile, it is closed as soon as it is open."""
+
+    def __init__(self, open_: Callable[[], _T], *, close: Callable[[_T], object]) -> None:
+        self._open, self._close = open_, close
+        self._lock = threading.Lock()
+        self._opened: _T | None = None
+        self._is_abandoned = False
+
+    def run(self) -> _T:
+        """Open in this thread; close at once what nobody waits for."""
+        opened = self._open()
+        with self._lock:
+            self._opened = opened
+            is_abandoned = self._is_abandoned
+        if is_abandoned:
+            self._close(opened)
+        return opened
+
+    def abandon(self) -> None:
+        """Close what is open, in a new thread, or else what `run` opens later."""
+        with self._lock:
+            self._is_abandoned = True
+            opened = self._opened
+        if opened is not None:
+            threading.Thread(target=self._close, args=(opened,), name="nedbus-close").start()
 
 
 def _call_in(loop: asyncio.AbstractEventLoop, call: Callable[[bool], object], is_up: bool) -> None:

@@ -1,15 +1,16 @@
 """The blocking API: connect, subscribe, query, publish."""
 
+from __future__ import annotations
+
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack, overload
+from typing import TYPE_CHECKING, Any, Unpack, overload
 
 from nedbus.errors import ArgumentError, ClosedError, NedbusError
-from nedbus.events import AccountReport
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import (
@@ -26,13 +27,16 @@ from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLoc
 
 from .closing import Finalizer
 from .discovery import Rejections, ServiceStatus, Vehicles, find_reports, find_services
-from .link import LinkWatch
+from .link import LinkCallback, LinkWatch
 from .newest import Newest
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiver, Receiver, find_schemas
 from .subscription import Subscription
+
+if TYPE_CHECKING:
+    from nedbus.events import AccountReport
 
 
 class Bus(AbstractContextManager["Bus"]):
@@ -55,7 +59,8 @@ class Bus(AbstractContextManager["Bus"]):
         self._directory = VehicleDirectory.of_fleet(self._reopen, prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
-        self._links: list[LinkWatch] = []
+        self._links: list[LinkWatch] = []  # one, created by the first `on_link`
+        self._links_lock = threading.Lock()
         closing = ExitStack()  # runs in reverse order; closing the session ends an open query for layouts
         heartbeats = self._publishers.heartbeats  # not the registry: its publishers reference the bus
         for close in (self._layouts.close, self._directory.close, session.close, heartbeats.close, self._queries.close):
@@ -241,15 +246,20 @@ class Bus(AbstractContextManager["Bus"]):
             raise
         return publisher
 
-    def on_link(self, call: Callable[[bool], object]) -> None:
+    def on_link(self, call: Callable[[bool], object]) -> LinkCallback:
         """Call a function with False when the link to the router is lost, and with True when it is up again.
 
-        The calls are made on a separate thread, in order, until the bus is closed.
+        The calls are made on a separate thread, in order, until the bus, or the object that this method returns, is
+        closed.
 
         Raises ArgumentError if `call` is not a function.
         """
         require_callable(call)
-        self._links.append(LinkWatch(self._session, call))
+        session = self._session
+        with self._links_lock:
+            if not self._links:
+                self._links.append(LinkWatch(session))
+        return self._links[0].add(call)
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
         """Open another Zenoh session, to the same routers or to `endpoint`; the caller closes it."""

@@ -6,8 +6,9 @@ import json
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import islice
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import zenoh
 from pydantic import TypeAdapter
@@ -17,11 +18,13 @@ from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health import Health
 from nedbus.errors import AddressError
-from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
 from nedbus.samples import LogStreamStatus, UntrustedReply
 from nedbus.transport import MAX_REPLY_BYTES, RawSample, Session, query, translate_zenoh_errors
 from nedbus_msgs import ANY, REJECTED, Address, status_key
+
+if TYPE_CHECKING:
+    from nedbus.events import AccountReport
 
 _log = logging.getLogger(__name__)
 
@@ -122,7 +125,10 @@ class ServiceStatus(UntrustedReply):
         return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
 
 
-_STATUS: Final = TypeAdapter(ServiceStatus)
+@cache
+def _status_type() -> TypeAdapter[ServiceStatus]:
+    """Return the validation of a reply; Pydantic takes 20 ms to compile it, so it waits for the first reply."""
+    return TypeAdapter(ServiceStatus)
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
@@ -130,13 +136,15 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     found: dict[str, ServiceStatus] = {}
     for key, content in parse_replies(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
         if isinstance(content, dict):
-            part = replace(_STATUS.validate_python(content), service=key.split("/")[-2])
+            part = replace(_status_type().validate_python(content), service=key.split("/")[-2])
             found[key] = replace(part, sources=(*found[key].sources, *part.sources)) if key in found else part
     return list(found.values())
 
 
 def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
     """Query all services for their event reports of the last `within` seconds; ignore invalid or oversized replies."""
+    from nedbus.events import ACCOUNT_PARAMETER, from_json, joined
+
     selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[str, list[AccountReport]] = {}
     for key, content in parse_replies(query(session, selector, timeout=timeout)):

@@ -15,7 +15,7 @@ from statistics import fmean, median
 from typing import Any, Final, Literal, get_args
 
 from nedbus import clock
-from nedbus.events import format_duration
+from nedbus.clock import format_duration
 from nedbus.samples import Sample
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (

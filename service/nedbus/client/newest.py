@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, ItemsView, Iterable, Iterator, Mapping, ValuesView
+from collections.abc import Callable, ItemsView, Iterable, Iterator, Mapping, ValuesView
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
 from nedbus import clock
 from nedbus.errors import ArgumentError, ClosedError, NoDataError
@@ -23,7 +22,7 @@ from nedbus_msgs import ANY, Address, Message, topic_of
 
 from .health import ABSENT, Health, Histogram, StreamHealth, health_of_last, silence_of
 from .receiving import MAX_KEYS, Inbox, Receiver
-from .subscription import AsyncSubscription, Subscription
+from .subscription import Subscription
 
 if TYPE_CHECKING:
     from .bus import Bus
@@ -81,7 +80,7 @@ class NewestMessage(Generic[M_co]):
 
     @property
     def updated(self) -> bool:
-        """True if the message arrived in the last update of its view."""
+        """True if the message arrived in the last update of its view, or in the last `add` of its Monitor."""
         return self._number == self._view.number
 
     @property
@@ -140,7 +139,11 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         self._by_topic: defaultdict[str, dict[Address, NewestMessage[Any]]] = defaultdict(dict)
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`."""
+        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`.
+
+        Each call is an update of the view: afterwards, only the stream of this sample is `updated`.
+        """
+        self._view.number += 1
         self._add(sample, received)
         return not sample.retained
 
@@ -243,7 +246,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
             del self._by_topic[address.topic]
 
 
-class _NewestBase(Monitor):
+class NewestBase(Monitor):
+    """The view of a bus, blocking or asynchronous."""
+
     def __init__(self, inbox: Inbox, topics: Iterable[str], ask: Callable[[], tuple[bool, Publishers]]) -> None:
         super().__init__()
         self._inbox, self._wanted, self._view.ask = inbox, frozenset(topics), ask
@@ -271,10 +276,11 @@ class _NewestBase(Monitor):
         arrived = [*samples, *(each for each in popped if each is not None)]
         if ended and not arrived:
             raise self._inbox.end_error
-        return [stream for sample in arrived if (stream := self._add(sample)).updated]
+        streams = dict.fromkeys(map(self._add, arrived))  # two samples of a stream are one piece of news
+        return [stream for stream in streams if stream.updated]
 
 
-class Newest(_NewestBase, AbstractContextManager["Newest"]):
+class Newest(NewestBase, AbstractContextManager["Newest"]):
     """View of the newest message of each stream; `bus.newest(...)` returns one. Read it after each `update`.
 
     It needs no thread unless `update` has a timeout. Call `update` from one thread; any thread may read the messages.
@@ -304,34 +310,3 @@ class Newest(_NewestBase, AbstractContextManager["Newest"]):
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-
-class AsyncNewest(_NewestBase):
-    """The asyncio version of Newest; `bus.newest(...)` returns one, which opens on first use."""
-
-    def __init__(
-        self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox, topics: Iterable[str], *, owner: Bus
-    ) -> None:
-        super().__init__(inbox, topics, owner._network)
-        self._subscription = AsyncSubscription[Message](open_receiver, inbox)
-
-    async def update(self, timeout: float | None = 0.0) -> list[NewestMessage[Message]]:
-        """Read what has arrived, or wait for a message; see `Newest.update`."""
-        await self._subscription._open()
-        await asyncio.sleep(0)  # otherwise a loop that never waits would starve other tasks
-        news = self._read()
-        if not news and timeout != 0:
-            with suppress(NoDataError):
-                news = self._read(await self._subscription.receive(timeout))
-        return news
-
-    async def close(self) -> None:
-        """Close the view; its messages remain. A second call does nothing."""
-        await self._subscription.close()
-
-    async def __aenter__(self) -> Self:
-        await self._subscription._open()
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        await self.close()

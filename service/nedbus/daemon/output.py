@@ -26,6 +26,7 @@ _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a 
 _MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
 _UNSETTLED: Final = 60.0  # s after which a stream that was stale counts as stable again
 _MAX_RULES: Final = 50  # rules with a separate counter
+_ULOG_STREAM: Final = "mavlink-ulog"  # source of messages before which losses are estimated
 _NO_MESSAGE: Final = "input that is no message"
 TOO_MANY: Final = "too many addresses"
 """Rule of messages rejected because their source has too many addresses."""
@@ -168,7 +169,8 @@ class SourceOutput:
         stream.health.add(row, received=round(received * 1e9), latency=latency, lost=lost, missing=missing)
         if message.dropout:
             self._event_log.add_dropout(address.vehicle, message.dropout, clock.steady() - message.dropout)
-        self._event_log.add(address, row, clock.steady(), missing=missing, lost=lost)
+        is_estimate = message.source == _ULOG_STREAM
+        self._event_log.add(address, row, clock.steady(), missing=missing, lost=lost, is_estimate=is_estimate)
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source; claim its address first if necessary."""

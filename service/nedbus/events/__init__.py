@@ -1,13 +1,12 @@
 """Vehicle events and their possible causes, derived from live or recorded messages; no I/O."""
 
-from .contradictions import AIR_DATA
-from .detectors import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State
 from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
-from .story import Span, Story, spans_of, state_at, stories_of, story_of
+from .story import Span, Story, events_outside, is_alarm, spans_of, state_at, stories_of, story_of
 from .times import Times, format_duration, format_since, format_utc, unit_of
+from .vehicle import EVENT_TOPICS
 from .verdict import Verdict, verdict_of

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from itertools import chain
-from typing import Final
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple
 
 from nedbus_msgs.frames import MapProjection
 
 from . import rules
-from .detectors import ChangeDetector, Detection, Finding, read_fields
+from .detectors import ChangeDetector, Detection, Finding, detect_nothing, read_fields
 
 AIR_DATA: Final = "vehicle_air_data"
 _GNSS: Final = ("GNSS", ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv"))
@@ -21,88 +22,253 @@ REFERENCES: Final = {
 }  # fmt: skip
 """Topics with independent measurements, each with its instrument and its fields."""
 
-_ESTIMATE: Final = ("x", "y", "z", "vx", "vy", "z_valid", "xy_valid", "ref_lat", "ref_lon", "ref_alt")
-_INTERVAL: Final = 390_000  # us between comparisons with a reference
-_MAX_AGE: Final = 500_000  # us between a measurement and the estimate
+_ESTIMATE: Final = ("x", "y", "z", "vx", "vy", "z_valid", "xy_valid", "z_global", "ref_lat", "ref_lon", "ref_alt")
+_INTERVAL: Final = 400_000  # us of the vehicle's clock, of each of which the first measurement is compared
+_DELAY: Final = 500_000  # us by which comparisons follow the estimate: topics are written and sent in any order
+_MAX_STEP: Final = 500_000  # us between the estimates before and after a measurement
 _FRESH: Final = 1_500_000  # us for which a comparison is valid
+_MAX_WAITING: Final = 100  # measurements; bounds the memory that a peer can use
+_MAX_ESTIMATES: Final = 1000
 _TWO_G: Final = 19.6  # m/s^2
 
 
 class ReferenceDetector(ChangeDetector):
-    """Detector for a topic in REFERENCES: compares the estimate with it, and runs the topic's `own` detection."""
+    """Detector for a topic in REFERENCES: collects its measurements, and runs the topic's `own` detection."""
 
     def __init__(self, topic: str, comparison: Comparison, own: Detection | None) -> None:
         self._name, fields = REFERENCES[topic]
-        super().__init__(*(own or (fields, (), lambda _, __: iter(()))))
+        super().__init__(*(own or (fields, (), detect_nothing)))
         self._read_reference = read_fields(fields, math.nan)
-        self._comparison, self._compared = comparison, 0
-        self.pause = 0.0 if own else 1.05e-6 * _INTERVAL
+        self._comparison = comparison
+        self._interval = -1
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the topic's own findings and the contradictions that begin or end; None if nothing has changed."""
+        """Return the topic's own findings, None if nothing has changed; remember the measurement."""
         found = super().add(message, missing)
-        if 0 <= self.stamp - self._compared < _INTERVAL:
-            return found
-        self._compared, values = self.stamp, self._read_reference(message)
-        if not all(isinstance(each, int | float) for each in values):  # fields of AIR_DATA may have any type
-            return found
-        new = self._comparison.add(self._name, self.stamp, values)
-        return chain(found or (), new) if new else found
+        interval = self.stamp // _INTERVAL
+        if interval != self._interval:
+            self._interval, values = interval, self._read_reference(message)
+            if all(isinstance(value, int | float) for value in values):  # fields of AIR_DATA may have any type
+                self._comparison.remember(_Measurement(self.stamp, self._name, values))
+        return found
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         super().reset()
-        self._compared = 0
+        self._interval = -1
         self._comparison.reset()
 
 
-class Comparison:
-    """Comparison of a valid estimate with all references; `position` returns the detector of the estimate in use."""
+class _Measurement(NamedTuple):
+    stamp: int
+    name: str
+    values: tuple[float, ...]
 
-    def __init__(self, position: Callable[[], ChangeDetector | None]) -> None:
-        self._estimate = position
+
+class _Message(NamedTuple):
+    """A message of the estimate, and the names of its fields that were not provided."""
+
+    stamp: int
+    fields: object
+    missing: frozenset[str]
+
+
+class _Estimate(NamedTuple):
+    """Fields of _ESTIMATE."""
+
+    x: float
+    y: float
+    z: float
+    vx: float
+    vy: float
+    z_valid: float
+    xy_valid: float
+    z_global: float
+    latitude: float
+    longitude: float
+    altitude: float
+
+    @property
+    def has_origin(self) -> bool:
+        return math.isfinite(self.altitude)
+
+    @property
+    def height(self) -> float:
+        """Height above sea level, or above the unknown altitude of the origin [m]."""
+        return (self.altitude if self.has_origin else 0.0) - self.z
+
+    @property
+    def speed(self) -> float:
+        return math.hypot(self.vx, self.vy)
+
+    @property
+    def height_limit(self) -> float:
+        return rules.HEIGHT_LIMIT + rules.HEIGHT_SHARE * (0.0 if math.isnan(self.z) else abs(self.z))
+
+    @property
+    def distance_limit(self) -> float:
+        return rules.POSITION_LIMIT + rules.GNSS_DELAY * self.speed
+
+
+class Comparison:
+    """Comparison of a valid estimate with all references, by PX4's timestamps alone.
+
+    A measurement is compared with the estimate at its time, between the messages before and after it, once the
+    estimate is _DELAY ahead. So a log, its conversion, its replay and a recording of that give the same result.
+    """
+
+    def __init__(self) -> None:
         self._read = read_fields(_ESTIMATE, math.nan)
         self.reset()
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
-        self._height, self._position = _Contradiction("height", "z"), _Contradiction("position", "xy")
+        self._height = _Contradiction("height")
+        self._position = _Contradiction("position")
+        self._origin = _Contradiction("origin")
         self._offsets: dict[str, tuple[object, float]] = {}  # origin and first difference, by reference
+        self._waiting: list[_Measurement] = []  # by time
+        self._estimates: deque[_Message] = deque(maxlen=_MAX_ESTIMATES)
 
-    def add(self, name: str, stamp: int, values: tuple[float, ...]) -> list[Finding]:
-        """Compare the estimate with a reference's fields; return contradictions that begin or end."""
-        position = self._estimate()
-        if position is None or abs(stamp - position.stamp) > _MAX_AGE:
+    def remember(self, measurement: _Measurement) -> None:
+        """Add a measurement, which is compared later."""
+        insort(self._waiting, measurement)
+        if len(self._waiting) > _MAX_WAITING:  # the last ones have damaged times
+            self._waiting.pop()
+
+    def add_estimate(self, stamp: int, message: object, missing: frozenset[str]) -> list[Finding]:
+        """Add a message of the estimate; return contradictions that began or ended, with their ages."""
+        estimates = self._estimates
+        if estimates and stamp <= estimates[-1].stamp:
+            if stamp < estimates[-1].stamp - _DELAY:  # the last time was damaged
+                estimates.clear()
             return []
-        x, y, z, vx, vy, z_valid, xy_valid, latitude, longitude, altitude = self._read(position.last)
-        has_origin, speed = math.isfinite(altitude), math.hypot(vx, vy)
-        height, up, distance = (altitude if has_origin else 0.0) - z, math.nan, math.nan
-        height_limit = rules.HEIGHT_LIMIT + rules.HEIGHT_SHARE * abs(z)
-        limit = rules.POSITION_LIMIT + rules.GNSS_DELAY * speed
-        project = MapProjection(latitude, longitude).project
-        if name == "barometer":
-            up = self._relative(name, height - values[0], (values[1], has_origin))
-            height_limit += speed * speed / _TWO_G  # dynamic pressure error
-        elif name == "ground truth":
-            up = self._relative(name, height - values[5] + values[2], has_origin)
-            distance = math.dist((x - values[0], y - values[1]), project(values[3], values[4]))
-        elif values[0] >= rules.MIN_FIX_TYPE and (values[1] or values[2]):
-            up, distance = altitude - z - values[3], math.dist((x, y), project(values[1], values[2]))
-            eph, epv = (each if each > 0.0 else rules.UNKNOWN_ACCURACY for each in values[4:])
-            height_limit, limit = height_limit + rules.SIGMAS * epv, limit + rules.SIGMAS * eph
-        if z_valid != 1 or "z_valid" in position.missing:
-            up = math.nan
+        estimates.append(_Message(stamp, message, missing))
+        findings: list[Finding] = []
+        while self._waiting and self._waiting[0].stamp <= stamp - _DELAY:
+            measurement = self._waiting.pop(0)
+            delay = (stamp - measurement.stamp) / 1e6
+            findings += [replace(finding, age=finding.age + delay) for finding in self._compare(measurement)]
+        while estimates[0].stamp < stamp - 2 * _DELAY - _MAX_STEP:
+            estimates.popleft()
+        return findings
+
+    def _compare(self, measurement: _Measurement) -> list[Finding]:
+        """Compare a measurement with the estimate at its time; return contradictions that begin or end."""
+        around = self._messages_around(measurement.stamp)
+        if around is None:
+            return []
+        estimate = self._interpolate(*around, measurement.stamp)
+        missing = around[0].missing | around[1].missing
+        if estimate.z_valid != 1 or "z_valid" in missing:
             self._offsets.clear()
-        if xy_valid != 1 or "xy_valid" in position.missing:
+            estimate = estimate._replace(z=math.nan)
+        if estimate.xy_valid != 1 or "xy_valid" in missing:
+            estimate = estimate._replace(x=math.nan, y=math.nan)
+        if measurement.name == "barometer":
+            error = self._error_of_barometer(measurement, estimate)
+        elif measurement.name == "ground truth":
+            error = self._error_of_truth(measurement, estimate)
+        else:
+            error = self._error_of_gnss(measurement, estimate)
+        name, stamp = measurement.name, measurement.stamp
+        changes = [
+            self._height.update(name, stamp, error.height, error.height_limit),
+            self._position.update(name, stamp, error.distance, error.distance_limit),
+        ]
+        if name == "GNSS" and estimate.z_global == 1 and not self._height.since:
+            changes.append(self._origin.update(name, stamp, error.altitude, error.height_limit))
+        return [change for change in changes if change is not None]
+
+    def _messages_around(self, stamp: int) -> tuple[_Message, _Message] | None:
+        """Return the messages of the estimate before and after this time; None if they are far apart or missing."""
+        after = bisect_left(self._estimates, stamp, key=lambda message: message.stamp)
+        if not 0 < after < len(self._estimates):
+            return None
+        before, next_one = self._estimates[after - 1], self._estimates[after]
+        return (before, next_one) if next_one.stamp - before.stamp <= _MAX_STEP else None
+
+    def _interpolate(self, before: _Message, after: _Message, stamp: int) -> _Estimate:
+        first, second = _Estimate(*self._read(before.fields)), _Estimate(*self._read(after.fields))
+        share = (stamp - before.stamp) / (after.stamp - before.stamp)
+        motion = [old + share * (new - old) for old, new in zip(first[:5], second[:5], strict=True)]
+        z_valid, xy_valid = min(first.z_valid, second.z_valid), min(first.xy_valid, second.xy_valid)
+        return _Estimate._make([*motion, z_valid, xy_valid, *second[7:]])
+
+    def _error_of_barometer(self, measurement: _Measurement, estimate: _Estimate) -> _Error:
+        """Return the change of the height difference, which a standard atmosphere and dynamic pressure limit."""
+        height, device = measurement.values
+        if height > rules.TROPOPAUSE:
+            return _Error()
+        error = self._relative("barometer", estimate.height - height, (device, estimate.has_origin))
+        climbed = self._relative("climb", height, device)
+        limit = estimate.height_limit + estimate.speed**2 / _TWO_G + atmosphere_error(climbed)
+        return _Error(height=error, height_limit=limit)
+
+    def _error_of_truth(self, measurement: _Measurement, estimate: _Estimate) -> _Error:
+        """Return the errors in the local frame, whose origin differs by a constant."""
+        x, y, z, latitude, longitude, altitude = measurement.values
+        height = self._relative("ground truth", estimate.height - altitude + z, estimate.has_origin)
+        if math.isfinite(estimate.latitude):
+            north, east = MapProjection(estimate.latitude, estimate.longitude).project(latitude, longitude)
+            distance = math.hypot(estimate.x - x - north, estimate.y - y - east)
+        elif math.isfinite(estimate.x + estimate.y):
+            north = self._relative("north", estimate.x - x, None)
+            east = self._relative("east", estimate.y - y, None)
+            distance = math.hypot(north, east)
+        else:
             distance = math.nan
-        found = self._height.update(name, stamp, up, height_limit), self._position.update(name, stamp, distance, limit)
-        return [each for each in found if each]
+        return _Error(height, distance, math.nan, estimate.height_limit, estimate.distance_limit)
+
+    def _error_of_gnss(self, measurement: _Measurement, estimate: _Estimate) -> _Error:
+        """Return the errors in height, position and altitude.
+
+        The height is off only if its change since the first comparison is off, too: else the origin's altitude is.
+        """
+        fix_type, latitude, longitude, altitude, eph, epv = measurement.values
+        if fix_type < rules.MIN_FIX_TYPE or not (latitude or longitude):
+            return _Error()
+        error = estimate.altitude - estimate.z - altitude
+        change = self._relative("GNSS", error, None)
+        height = min(error, change, key=abs)
+        if error * change < 0.0:  # on opposite sides: the altitude and its change do not support each other
+            height = 0.0
+        north, east = MapProjection(estimate.latitude, estimate.longitude).project(latitude, longitude)
+        eph, epv = (value if value > 0.0 else rules.UNKNOWN_ACCURACY for value in (eph, epv))
+        return _Error(
+            height, math.hypot(estimate.x - north, estimate.y - east), error,
+            estimate.height_limit + rules.SIGMAS * epv, estimate.distance_limit + rules.SIGMAS * eph,
+        )  # fmt: skip
 
     def _relative(self, name: str, difference: float, origin: object) -> float:
-        """Return the change of a height difference since the first comparison with this origin."""
-        if name not in self._offsets or self._offsets[name][0] != origin:
-            self._offsets[name] = (origin, difference)
-        return difference - self._offsets[name][1]
+        """Return the change of a difference since the first one with this origin; NaN if it is unknown."""
+        if not math.isfinite(difference):
+            return math.nan
+        known = self._offsets.get(name)
+        if known is None or known[0] != origin:
+            self._offsets[name] = known = (origin, difference)
+        return difference - known[1]
+
+
+def atmosphere_error(climbed: float) -> float:
+    """Return the possible error of a barometer's height [m] after a climb [m].
+
+    PX4 computes it with the International Standard Atmosphere, whose temperature profile is 15 degrees C at sea level,
+    less 6.5 K per km up to 11 km. By the hypsometric equation (ISO 2533; WMO-No. 8, chapter 3) the true thickness of a
+    layer is proportional to its mean temperature in K: an error of 1 % of the climb per 3 degrees. ATMOSPHERE_SHARE
+    covers a day that is 45 degrees colder or warmer.
+    """
+    return rules.ATMOSPHERE_SHARE * abs(climbed)
+
+
+class _Error(NamedTuple):
+    """Errors [m], NaN if unknown, and their limits: of the height, the horizontal position and the altitude."""
+
+    height: float = math.nan
+    distance: float = math.nan
+    altitude: float = math.nan
+    height_limit: float = math.inf
+    distance_limit: float = math.inf
 
 
 @dataclass(slots=True)
@@ -113,34 +279,43 @@ class _Contradiction:
     """
 
     quantity: str
-    flag: str
     errors: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     since: int = 0
     worst: float = 0.0
-    text: str = ""
+    is_reported: bool = False
 
     def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
         """Add an error, NaN if not measured; return the finding that begins or ends a contradiction, if any."""
         self.errors[name] = (stamp, error, limit)
         if not self.since and not abs(error) > limit:
             return None
-        kind, text = f"{self.quantity}_contradicted", self.text
         fresh = {
-            each: (off, most)
-            for each, (time, off, most) in self.errors.items()
-            if abs(stamp - time) <= _FRESH and math.isfinite(off)
+            reference: (error, limit)
+            for reference, (time, error, limit) in self.errors.items()
+            if abs(stamp - time) <= _FRESH and math.isfinite(error)
         }
-        factor = 2.0 if self.quantity == "height" and len(fresh) == 1 else 1.0
-        directions = {math.copysign(abs(off) > factor * most, off) for off, most in fresh.values()}
+        is_alone = self.quantity != "position" and len(fresh) == 1
+        factor = 2.0 if is_alone else 1.0
+        directions = {math.copysign(abs(error) > factor * limit, error) for error, limit in fresh.values()}
         if directions not in ({1.0}, {-1.0}):
-            self.since, self.worst, self.text = 0, 0.0, ""
-            return Finding(kind, "end", f"{self.quantity} no longer contradicted") if text else None
+            was_reported, self.is_reported = self.is_reported, False
+            self.since, self.worst = 0, 0.0
+            kind = f"{self.quantity}_contradicted"
+            return Finding(kind, "end", f"{self.quantity} no longer contradicted") if was_reported else None
         self.since, self.worst = self.since or stamp, max(self.worst, error, key=abs)
         lasted = (stamp - self.since) / 1e6
-        if lasted < rules.CONTRADICTED[self.quantity]:
+        if self.is_reported or lasted < rules.CONTRADICTED[self.quantity]:
             return None
-        side = "off" if self.quantity == "position" else "above" if self.worst > 0.0 else "below"
-        self.text = f"{self.quantity} {abs(self.worst):.0f} m {side} {' and '.join(sorted(fresh))}"
+        self.is_reported = True
+        return self._begin(" and ".join(sorted(fresh)), lasted)
+
+    def _begin(self, references: str, lasted: float) -> Finding:
+        size, side = f"{abs(self.worst):.0f} m", "above" if self.worst > 0.0 else "below"
+        if self.quantity == "height":
+            text = f"height {size} {side} {references} while z_valid is true"
+        elif self.quantity == "position":
+            text = f"position {size} off {references} while xy_valid is true"
+        else:
+            text = f"origin altitude (ref_alt) {size} {side} {references} (z is right)"
         numbers = {"distance": self.worst}
-        begin = Finding(kind, "begin", f"{self.text} while {self.flag}_valid is true", numbers=numbers, age=lasted)
-        return None if text else begin
+        return Finding(f"{self.quantity}_contradicted", "begin", text, numbers=numbers, age=lasted)

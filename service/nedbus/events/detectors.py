@@ -10,7 +10,7 @@ from nedbus_msgs import FieldReader
 from nedbus_msgs.messages import LogMessage, VehicleStatus
 
 from . import rules
-from .kinds import Kind, Severity, flagged
+from .kinds import KINDS, Kind, Severity, flagged
 
 Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
@@ -36,6 +36,7 @@ class Finding:
     `initial`: True if it was active in the first message, so its condition begins without an event.
     `age`: time since it began [s].
     `switch`: True to ignore it unless it begins an inactive condition or ends an active one.
+    `is_large`: True for a correction of the estimate that is bad while the vehicle is armed.
     """
 
     kind: str
@@ -47,6 +48,7 @@ class Finding:
     initial: bool = False
     age: float = 0.0
     switch: bool = False
+    is_large: bool = False
 
 
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
@@ -113,6 +115,120 @@ class TextDetector(ChangeDetector):
         """Return the finding in a message."""
         self._state = ()
         return super().add(message, missing)
+
+
+def detect_nothing(_: Fields, __: Fields) -> Iterator[Finding]:
+    """Yield no finding: the detection of a stream of which only the times count."""
+    return iter(())
+
+
+class AidDetector(ChangeDetector):
+    """Detector for a topic of AID_SOURCES: measurements that the primary EKF rejects, or does not use.
+
+    Single messages vary: a state counts once all of AID_COUNT messages in AID_HOLD agree.
+    """
+
+    def __init__(self, topic: str, is_primary: Callable[[object], bool]) -> None:
+        super().__init__(("fused", "innovation_rejected", "estimator_instance"), (), detect_nothing)
+        self.topic, self.kind = topic, ""  # of the condition that it began
+        self._is_primary = is_primary
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the state after a reboot of the vehicle."""
+        super().reset()
+        self.kind = ""
+        self._is_first = True
+        self._start_run(is_fused=None)
+
+    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding]:
+        """Return the findings in a message."""
+        super().add(message, missing)
+        fused, rejected, instance = self._state
+        if not self._is_primary(instance):
+            self._start_run(is_fused=None)
+            return self._change_to("", f"{self._label}: another EKF is primary")
+        is_fused = bool(fused)
+        if is_fused != self._is_fused or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
+            self._is_first = self._is_fused is None and self._is_first
+            self._start_run(is_fused=is_fused)
+        self._count += 1
+        self._rejected += bool(rejected)
+        if self._count < rules.AID_COUNT or self.stamp - self._since < 1e6 * rules.AID_HOLD:
+            return iter(())
+        if is_fused:
+            return self._change_to("", "")
+        is_rejected = self.kind == "aid_rejected" or 2 * self._rejected > self._count
+        return self._change_to("aid_rejected" if is_rejected else "aid_unused", "")
+
+    def stop(self) -> Iterator[Finding]:
+        """Return the end of the condition when messages no longer arrive."""
+        self._start_run(is_fused=None)
+        return self._change_to("", f"EKF no longer receives {self._label}")
+
+    @property
+    def _label(self) -> str:
+        return rules.AID_SOURCES[self.topic]
+
+    def _start_run(self, *, is_fused: bool | None) -> None:
+        self._is_fused, self._since, self._count, self._rejected = is_fused, self.stamp, 0, 0
+
+    def _change_to(self, kind: str, text: str) -> Iterator[Finding]:
+        before, self.kind = self.kind, kind
+        is_new_run = not (before and kind)
+        age = (self.stamp - self._since) / 1e6 if is_new_run else 0.0
+        if before and before != kind:
+            yield Finding(before, "end", text or KINDS[before].end.format(self._label), (self.topic,), age=age)
+        if kind and before != kind:
+            severity: Severity | None = "info" if self.topic in KINDS[kind].minor else None
+            initial = kind == "aid_unused" and self._is_first
+            yield Finding(
+                kind, "begin", KINDS[kind].begin.format(self._label), (self.topic,), severity=severity,
+                initial=initial, age=age,
+            )  # fmt: skip
+
+
+class VisionDetector(ChangeDetector):
+    """Detector for positions sent into the vehicle that its EKF does not fuse at all.
+
+    `is_fused`: returns whether the EKF fuses any vision, None if unknown, and since when it says so [us].
+    """
+
+    def __init__(self, is_fused: Callable[[], tuple[bool | None, int]]) -> None:
+        super().__init__((), (), detect_nothing)
+        self._is_fused = is_fused
+        self.since = 0  # first message that was not fused [us]
+        self.is_unused = False
+
+    def reset(self) -> None:
+        """Discard the state after a reboot of the vehicle."""
+        super().reset()
+        self.since, self.is_unused = 0, False
+
+    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding]:
+        """Return the findings in a message."""
+        super().add(message, missing)
+        is_fused, stamp = self._is_fused()
+        if is_fused is not False:
+            return self._end("the EKF fuses vision", age=max(0, self.stamp - stamp) / 1e6)
+        if not self.since or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
+            self.since = self.stamp
+        return self._begin((self.stamp - self.since) / 1e6)
+
+    def stop(self) -> Iterator[Finding]:
+        """Return the end of the condition when messages no longer arrive."""
+        return self._end("vision no longer arrives")
+
+    def _begin(self, age: float) -> Iterator[Finding]:
+        if not self.is_unused and age >= rules.VISION_HOLD:
+            self.is_unused = True
+            yield Finding("vision_unused", "begin", "vision arrives, but the EKF does not fuse it", age=age)
+
+    def _end(self, text: str, *, age: float = 0.0) -> Iterator[Finding]:
+        self.since = 0
+        if self.is_unused:
+            self.is_unused = False
+            yield Finding("vision_unused", "end", text, age=age)
 
 
 def detection_of(message: str) -> Detection | None:
@@ -219,6 +335,23 @@ def _detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
         names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
         yield Finding("mode", "once", f"mode changed from {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
+    yield from _detect_transition(before, after)
+
+
+def _detect_transition(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the begin and end of a VTOL's transition, and the vehicle type that it changes."""
+    was, now = before.get("in_transition_mode"), after["in_transition_mode"]
+    if now and not was:
+        aim = {True: " to fixed wing", False: " to rotary wing"}.get(after["in_transition_to_fw"], "")
+        yield Finding("transition", "begin", f"VTOL transition{aim}", initial=was is None)
+    elif was and now is False:
+        yield Finding("transition", "end", "VTOL transition ended")
+    old, new = before.get("vehicle_type"), after["vehicle_type"]
+    if old is not None and new is not None and old != new:
+        names = rules.VEHICLE_TYPES.get(old, str(old)), rules.VEHICLE_TYPES.get(new, str(new))
+        text = f"vehicle type changed from {names[0]} to {names[1]}"
+        yield Finding("vehicle_type", "once", text, names, {"from": old, "to": new})
+
 
 def _detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("landed"), after["landed"]
@@ -270,7 +403,11 @@ _FURTHER: Final[Mapping[str, Detection]] = {
     "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), _detect_aiding),
     "LogMessage": (("severity", "text"), (), _detect_text),
     "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), _detect_gps),
-    "VehicleStatus": (("arming_state", "nav_state"), (), _detect_status),
+    "VehicleStatus": (
+        ("arming_state", "nav_state", "in_transition_mode", "vehicle_type"),
+        ("in_transition_to_fw",),
+        _detect_status,
+    ),
     "BatteryStatus": (("warning", "connected"), ("remaining",), _detect_battery),
     "VehicleLandDetected": (("landed",), (), _detect_landing),
 }

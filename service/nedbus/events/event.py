@@ -10,16 +10,22 @@ from typing import Annotated, Final, Literal
 from pydantic import Field
 
 from .kinds import KINDS, SEVERITIES, Severity, importance
-from .rules import LARGE_CORRECTION, MAX_ALONE
+from .rules import MAX_ALONE
 
 WINDOW: Final = 10.0
 """Seconds before an event in which events of related kinds are evidence; the start of an active one may be older."""
+
+LATE: Final = 0.5
+"""Seconds after the start of a fault in which events are still its possible causes: topics differ in rate."""
 
 ALL: Final = "*"
 """Vehicle name in events that concern all vehicles: events of the router link and of the reader."""
 
 ALONE: Final = "one_message"
 """Name among an event's `numbers` if only one message, between two that agree, had the value that it ends."""
+
+SUPPRESSED: Final = "suppressed"
+"""Name among the `numbers` of a text of PX4 that stands for so many equal ones."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
 """Time on the event log's clock [s]; the bounds validate reports from peers."""
@@ -61,9 +67,20 @@ class Event:
         return "px4" if self.kind == "text" else "nedbus"
 
     @property
+    def is_minor(self) -> bool:
+        """True if it concerns only minor flags of its kind, or is a small correction; it explains nothing."""
+        kind = KINDS[self.kind]
+        if kind.correction and kind.severity != "info":
+            return self.severity == "info"
+        return bool(self.names) and kind.minor.issuperset(self.names)
+
+    @property
     def words(self) -> str:
-        """The text, in quotes if it is PX4's own."""
-        return f'PX4: "{self.text}"' if self.origin == "px4" else self.text
+        """The text, in quotes if it is PX4's own, with the number of equal ones that it stands for."""
+        if self.origin != "px4":
+            return self.text
+        count = self.numbers.get(SUPPRESSED)
+        return f'PX4: "{self.text}"{f", the last of {count:.0f} suppressed texts" if count else ""}'
 
     def later(self, seconds: float) -> Event:
         """Return this event and its evidence on a clock that is ahead by `seconds`."""
@@ -101,23 +118,22 @@ class State:
     conditions: tuple[Condition, ...]
 
 
-def rank(condition: Condition, until: float | None, *, is_now: bool = True) -> tuple[int, bool, bool, int, float]:
+def rank(condition: Condition, until: float | None) -> tuple[int, int, float]:
     """Return a sort key for conditions, worst first; `until`: the end, None while it is active.
 
-    Order: severity; with `is_now`, active conditions before ended ones and single events; large corrections of the
-    estimate; importance of the kind; duration, or the largest number of a single event.
+    Order: severity; importance of the kind; duration, or the largest number of a single event.
     """
-    numbers = map(abs, condition.begin.numbers.values()) if condition.begin.change == "once" else ()
-    size = max(numbers, default=round((math.inf if until is None else until) - condition.since, 2))
-    has_ended = is_now and until is not None
-    is_large = KINDS[condition.kind].correction and size >= LARGE_CORRECTION
-    return SEVERITIES.index(condition.severity), has_ended, not is_large, importance(condition.kind), -size
+    if condition.begin.change == "once":
+        size = max(map(abs, condition.begin.numbers.values()), default=0.0)
+    else:
+        size = math.inf if until is None else round(until - condition.since, 2)
+    return SEVERITIES.index(condition.severity), importance(condition.kind), -size
 
 
 def state_of(conditions: Iterable[Condition]) -> State:
     """Return the state of a vehicle, set by the worst of these conditions and recent single events."""
     counting = (each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless)
-    ordered = sorted(counting, key=lambda each: rank(each, each.since if each.begin.change == "once" else None))
+    ordered = sorted(counting, key=lambda condition: rank(condition, None))
     if not ordered:
         return State("info", "ok", None, ())
     first = ordered[0]
@@ -152,25 +168,43 @@ def without_wild(events: Iterable[Event]) -> list[Event]:
     return kept
 
 
-def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
-    """Return the possible causes of an event: the latest of each kind in the last WINDOW seconds, or still active.
+def explain(
+    event: Event, near: Iterable[Event], conditions: Iterable[Condition] = (), *, late: float = 0.0
+) -> list[Event]:
+    """Return the possible causes of an event in chronological order: the latest of each kind, and each text of PX4.
 
-    Possible causes of a start are other starts and PX4's log messages; of an end, other ends since the condition
-    began; of a correction of the estimate, all of these. All log messages are returned, not just the latest.
+    `near`: events of about the same time; those from WINDOW seconds before the event to `late` seconds after it count.
+    `conditions`: active ones count, however old. Possible causes of a start are other starts and PX4's texts; of an
+    end, other ends since the condition began; of a correction of the estimate, all of these.
     """
-    kind, latest = KINDS[event.kind], dict[object, Event]()
-    excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""
+    causes, latest = KINDS[event.kind].causes, dict[object, Event]()
     earliest = event.time - min(WINDOW, WINDOW if event.lasted is None else event.lasted)
-    for each in before:
-        is_bad = each.severity != "info" or (each.kind != "text" and (event.change == "end" or kind.correction))
-        is_near = earliest <= each.time <= event.time
-        is_link = each.kind == "link_down"  # the losses that it causes are detected after it ends
-        change = "begin" if each.kind == "text" else each.change
-        is_of_change = is_link or (is_bad and change != excluded)
-        if each is not event and each.kind in kind.causes and is_near and is_of_change:
-            latest[each.text if each.kind == "text" else each.kind] = each
-    for condition in conditions:
-        is_before = condition.begin.time <= event.time  # an event may be reported late
-        if condition.kind in kind.causes and condition.severity != "info" and event.change != "end" and is_before:
-            latest.setdefault(condition.kind, condition.begin)
-    return sorted(latest.values(), key=lambda each: each.time)
+    for other in near:
+        is_near = earliest <= other.time <= event.time + late
+        if other is not event and other.kind in causes and is_near and _may_explain(other, event):
+            latest[other.text if other.kind == "text" else other.kind] = other
+    if event.change != "end":
+        for condition in conditions:
+            begin = condition.begin
+            is_before = begin.time <= event.time + late  # an event may be reported late
+            if condition.kind in causes and is_before and not begin.is_minor and _is_notable(condition.kind, condition):
+                latest.setdefault(condition.kind, begin)
+    return sorted(latest.values(), key=lambda cause: cause.time)
+
+
+def _may_explain(cause: Event, event: Event) -> bool:
+    """Return whether an event of a kind that explains another may explain this one: by change and importance."""
+    if cause.kind == "link_down":  # the losses that it causes are detected after it ends
+        return True
+    if cause.kind == "text":
+        return cause.severity != "info" and event.change != "end"
+    if KINDS[event.kind].correction:
+        return not cause.is_minor
+    if event.change == "end":
+        return cause.change != "begin" and not cause.is_minor
+    return cause.change != "end" and not cause.is_minor and _is_notable(cause.kind, cause)
+
+
+def _is_notable(kind: str, found: Event | Condition) -> bool:
+    """Return whether a start is not routine: info because of the kind, or on the ground, but not by its size."""
+    return found.severity != "info" or KINDS[kind].severity == "info" or KINDS[kind].on_ground == "info"

@@ -37,16 +37,17 @@ class EventLog:
 
     All times come from one monotonic clock or one file, because a clock step would end or hide conditions.
 
+    `reader`: what may be overloaded, as its events name it: a reader, or a service.
     `reported`: total number of events. `counts`: number of events by vehicle (until forgotten) and severity.
     `refused`: number of messages from vehicles beyond MAX_VEHICLES.
     """
 
-    def __init__(self, keep: int = KEPT) -> None:
+    def __init__(self, keep: int = KEPT, *, reader: str = "reader") -> None:
         self._events: dict[int, Event] = {}
         self.vehicles: dict[str, Vehicle] = {}
         self.counts: Counter[tuple[str, Severity]] = Counter()
         self.reported = self.refused = 0
-        self._keep = keep
+        self._keep, self._reader = keep, reader
         self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # event numbers by vehicle
         self._common = Vehicle(ALL, self._record)  # conditions of the link and the reader
         self._dropped = self._most_present = 0
@@ -69,18 +70,22 @@ class EventLog:
         return self._common.conditions.get(("overload", ""))
 
     def add(
-        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0
-    ) -> None:
+        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0,
+        is_estimate: bool = False,
+    ) -> None:  # fmt: skip
         """Add a message: a model, a row, or a dict of fields.
 
-        `missing`: names of fields that were not provided. `lost`: messages lost before this one.
+        `missing`: names of fields that were not provided. `lost`: messages lost before this one; with `is_estimate`
+        about as many, of any topic, as in the vehicle's ULog stream.
         """
         vehicle = self.vehicles.get(address.vehicle)
         if vehicle is not None and not lost and vehicle.skips(address, time):  # most messages; needs no lock
             return
         with self._lock:
             if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
-                vehicle.add(address, message, time, missing, lost)
+                if lost:
+                    vehicle.count_lost(lost, "" if is_estimate else address.stream, time)
+                vehicle.add(address, message, time, missing)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
         """Record a logging dropout of a vehicle that starts at `time`."""
@@ -117,10 +122,10 @@ class EventLog:
             self._common.emit(Finding("link_down", change, link or "link restored", switch=True), "", time)
             if dropped > self._dropped or is_behind:
                 self._last_overload = time
-                text = "reader overloaded: messages are delayed or dropped"
+                text = f"{self._reader} overloaded: messages are delayed or dropped"
                 self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
             elif time - self._last_overload > PAUSE:
-                text = f"messages dropped so far: {dropped}; reader caught up"
+                text = f"messages dropped so far: {dropped}; {self._reader} caught up"
                 ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
                 self._common.emit(ended, "", time, changed=self._last_overload)
             self._dropped = dropped
@@ -179,7 +184,7 @@ class EventLog:
                 _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
             self.refused += 1
             return None
-        vehicle = self.vehicles[name] = Vehicle(name, self._record, self._common)
+        vehicle = self.vehicles[name] = Vehicle(name, self._record, self._common, first=time)
         return vehicle
 
     def _gone(self, time: float) -> list[tuple[float, str]]:

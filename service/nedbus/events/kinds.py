@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
-from .rules import EVIDENCE, FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, REJECTED
+from .rules import AID_SOURCES, EVIDENCE, FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, MINOR_AIDS, REJECTED
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
@@ -20,16 +20,17 @@ class Kind:
     always info. `message`: the PX4 message in which it is detected, "" for other sources.
     `causes`: kinds that may explain it. `row`: its row in plots, by default its name.
 
-    `fault`: `nedbus why` reports it, also once it has ended. `validity`: a quantity of the estimate is invalid.
+    `validity`: a quantity of the estimate is invalid. `usual`: normal in a flight that has it from its first message
+    on, as without GNSS: no fault and no part of the state then, but evidence.
     `correction`: the estimate is corrected; both starts and ends of conditions may explain it.
     `phase`: a phase of a flight, shown even if its severity is info.
+    `of_data`: it concerns the data, not the vehicle, and is no present fault in a verdict.
     `stateless`: it does not affect the vehicle's state. `kept_on_reboot`: a reboot does not end it.
 
     A kind with `flags` is a condition, active while any of these fields of the message equals `bad`; the values of
     `flags` are labels. Flags that change in the same message become one event.
     `begin`, `end`: event texts, with `{}` for the labels. `first`: text of the end of an initial condition.
     `minor`: flags whose start is info. `initial`: a flag that is bad in the first message begins a condition.
-    `once_armed`: if active in the first messages, it takes effect once the vehicle has been armed for PAUSE.
     """
 
     name: str
@@ -38,11 +39,11 @@ class Kind:
     causes: tuple[str, ...] = ()
     on_ground: Severity | None = None
     row: str = ""
-    fault: bool = False
     validity: bool = False
     correction: bool = False
     phase: bool = False
     stateless: bool = False
+    of_data: bool = False
     kept_on_reboot: bool = False
     flags: Mapping[str, str] = field(default_factory=dict)
     begin: str = ""
@@ -51,7 +52,7 @@ class Kind:
     bad: bool = True
     minor: frozenset[str] = frozenset()
     initial: bool = False
-    once_armed: bool = False
+    usual: bool = False
 
     def conditions(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the flags of an event, one condition each; `("",)` for a kind without flags."""
@@ -61,10 +62,11 @@ class Kind:
 _ESTIMATE: Final = "VehicleLocalPosition"
 _FLAGS: Final = "EstimatorStatusFlags"
 _GPS: Final = "SensorGps"
+_STATUS: Final = "VehicleStatus"
 _JAMMED: Final = ("jamming", "spoofing")
 _SENSING: Final = (
-    "no_messages", "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided",
-    "innovation_rejected", "estimator_fault", "ekf_changed",
+    "no_messages", "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided", "aid_rejected",
+    "aid_unused", "vision_unused", "innovation_rejected", "estimator_fault", "ekf_changed", "transition",
 )  # fmt: skip
 _CONTRADICTED: Final = ("height_contradicted", "position_contradicted")
 _INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning", *_CONTRADICTED)
@@ -72,7 +74,7 @@ _INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "de
 
 def _validity(name: str, flag: str, quantity: str, *causes: str) -> Kind:
     return Kind(
-        name, "bad", _ESTIMATE, ("text", *_SENSING, *causes, "reboot"), fault=True, validity=True,
+        name, "bad", _ESTIMATE, ("text", *_SENSING, *causes, "reboot"), validity=True,
         flags={flag: quantity}, bad=False, initial=True, begin=f"{quantity} not valid", end=f"{quantity} valid again",
         first=f"{quantity} valid for the first time",
     )  # fmt: skip
@@ -81,70 +83,79 @@ def _validity(name: str, flag: str, quantity: str, *causes: str) -> Kind:
 def _not_global(quantity: str) -> Kind:
     return Kind(
         f"{quantity}_not_global", "watch", _ESTIMATE, _SENSING, on_ground="info",
-        flags={f"{quantity}_global": quantity}, initial=True, once_armed=True,
+        flags={f"{quantity}_global": quantity}, initial=True, usual=True,
         bad=False, begin=f"{quantity} has no global reference", end=f"{quantity} has a global reference",
     )  # fmt: skip
 
 
 _ROWS: Final = (
-    Kind("duplicate", "bad", fault=True, kept_on_reboot=True),
-    Kind("gone", "bad", causes=("link_down", "battery", "silent"), fault=True, kept_on_reboot=True),
-    Kind("silent", "bad", causes=("link_down", "battery", "overload"), fault=True, kept_on_reboot=True),
+    Kind("duplicate", "bad", kept_on_reboot=True),
+    Kind("gone", "bad", causes=("link_down", "battery", "silent"), kept_on_reboot=True),
+    Kind("silent", "bad", causes=("link_down", "battery", "overload"), kept_on_reboot=True),
     Kind("link_down", "bad"),
-    Kind("reboot", "bad", causes=("duplicate", "battery", "gone", "silent"), fault=True, phase=True),
+    Kind("reboot", "bad", causes=("duplicate", "battery", "gone", "silent"), phase=True),
     _validity("xy_invalid", "xy_valid", "xy", "dead_reckoning"),
     _validity("z_invalid", "z_valid", "z"),
     _validity("v_xy_invalid", "v_xy_valid", "vxy", "dead_reckoning"),
     _validity("v_z_invalid", "v_z_valid", "vz"),
     *(
-        Kind(name, "bad", _ESTIMATE, ("text", *_SENSING, "dead_reckoning", "reset", "jump"), "info", fault=True)
+        Kind(name, "bad", _ESTIMATE, ("text", *_SENSING, "dead_reckoning", "reset", "jump"), "info")
         for name in _CONTRADICTED
     ),
     Kind(
-        "failsafe", "bad", "VehicleStatus", ("text", *_INVALID, *_SENSING, "failsafe_flag", "gcs_lost", "battery"),
-        fault=True, flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe cleared",
+        "failsafe", "bad", _STATUS, ("text", *_INVALID, *_SENSING, "failsafe_flag", "gcs_lost", "battery"),
+        flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe cleared",
     ),
-    Kind("battery", "bad", "BatteryStatus", ("text",), fault=True),
+    Kind("battery", "bad", "BatteryStatus", ("text",)),
     Kind(
         "dead_reckoning", "watch", _ESTIMATE, ("text", *_SENSING), flags={"dead_reckoning": "dead reckoning"},
         initial=True, begin="dead reckoning", end="dead reckoning ended",
     ),
     Kind(
-        "estimator_fault", "watch", _FLAGS, ("text",), flags=FAULTS, initial=True, begin="EKF fault: {}",
-        end="EKF fault cleared: {}",
-    ),
-    Kind("text", "watch", "LogMessage", row="PX4", phase=True, stateless=True),
-    Kind("ekf_changed", "watch", causes=("text", "estimator_fault", "innovation_rejected"), on_ground="info"),
-    Kind(
         "no_messages", "watch", causes=("text", "link_down"), on_ground="info", flags={name: name for name in EVIDENCE},
         begin="no {} message", end="{} messages resumed",
     ),
-    Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites"), once_armed=True),
+    Kind("text", "watch", "LogMessage", ("no_messages", "ekf_changed"), row="PX4", phase=True, stateless=True),
+    Kind(
+        "reset", "watch", _ESTIMATE, ("text", *_SENSING, *_INVALID, "origin_set", "origin_moved"), on_ground="info",
+        correction=True,
+    ),
+    Kind("jump", "watch", _ESTIMATE, ("text", "duplicate", *_SENSING, *_INVALID), correction=True),
+    Kind("ekf_changed", "watch", causes=("text", "estimator_fault", "innovation_rejected"), on_ground="info"),
+    Kind(
+        "estimator_fault", "watch", _FLAGS, ("text",), flags=FAULTS, initial=True, begin="EKF fault: {}",
+        end="EKF fault cleared: {}",
+    ),
+    Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites"), usual=True),
     Kind("few_satellites", "watch", _GPS, _JAMMED),
     Kind("jamming", "watch", _GPS, ("text",)),
     Kind("spoofing", "watch", _GPS, ("text",)),
+    Kind("origin_contradicted", "watch", _ESTIMATE, ("text", "origin_set", "origin_moved"), "info"),
     Kind("not_aided", "watch", _FLAGS, on_ground="info"),
+    Kind(
+        "aid_rejected", "watch", causes=("text", "gps_fix_lost", "gps_fix", *_JAMMED, "estimator_fault"),
+        on_ground="info", flags=AID_SOURCES, minor=MINOR_AIDS, begin="EKF rejects {}", end="EKF accepts {} again",
+    ),
+    Kind(
+        "vision_unused", "watch", causes=("text", "aid_rejected", "aid_unused", "estimator_fault"), on_ground="info",
+    ),
     Kind(
         "innovation_rejected", "watch", _FLAGS, ("gps_fix_lost", "gps_fix", *_JAMMED, "estimator_fault"),
         flags=REJECTED, begin="EKF rejects {}", end="EKF accepts {} again",
     ),
     Kind(
         "not_fused", "watch", _FLAGS,
-        ("no_messages", "gps_fix_lost", "few_satellites", *_JAMMED, "innovation_rejected", "estimator_fault"),
+        ("no_messages", "gps_fix_lost", "few_satellites", *_JAMMED, "aid_rejected", "innovation_rejected",
+         "estimator_fault"),
         on_ground="info",
         flags=FUSED, bad=False, minor=frozenset(HEIGHTS), begin="EKF stopped fusing {}", end="EKF started fusing {}",
     ),
     _not_global("xy"),
     _not_global("z"),
-    Kind("jump", "watch", _ESTIMATE, ("text", "duplicate", *_SENSING, *_INVALID), correction=True),
-    Kind(
-        "reset", "watch", _ESTIMATE, ("text", *_SENSING, *_INVALID, "origin_set", "origin_moved"), on_ground="info",
-        correction=True,
-    ),
     Kind("origin_moved", "watch", _ESTIMATE, (*_SENSING, "reset"), on_ground="info", correction=True),
     Kind("origin_set", "info", _ESTIMATE, _SENSING, correction=True),
     Kind(
-        "gcs_lost", "watch", "VehicleStatus", ("text",), on_ground="info",
+        "gcs_lost", "watch", _STATUS, ("text",), on_ground="info",
         flags={"gcs_connection_lost": "GCS connection"},
         begin="GCS connection lost", end="GCS connection regained",
     ),
@@ -152,9 +163,14 @@ _ROWS: Final = (
         "failsafe_flag", "watch", "FailsafeFlags", ("text", *_INVALID, *_SENSING), on_ground="info",
         flags=FAILSAFE_FLAGS, begin="failsafe flags: {}", end="failsafe flags cleared: {}",
     ),
-    Kind("lost", "watch", causes=("link_down", "overload")),
-    Kind("rejected", "watch", kept_on_reboot=True),
-    Kind("overload", "watch", fault=True),
+    Kind("lost", "watch", causes=("link_down", "overload"), of_data=True),
+    Kind("rejected", "watch", of_data=True, kept_on_reboot=True),
+    Kind("overload", "watch"),
+    Kind(
+        "aid_unused", "info", causes=("text",), flags=AID_SOURCES, begin="EKF receives {}, but does not fuse it",
+        end="EKF fuses {}",
+    ),
+    Kind("transition", "info", _STATUS, ("text", "mode"), phase=True),
     Kind(
         "heading_not_good", "info", _ESTIMATE, (*_SENSING, "reset", "landed"),
         flags={"heading_good_for_control": "heading"}, bad=False, begin="heading not good for control",
@@ -166,10 +182,11 @@ _ROWS: Final = (
         end="distance to ground valid",
     ),
     Kind("gps_fix", "info", _GPS, ("few_satellites", *_JAMMED), phase=True),
-    Kind("mode", "info", "VehicleStatus", ("text", "failsafe", "failsafe_flag", "xy_invalid", "z_invalid"), phase=True),
-    Kind("armed", "info", "VehicleStatus", row="armed, landed", phase=True),
+    Kind("mode", "info", _STATUS, ("text", "failsafe", "failsafe_flag", "xy_invalid", "z_invalid"), phase=True),
+    Kind("vehicle_type", "info", _STATUS, ("transition",), phase=True),
+    Kind("armed", "info", _STATUS, row="armed, landed", phase=True),
     Kind(
-        "disarmed", "info", "VehicleStatus", ("text", "landed", "failsafe", "failsafe_flag", "estimator_fault"),
+        "disarmed", "info", _STATUS, ("text", "landed", "failsafe", "failsafe_flag", "estimator_fault"),
         row="armed, landed", phase=True,
     ),
     Kind("takeoff", "info", "VehicleLandDetected", row="armed, landed", phase=True),

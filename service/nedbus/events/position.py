@@ -9,9 +9,9 @@ from nedbus_msgs import JUMP_FIELDS, RESET_COUNTERS, Quantity, jump_of
 from nedbus_msgs.frames import MapProjection
 
 from .detectors import ChangeDetector, Fields, Finding, detect_flags, read_fields
-from .event import ALONE
+from .event import ALONE, Event
 from .kinds import Severity, flagged
-from .rules import JUMP_DISTANCE, JUMP_SHARE, MAX_ALONE, SMALL_RESET
+from .rules import JUMP_DISTANCE, JUMP_SHARE, LARGE_CORRECTION, MAX_ALONE, SMALL_RESET
 
 _KINDS: Final = flagged("VehicleLocalPosition")
 _COMPARED: Final = (
@@ -105,23 +105,44 @@ class PositionDetector(ChangeDetector):
             seconds = self.stamp / 1e6 - jump[0]
             text = f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
-            yield Finding("jump", "once", text, numbers=numbers)
+            yield Finding("jump", "once", text, numbers=numbers, is_large=distance >= LARGE_CORRECTION)
 
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
     numbers: dict[str, float] = {}
     known, unknown = [], []
     for name in quantities:
-        if (size := jump_of(name, before, after)) is None:
+        size = jump_of(name, before, after)
+        if size is None:
             unknown.append(f"{name} by an unknown amount")
             continue
-        names, text = _RESETS[name]
-        values = dict(zip(names, (-each if name in ("z", "vz") else each for each in size), strict=True))
-        numbers |= values
-        known.append(text.format(**values, size=math.hypot(*size), degrees=math.degrees(size[0])))
-    is_small = not unknown and all(abs(each) < SMALL_RESET for name, each in numbers.items() if name != "heading")
+        up = [-value for value in size] if name in ("z", "vz") else size
+        numbers |= zip(_RESETS[name][0], up, strict=True)
+        known.append(_describe(name, numbers))
+    sizes = [abs(size) for name, size in numbers.items() if name != "heading"]
+    is_small = not unknown and all(size < SMALL_RESET for size in sizes)
+    is_large = any(size >= LARGE_CORRECTION for size in sizes)
     text = f"reset of {', '.join(known + unknown)}"
-    return Finding("reset", "once", text, tuple(quantities), numbers, severity="info" if is_small else None)
+    severity: Severity | None = "info" if is_small else None
+    return Finding("reset", "once", text, tuple(quantities), numbers, severity=severity, is_large=is_large)
+
+
+def _describe(name: Quantity, numbers: Mapping[str, float]) -> str:
+    """Return the text for a quantity of a reset, whose `numbers` have its sizes."""
+    names, text = _RESETS[name]
+    sizes = {each: numbers[each] for each in names}
+    return text.format(**sizes, size=math.hypot(*sizes.values()), degrees=math.degrees(sizes[names[0]]))
+
+
+def large_part(reset: Event) -> str:
+    """Return the text of a reset, without the quantities that a large one moved little."""
+    sizes = {
+        name: math.hypot(*(reset.numbers[each] for each in _RESETS[name][0]))
+        for name in _RESETS
+        if name != "heading" and name in reset.names and reset.numbers.keys() >= {*_RESETS[name][0]}
+    }
+    large = [name for name, size in sizes.items() if size >= LARGE_CORRECTION]
+    return f"reset of {', '.join(_describe(name, reset.numbers) for name in large)}" if large else reset.text
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:

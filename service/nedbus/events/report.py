@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
@@ -29,6 +30,7 @@ class VehicleReport:
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
     `unknown`: flags that its position does not provide. `kinds`: kinds of all active conditions.
+    `first`: time of the first message that the service received, None if unknown.
     """
 
     severity: Literal["bad", "watch", "info"]
@@ -40,6 +42,7 @@ class VehicleReport:
     has_position: bool = False
     held: tuple[Condition, ...] = ()
     unknown: tuple[str, ...] = ()
+    first: Seconds | None = None
 
     @property
     def is_silent(self) -> bool:
@@ -71,7 +74,10 @@ class AccountReport:
         ]
 
 
-_REPORT: Final = TypeAdapter(AccountReport)
+@cache
+def _report_type() -> TypeAdapter[AccountReport]:
+    """Return the validation of a reply; Pydantic takes 30 ms to compile it, so it waits for the first reply."""
+    return TypeAdapter(AccountReport)
 
 
 def report_of(
@@ -89,12 +95,14 @@ def report_of(
         held = list(vehicle.conditions.items())
         flags = {flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if KINDS[kind].validity}
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
-        bad = (each for _, each in held if each.severity != "info")
+        known = [condition for _, condition in held] + [*vehicle.usual.values()]
+        bad = (condition for condition in known if condition.severity != "info")
         unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))
         vehicles[name] = VehicleReport(
             state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
             tuple(sorted(vehicle.topics, key=lambda each: (each not in TOPICS, each)))[:_MAX_TOPICS],
             vehicle.main is not None, tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
+            max(0.0, vehicle.first + to_utc),
         )  # fmt: skip
     return AccountReport(service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events))
 
@@ -118,6 +126,6 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 def from_json(content: object) -> AccountReport | None:
     """Validate the reply of a peer; return None if it is not a report, for example from an older service."""
     try:
-        return _REPORT.validate_python(content)
+        return _report_type().validate_python(content)
     except ValidationError:
         return None

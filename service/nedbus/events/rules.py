@@ -36,6 +36,26 @@ REJECTED: Final = {
     "reject_airspeed": "airspeed", "reject_sideslip": "sideslip", "reject_hagl": "height above ground",
     "reject_optflow_x": "optical flow x", "reject_optflow_y": "optical flow y",
 }  # fmt: skip
+_AID: Final = "estimator_aid_src_"
+MINOR_AIDS: Final = frozenset({
+    f"{_AID}gnss_yaw", f"{_AID}baro_hgt", f"{_AID}rng_hgt", f"{_AID}mag", f"{_AID}terrain_range_finder",
+})  # fmt: skip
+"""Topics of AID_SOURCES whose rejection alone leaves the position as it is."""
+AID_SOURCES: Final[Mapping[str, str]] = {
+    f"{_AID}ev_pos": "vision position", f"{_AID}ev_hgt": "vision height", f"{_AID}ev_vel": "vision velocity",
+    f"{_AID}ev_yaw": "vision yaw", f"{_AID}gnss_pos": "GNSS position", f"{_AID}gnss_vel": "GNSS velocity",
+    f"{_AID}gnss_hgt": "GNSS height", f"{_AID}gnss_yaw": "GNSS yaw", f"{_AID}optical_flow": "optical flow",
+    f"{_AID}aux_global_position": "auxiliary position", f"{_AID}baro_hgt": "baro height",
+    f"{_AID}rng_hgt": "range height", f"{_AID}terrain_range_finder": "range finder", f"{_AID}mag": "magnetometer",
+}  # fmt: skip
+"""Measurements that the EKF may fuse, by topic: PX4's EstimatorAidSource1d, 2d and 3d (1.14 and later)."""
+VISION: Final = ("vehicle_visual_odometry",)
+"""Topics of positions sent into the vehicle that EKF2 reads; it does not read vehicle_mocap_odometry."""
+AID_HOLD: Final = 0.5  # s for which all messages of an aid source agree before it counts as fused, rejected or unused
+AID_COUNT: Final = 3  # ... and their minimum number
+AID_PAUSE: Final = 1.0  # s without messages after which an aid source has stopped, and is judged anew
+VISION_HOLD: Final = 1.5  # s in which vision arrives without being fused; PX4 starts to fuse it within 0.5 s
+
 _FAILSAFE_FLAGS: Final = (
     "angular_velocity_invalid", "attitude_invalid", "local_altitude_invalid", "local_position_invalid",
     "local_position_invalid_relaxed", "local_velocity_invalid", "global_position_invalid",
@@ -51,13 +71,22 @@ FAILSAFE_FLAGS: Final[Mapping[str, str]] = {
     "fd_alt_loss": "uncommanded altitude loss",
 }  # fmt: skip
 
+SUBJECTS: Final[Mapping[str, str]] = {
+    "accelerometer": r"\baccel|acc \d", "airspeed": "airspeed", "barometer": r"\bbaro", "battery": "battery",
+    "EKF": "primary EKF", "GNSS": r"\bgps|gnss|satellite", "gyro": r"\bgyro", "heading": "heading|yaw",
+    "height": r"height|altitude|vertical|\bv?z\b", "magnetometer": r"\bmag|compass", "optical flow": "flow",
+    "position": r"position|dead reckoning|\bv?xy\b", "range finder": r"\brange|distance sensor",
+    "vision": "vision|odometry",
+}  # fmt: skip
+"""Sensors and quantities, with patterns of the words for them in texts of PX4 and nedbus."""
+
 POSITIONS: Final = ("vehicle_local_position", "external_ins_local_position", "estimator_local_position")
 """Topics with position validity flags, in order of preference."""
 
 EVIDENCE: Final[Mapping[str, tuple[str, ...]]] = {
     "GPS": ("vehicle_gps_position", "sensor_gps"), "barometer": ("vehicle_air_data",),
-    "estimator flags": ("estimator_status_flags",), "vehicle status": ("vehicle_status",),
-    "failsafe flags": ("failsafe_flags",), "battery": ("battery_status",),
+    "magnetometer": ("vehicle_magnetometer",), "estimator flags": ("estimator_status_flags",),
+    "vehicle status": ("vehicle_status",), "failsafe flags": ("failsafe_flags",), "battery": ("battery_status",),
 }  # fmt: skip
 """What a verdict rests on besides the position, with its topics in order of preference, one of which suffices."""
 
@@ -72,7 +101,8 @@ JAMMING_BEGIN: Final = 80  # jamming_indicator; "too high" in PX4's guide to fli
 JAMMING_END: Final = 60
 JUMP_DISTANCE: Final = 1.0  # m of unexplained motion, plus JUMP_SHARE of the distance flown
 JUMP_SHARE: Final = 0.2
-LARGE_CORRECTION: Final = 10.0  # m or m/s; unless a fault is bad, a larger reset or jump comes first in the verdict
+LARGE_CORRECTION: Final = 10.0  # m or m/s; while armed, a reset or jump of this size is bad
+RECOVERY: Final = 1.0  # s after an invalid estimate in which a large correction is its recovery, and not bad
 SMALL_RESET: Final = 0.5  # m or m/s; a smaller reset is info
 # A reference contradicts a valid estimate if they differ by more than the limit plus HEIGHT_SHARE of the height, SIGMAS
 # times the GNSS accuracy, and the distance flown in GNSS_DELAY. Healthy logs: up to 2.9 m in height, 2.2 m at 18 m/s.
@@ -82,9 +112,14 @@ POSITION_LIMIT: Final = 4.0  # m
 GNSS_DELAY: Final = 0.5  # s
 SIGMAS: Final = 3.0
 UNKNOWN_ACCURACY: Final = 10.0  # m, in place of a missing eph or epv
-CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all references must disagree with the estimate
-FLAPPING_CHANGES: Final = 4, 20  # per condition and per kind, in WINDOW; beyond that, only the last is reported
-MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; beyond that, only the last is reported
+CONTRADICTED: Final = {"height": 1.5, "position": 3.0, "origin": 3.0}  # s for which all references must disagree
+ATMOSPHERE_SHARE: Final = 0.15  # of the height climbed; see `atmosphere_error`
+TROPOPAUSE: Final = 11_000.0  # m; PX4 computes the barometer's height with the lapse rate below it
+# Events within WINDOW; beyond these numbers, only the last one is reported.
+CONDITION_CHANGES: Final = 4  # of one condition
+KIND_CHANGES: Final = 20  # of the conditions of one kind
+EQUAL_EVENTS: Final = 10  # single events of one kind, severity and quantities, or with one text
+SINGLE_EVENTS: Final = 200  # single events of one kind
 PERIODIC: Final = ("VehicleLocalPosition", "SensorGps", "BatteryStatus")  # PX4 sends the others when they change
 MAX_ALONE: Final = 0.4  # s; a condition of a PERIODIC message that ends this soon, with the next one, may be wild
 PAUSE: Final = 5.0  # s without a recurrence after which flapping, losses, rejections or an overload have ended
@@ -97,6 +132,9 @@ MODES: Final[Mapping[int, str]] = {
     **{number: f"External {number - 22}" for number in range(23, 31)},
 }  # fmt: skip
 """Flight mode names by nav_state, as in QGroundControl."""
+
+VEHICLE_TYPES: Final[Mapping[int, str]] = {0: "unspecified", 1: "rotary wing", 2: "fixed wing", 3: "rover"}
+"""Vehicle types by vehicle_type of VehicleStatus."""
 
 FIXES: Final[Mapping[int, str]] = {
     0: "none", 1: "none", 2: "2D", 3: "3D", 4: "DGPS", 5: "RTK float", 6: "RTK fixed", 8: "extrapolated",

@@ -2,18 +2,18 @@
 
 import math
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from .event import WINDOW, Condition, Event, State, explain, state_of, without_wild
-from .kinds import KINDS, importance
-from .rules import EVIDENCE, RECENT
+from .event import LATE, WINDOW, Condition, Event, State, explain, rank, state_of, without_wild
+from .kinds import KINDS
+from .rules import AID_SOURCES, EVIDENCE, RECENT, VISION
 from .times import Times
 
 TOGETHER: Final = 1.0  # s; maximum time between the starts of conditions of one story
 _INVALID: Final = " not valid"
-_UNNEEDED: Final = ("barometer", "battery")  # EVIDENCE that does not explain an invalid estimate
+_UNNEEDED: Final = ("barometer", "magnetometer", "battery")  # EVIDENCE that does not explain an invalid estimate
 _SENSOR_FAILURE: Final = re.compile(r"#\d+ fail(ed|ure):")  # PX4's "MAG #0 failed: STALE!", and its event for it
 
 
@@ -28,6 +28,11 @@ class Span(Condition):
     def is_of_estimate(self) -> bool:
         """True if it is a fault of the position estimate."""
         return KINDS[self.kind].message == "VehicleLocalPosition"
+
+    @property
+    def is_usual(self) -> bool:
+        """True if it belongs to the flight, as the missing global reference of a flight without GNSS."""
+        return self.initial and KINDS[self.kind].usual
 
     def holds(self, time: float) -> bool:
         """Return True if the condition is active at `time`, or the single event is recent."""
@@ -44,6 +49,7 @@ class Story:
     `begin`: the event that began it, None if it was active in the first message. `end`: the event that ended it.
     `before`: the evidence, oldest first. `meanwhile`: other events during the fault. `after`: events at its end.
     `lacking`: topics that may hold evidence, but are missing from the data.
+    `in_flight`: it lasted into a flight, or the data does not tell.
     """
 
     spans: tuple[Span, ...]
@@ -56,11 +62,22 @@ class Story:
     meanwhile: tuple[Event, ...]
     after: tuple[Event, ...]
     lacking: tuple[str, ...]
+    in_flight: bool = True
 
     @property
     def is_bad(self) -> bool:
         """True if any of its conditions is bad."""
         return any(each.severity == "bad" for each in self.spans)
+
+    @property
+    def kind(self) -> str:
+        """The kind of its main condition."""
+        return self.spans[0].kind
+
+    @property
+    def rank(self) -> tuple[int, int, float]:
+        """Sort key, worst first."""
+        return rank(self.spans[0], self.until)
 
     def has_ended(self, now: float) -> bool:
         """Return True if it is over, and not a single event of the last minute."""
@@ -84,32 +101,55 @@ def stories_of(
 ) -> list[Story]:
     """Return the stories of one vehicle in chronological order; [] if it has no faults.
 
+    Each event of severity bad or watch, other than a text, begins a story or is in one: as one of its conditions, as
+    evidence, or as an event during it or at its end. So does each text that `is_alarm`.
+
     `events`: all events of the vehicle, in order. `conditions`: conditions active after the last event.
     `topics`: published topics. `at`: return the stories active at this time, else the last one before, else the first.
     """
     events = without_wild(events)
-    spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
-    chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
-    if not any(span.until is None if at is None else span.holds(at) for span in chosen):
-        others = [s for s in spans if s.severity != "info" and not (KINDS[s.kind].fault or KINDS[s.kind].stateless)]
-        chosen += [s for s in others if s.until is None] if chosen and at is None else others
-    chosen += [replace(span, severity="watch") for span in spans if _is_alarm(span.begin)]
+    spans = spans_of(events, conditions)
+    faults = [_as_fault(span) for span in spans if _is_fault(span)]
+    chosen = sorted(faults, key=lambda span: rank(span, span.until))
+    flights = [*_flights(events)]
     stories: list[Story] = []
     while chosen:
         group = _together(chosen[0], chosen)
-        stories.append(_make_story(group, spans, events, topics))
+        stories.append(_make_story(group, spans, events, topics, flights))
         chosen = [span for span in chosen if span not in group]
-    stories.sort(key=lambda story: story.since)
-    if at is None:
-        return _without_parts(stories)
-    held = [story for story in stories if story.since <= at and (story.until is None or at <= story.until)]
-    return held or [story for story in stories if story.since <= at][-1:] or stories[:1]
+    if at is not None:
+        stories.sort(key=lambda story: story.since)
+        held = [story for story in stories if story.since <= at and (story.until is None or at <= story.until)]
+        stories = held or [story for story in stories if story.since <= at][-1:] or stories[:1]
+    return sorted(_without_parts(stories), key=lambda story: story.since)
 
 
-def _is_alarm(event: Event) -> bool:
+def events_outside(stories: Iterable[Story], events: Iterable[Event]) -> list[Event]:
+    """Return the events of severity bad and watch that are in no story: texts of PX4."""
+    told = set[Event]()
+    for story in stories:
+        told.update(story.before, story.meanwhile, story.after)
+        for span in story.spans:
+            told.add(span.begin)
+    return [event for event in without_wild(events) if event.severity != "info" and event not in told]
+
+
+def is_alarm(event: Event) -> bool:
     """Return True for PX4's text about a failed sensor, or of severity critical and worse while armed."""
     is_critical = event.severity == "bad" and "armed" in event.numbers
     return event.kind == "text" and (is_critical or _SENSOR_FAILURE.search(event.text) is not None)
+
+
+def _is_fault(span: Span) -> bool:
+    if span.kind == "text":
+        return is_alarm(span.begin)
+    has_ended_early = span.initial and span.end is not None  # as the invalid estimate of a vehicle that boots
+    return span.severity != "info" and not span.is_usual and not has_ended_early
+
+
+def _as_fault(span: Span) -> Span:
+    """Return a text as a watch condition: PX4 reports a failure, but the estimate may be sound."""
+    return replace(span, severity="watch") if span.kind == "text" else span
 
 
 def story_of(
@@ -169,16 +209,36 @@ def state_at(spans: Iterable[Span], time: float) -> State:
     return state_of(span for span in spans if span.holds(time))
 
 
+def _flights(events: Iterable[Event]) -> Iterator[tuple[float, float]]:
+    """Yield begin and end of each flight: from take-off, or from arming if the data has none, to disarming or a reboot.
+
+    A landing is no end: a failed estimate can cause a false one in the air.
+    """
+    armed = took_off = None
+    is_known = False
+    for event in events:
+        if event.kind == "armed":
+            armed = event.time
+        elif event.kind == "takeoff" and took_off is None:
+            took_off = event.time
+        elif event.kind == "disarmed" or (event.kind == "reboot" and armed is not None):
+            begin = took_off if took_off is not None else armed
+            yield -math.inf if begin is None else begin, event.time
+            armed = took_off = None
+            is_known = True
+    begin = took_off if took_off is not None else armed
+    if begin is not None or not is_known:
+        yield -math.inf if begin is None else begin, math.inf
+
+
 def _make_story(
-    group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str]
-) -> Story:
+    group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str],
+    flights: Sequence[tuple[float, float]] = (),
+) -> Story:  # fmt: skip
     """Return the story of a group of conditions; start and evidence are those of the first one."""
     span = group[0]
     until = None if any(each.until is None for each in group) else max(each.until or 0.0 for each in group)
     end = next((each.end for each in group if each.end is not None and each.until == until), None)
-    what = "; ".join(dict.fromkeys(each.begin.words if each.kind == "text" else each.text for each in group))
-    if all(each.text.endswith(_INVALID) for each in group):
-        what = what.replace(f"{_INVALID}; ", " and ")
     used = {event for each in group for event in (each.begin, each.end) if event is not None}
 
     def unused(found: Iterable[Event]) -> list[Event]:
@@ -186,45 +246,103 @@ def _make_story(
         used.update(new)
         return new
 
-    near = [each for each in events if span.since - WINDOW <= each.time <= span.since]
-    held = (s for s in spans if s.initial == span.initial and s.since <= span.since < (s.until or math.inf))
-    before = unused(explain(span.begin, [] if span.initial else near, held))
-    if not before and not span.initial:
-        before = unused(e for e in near if e.change != "end" and not (KINDS[e.kind].phase and e.severity == "info"))
+    before = unused(_evidence(span, spans, events))
     after = unused(explain(end, events)) if end else []
+    stop = math.inf if until is None else until
     begun = (each for each in events if each.change != "end" and (each.severity != "info" or each.kind == "mode"))
     notable = [each for each in begun if each not in used]
-    stop = math.inf if until is None else until
     after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
-    lacking: list[str] = []
-    if span.is_of_estimate and span.severity != "info":
-        needed = (each for name, each in EVIDENCE.items() if name not in _UNNEEDED)
-        lacking = [each[0] for each in needed if set(each).isdisjoint(topics)]
+    meanwhile = [each for each in notable if span.since <= each.time < stop]
+    in_flight = not flights or any(begin <= stop and span.since <= end for begin, end in flights)
     return Story(
-        tuple(group), what, span.since, until, None if span.initial else span.begin, end, tuple(before),
-        tuple(each for each in notable if span.since <= each.time < stop), tuple(after), tuple(lacking),
+        tuple(group), _text_of(group), span.since, until, None if span.initial else span.begin, end, tuple(before),
+        tuple(meanwhile), tuple(after), _lacking(span, topics), in_flight,
     )  # fmt: skip
 
 
+def _text_of(group: Sequence[Span]) -> str:
+    texts = [span.begin.words if span.kind == "text" else span.text for span in group]
+    text = "; ".join(dict.fromkeys(texts))
+    if all(span.text.endswith(_INVALID) for span in group):
+        return text.replace(f"{_INVALID}; ", " and ")
+    return text
+
+
+def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> list[Event]:
+    """Return the possible causes of a condition; without any, all other starts of the ten seconds before it."""
+    held = [
+        other
+        for other in spans
+        if (other.initial or not span.initial) and other.since <= span.since < (other.until or math.inf)
+    ]
+    if span.initial:
+        return explain(span.begin, (), held)
+    recovered = {
+        other.begin
+        for other in spans
+        if other.end is not None and other.until is not None and other.until < span.since - TOGETHER
+    }
+    near = [event for event in events if span.since - WINDOW <= event.time <= span.since + LATE]
+    causes = [
+        cause
+        for cause in explain(replace(span.begin, time=span.since), near, held, late=LATE)
+        if not (cause.kind == "text" and cause.time > span.since) and cause not in recovered
+    ]
+    if span.kind == "text":
+        causes += [event for event in near if event.kind == "text" and event.severity != "info"]
+        causes = sorted((cause for cause in causes if cause.time <= span.since), key=lambda cause: cause.time)
+    if causes:
+        return causes
+    others = [
+        event
+        for event in near
+        if event is not span.begin
+        and event.change != "end"
+        and event.time < span.since
+        and (event.severity != "info" or not _is_routine(event))
+    ]
+    return [event for event in others if event.severity != "info"] or others
+
+
+def _is_routine(event: Event) -> bool:
+    return KINDS[event.kind].phase or event.is_minor
+
+
+def _lacking(span: Span, topics: Collection[str]) -> tuple[str, ...]:
+    """Return the topics that may explain a fault of the estimate, but are missing from the data."""
+    if not span.is_of_estimate or span.severity == "info" or span.kind == "origin_contradicted":
+        return ()
+    needed = {name: choices for name, choices in EVIDENCE.items() if name not in _UNNEEDED}
+    if not {*VISION, *(topic for topic in AID_SOURCES if "_ev_" in topic)}.isdisjoint(topics):
+        del needed["GPS"]  # a flight with vision needs none
+    return tuple(choices[0] for choices in needed.values() if set(choices).isdisjoint(topics))
+
+
 def _without_parts(stories: Sequence[Story]) -> list[Story]:
-    """Drop stories that are part of an earlier bad story, or evidence for a bad story."""
+    """Drop stories that are part of a worse one."""
     kept: list[Story] = []
-    for story in stories:
-        if not any(_is_part(story, each) for each in kept):
+    for story in sorted(stories, key=lambda story: story.rank):
+        if not any(_is_part(story, worse) for worse in kept):
             kept.append(story)
-    causes = {event for story in kept if story.is_bad for event in story.before}
-    return [story for story in kept if story.is_bad or story.spans[0].begin not in causes]
+    return kept
 
 
-def _is_part(story: Story, of: Story) -> bool:
-    """Return True if a story is part of a bad one; not if it is still active, or bad and more important or longer."""
-    begin, kind = story.spans[0].begin, story.spans[0].kind
-    if not of.is_bad or begin not in (*of.before, *of.meanwhile, *of.after):
-        return False
+def _is_part(story: Story, worse: Story) -> bool:
+    """Return True if a story is evidence for a worse one, or a consequence of a bad one; not if it outlasts that."""
+    begin = story.spans[0].begin
     is_bad_estimate = story.is_bad and story.spans[0].is_of_estimate
-    outlasts = of.until is not None and (story.until is None or (is_bad_estimate and story.until > of.until + TOGETHER))
-    is_worse = story.is_bad and importance(kind) < importance(of.spans[0].kind)
-    return not (outlasts or is_worse)
+    outlasts = worse.until is not None and (
+        story.until is None or (is_bad_estimate and story.until > worse.until + TOGETHER)
+    )
+    if outlasts:
+        return False
+    if begin in worse.before and story.kind in KINDS[worse.kind].causes:
+        return True
+    if not worse.is_bad or begin not in (*worse.meanwhile, *worse.after):
+        return False
+    is_consequence = worse.kind in KINDS[story.kind].causes
+    is_alarm_of_sensor = story.kind == "text" and _SENSOR_FAILURE.search(begin.text) is not None
+    return is_consequence or (not is_alarm_of_sensor and (story.kind == "text" or not story.is_bad))
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
+from nedbus.clock import format_duration
 from nedbus_msgs import is_unix_time
 
 from .event import Event
@@ -66,6 +67,10 @@ class Times:
             return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
         return format_utc(utc)
 
+    def text_at(self, time: float) -> str:
+        """Format a time of live data on the event log's clock [s], as UTC."""
+        return format_utc(time + self.ahead)
+
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
         """Format a period and its duration [s]; `begin` and `end` are None if they are outside the data."""
         still = f"until {'now' if self.is_live else 'the end'}"
@@ -116,15 +121,6 @@ def format_utc(utc: float) -> str:
     """Format a Unix time as UTC, such as 14:05:12.3."""
     tenths = round(utc * 10)
     return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"
-
-
-def format_duration(seconds: float) -> str:
-    """Format a duration [s] in ms, s, min or h."""
-    if seconds < 1:
-        return f"{max(0.0, seconds) * 1e3:.0f} ms"
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
 
 
 def format_since(since: float | None, now: float) -> str:

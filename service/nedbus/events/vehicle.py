@@ -11,15 +11,19 @@ from statistics import median
 from typing import Final
 
 from nedbus.timeline import is_boot_possible
-from nedbus_msgs import BY_TOPIC, Address, FieldReader
+from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
 
 from . import detectors, rules
-from .contradictions import REFERENCES, Comparison, ReferenceDetector
-from .detectors import ChangeDetector, Fields, Finding
-from .event import ALONE, WINDOW, Condition, Event, State, explain, state_of, without_wild
-from .kinds import KINDS
+from .contradictions import AIR_DATA, REFERENCES, Comparison, ReferenceDetector
+from .detectors import AidDetector, ChangeDetector, Fields, Finding, VisionDetector
+from .event import ALONE, SUPPRESSED, WINDOW, Condition, Event, State, explain, state_of, without_wild
+from .kinds import KINDS, Severity
 from .position import PositionDetector
 from .times import format_duration
+
+MAGNETOMETER: Final = "vehicle_magnetometer"
+EVENT_TOPICS: Final = (*TOPICS, detectors.EKF_SELECTOR, AIR_DATA, MAGNETOMETER, *rules.AID_SOURCES)
+"""Topics from which events are derived: all built-in ones, and others that PX4 logs."""
 
 _EKF: Final = "estimator_status_flags"
 _REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
@@ -35,7 +39,8 @@ _GROUPS: Final = (rules.POSITIONS, rules.EVIDENCE["GPS"])
 _EVIDENCE_OF: Final = {topic: name for name, topics in rules.EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = FieldReader(_SAMPLE)
-_NEW: Final = ChangeDetector((), (), lambda _, __: iter(()))  # in place of the detector of a new stream
+_read_vision: Final = FieldReader(("cs_ev_pos", "cs_ev_vel", "cs_ev_hgt", "cs_ev_yaw"))
+_NEW: Final = ChangeDetector((), (), detectors.detect_nothing)  # in place of the detector of a new stream
 
 
 class Vehicle:
@@ -44,22 +49,26 @@ class Vehicle:
     `on_event`: callback for each event. `common`: pseudo-vehicle whose conditions concern all vehicles.
 
     `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
+    `usual`: those of `usual` kinds, active since the first messages; they belong to the flight and affect no state.
     `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
+    `first`: time of the first message on the event log's clock [s].
     `last_seen`: time of the last message on the event log's clock [s], or of the last update with a live publisher.
     `time`: time of the last message with a detector [s]. `boot`: the time since boot in it [s].
     `recent`: recent events, searched for evidence.
     """
 
-    def __init__(self, name: str, on_event: Callable[[Event], None], common: Vehicle | None = None) -> None:
+    def __init__(
+        self, name: str, on_event: Callable[[Event], None], common: Vehicle | None = None, *, first: float = 0.0
+    ) -> None:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
-        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; take effect once armed
-        self._armed_at = math.inf
+        self.usual: dict[tuple[str, str], Condition] = {}
         self.topics: set[str] = set()
         self.main: Address | None = None
         self.armed: bool | None = None
         self.time = self.last_seen = 0.0
+        self.first = first
         self.boot: float | None = None
         self._before = -math.inf  # time of the message before the last one in its stream
         self._is_off = False  # the last time since boot was not the expected one
@@ -69,14 +78,15 @@ class Vehicle:
         self._detectors: dict[Address, ChangeDetector | None] = {}
         self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use, by group
         self._main_time = math.inf  # time of the last position
+        self._invalid = -math.inf  # last time when a quantity of the estimate was invalid
         self._rebooted = -math.inf
         self._suspect: _Suspect | None = None
-        self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}  # by condition, and by kind
-        self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
+        self._changes: dict[tuple[str, object], deque[Event]] = {}  # by condition or likeness, and by kind
+        self._suppressed: Counter[tuple[str, object]] = Counter()  # number of suppressed events, by the same keys
         self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
         self._ekf = 0  # instance of the primary EKF
         self._position: PositionDetector | None = None  # of `main`
-        self._comparison = Comparison(lambda: self._position)
+        self._comparison = Comparison()
         self._supplies: dict[str, _Supply] = {}  # by key of EVIDENCE
         self._checked = self._resumed = 0  # time of the last position then, and after its last pause [us since boot]
         self._equal: dict[int, bool] = {}  # by EKF: whether its estimate equals the vehicle's
@@ -87,11 +97,9 @@ class Vehicle:
         detector = self._detectors.get(address, _NEW)
         return detector is None or time < detector.due
 
-    def add(self, address: Address, message: object, time: float, missing: frozenset[str], lost: int) -> None:
-        """Add a message; `lost`: number of messages lost before it."""
+    def add(self, address: Address, message: object, time: float, missing: frozenset[str]) -> None:
+        """Add a message."""
         self.last_seen = time
-        if lost:
-            self._count("lost", time, lost, address.stream)
         try:
             detector = self._detectors[address]
         except KeyError:
@@ -114,11 +122,16 @@ class Vehicle:
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
+            found = iter([*(found or ()), *self._comparison.add_estimate(stamp, message, missing)])
         if not is_queued and (stamp < before - _REBOOT or self._suspect is not None):
             suspect = _Suspect(address, before, [*(found or ())])
             known = self._check_reboot(suspect, stamp, earlier, time, elapsed)
             found = detector.add(message, missing) if known is None else iter(known)
         self._emit_all(found or (), address, time)
+
+    def count_lost(self, count: int, stream: str, time: float) -> None:
+        """Count lost messages of a stream, "" for an estimate of those of all topics of the vehicle's ULog stream."""
+        self._count("lost", time, count, stream)
 
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
@@ -134,15 +147,19 @@ class Vehicle:
         self._count("rejected", time, 1, topic)
 
     def settle(self, time: float) -> None:
-        """Report bursts and flapping that have ended; activate initial conditions once armed for PAUSE."""
+        """Report bursts and flapping that have ended."""
         for kind, burst in list(self._bursts.items()):
             if time - burst.end <= rules.PAUSE and (kind != "lost" or time - burst.begin <= rules.MAX_BURST):
                 continue
             del self._bursts[kind]
             messages, numbers = f"{burst.count} message{'s' * (burst.count > 1)}", {"messages": burst.count}
             if kind == "lost":
-                names = tuple(sorted(burst.topics))
-                text = f"{messages} lost ({', '.join(names)})"
+                names = tuple(sorted(burst.topics - {""}))
+                streams = ", ".join(names)
+                if "" in burst.topics:
+                    messages = f"about {messages}"
+                    streams = f"{streams} and the ULog stream" if streams else "the ULog stream"
+                text = f"{messages} lost ({streams})"
                 self.emit(Finding(kind, "once", text, names, numbers), "", burst.begin)
             elif kind == "rejected":
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
@@ -150,15 +167,10 @@ class Vehicle:
                 duration = burst.count / 1e3
                 text = f"logging dropout of {format_duration(duration)}"
                 self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
-        if self._on_ground and time - self._armed_at >= rules.PAUSE:
-            self.conditions |= self._on_ground
-            self.initial += [*dict.fromkeys(self._on_ground.values())][: _MAX_RECENT - len(self.initial)]
-            self._on_ground.clear()
         for key, events in list(self._changes.items()):
             last = events[-1]
             if key in self._suppressed and time - last.time > rules.PAUSE:
-                count = self._suppressed.pop(key)
-                self._report(replace(last, text=f"{last.text}, the last of {count} suppressed changes"))
+                self._report(_summary(last, self._suppressed.pop(key)))
             if time - last.time > WINDOW:
                 del self._changes[key]
 
@@ -166,6 +178,7 @@ class Vehicle:
         """Update from the state of the position stream ("stale", "gone", "duplicate", ...), None if not observed."""
         self.settle(time)
         self._check_supplies()
+        self._check_aids()
         if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
             several = f"several publishers of {stream}: readers receive a mixture of their messages"
@@ -209,6 +222,25 @@ class Vehicle:
                 time = self._main_time if change == "end" else since
                 self.emit(Finding("no_messages", change, text, tuple(names)), "", time)
 
+    def _check_aids(self) -> None:
+        """End the conditions of measurements that no longer arrive while positions do, by PX4's time."""
+        if self._position is None:
+            return
+        for address, detector in self._detectors.items():
+            if isinstance(detector, AidDetector | VisionDetector) and detector.stamp:
+                silence = (self._position.stamp - detector.stamp) / 1e6
+                if silence > rules.AID_PAUSE:
+                    for found in detector.stop():
+                        self.emit(found, address.topic, self._main_time - silence)
+
+    def _is_vision_fused(self) -> tuple[bool | None, int]:
+        """Return whether the primary EKF fuses any vision, None if unknown, and the time of this state [us]."""
+        detector = self._detectors.get(Address(self.name, _EKF, self._ekf))
+        if detector is None or detector.last is None:
+            return None, 0
+        flags = [flag for flag in _read_vision(detector.last) if flag is not None]
+        return any(flags) if flags else None, detector.stamp
+
     def state(self, time: float) -> State:
         """Return the current state, set by active and flapping conditions and single events of the last minute."""
         is_flying = self.armed is not False
@@ -225,44 +257,93 @@ class Vehicle:
         return state_of(dict.fromkeys(found))  # a condition with several flags appears once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
-        """Begin or end the conditions of a finding; report its event unless it is initial or flapping.
+        """Begin or end the conditions of a finding, or report a single event.
 
         `changed`: time when the condition began or ended, if earlier than `time`.
         """
         changed = time if changed is None else changed
-        kind, text, lasted = KINDS[found.kind], found.text, None
-        in_air = found.severity or ("info" if found.change == "end" else kind.severity)
-        is_on_ground = kind.on_ground is not None and self.armed is False and in_air != "info"
-        severity = (kind.on_ground if is_on_ground else None) or in_air
-        keys = [(found.kind, flag) for flag in kind.conditions(found.names)]
-        if found.switch and (found.change == "begin") == (keys[0] in self.conditions):
-            return
-        for key in keys:
-            self._on_ground.pop(key, None)
-        held = {key: self.conditions[key] for key in keys if key in self.conditions}
-        if found.change == "end":
-            for key in held:
-                del self.conditions[key]
-            if known := [each.since for each in held.values() if not each.initial]:
-                lasted = max(0.0, changed - min(known))
-                text = f"{text} after {format_duration(lasted)}"
-            elif kind.first:
-                text = kind.first
-        boot = None if self.boot is None else round(self.boot + time - self.time, 6)
-        is_alone = any(each.begin.time == self._before and not each.initial for each in held.values())
-        is_alone &= kind.message in rules.PERIODIC and time - self._before <= rules.MAX_ALONE
-        marks = {"armed": self.armed and found.kind == "text", ALONE: is_alone}
-        numbers = {**found.numbers, **{name: 1 for name, is_set in marks.items() if is_set}}
-        event = Event(
-            self.name, found.kind, found.change, severity, text, time, boot, topic, numbers, found.names, lasted
-        )
         if found.change == "begin":
-            condition = Condition(found.kind, in_air, text, changed, event, found.initial)
-            is_waiting = found.initial and kind.once_armed
-            (self._on_ground if is_waiting else self.conditions).update(dict.fromkeys(keys, condition))
-            if found.initial and not is_waiting and len(self.initial) < _MAX_RECENT:
-                self.initial.append(condition)
-        if not found.initial and not self._is_flapping(event):
+            self.begin(found, topic, time, changed)
+        elif found.change == "end":
+            self.end(found, topic, time, changed)
+        else:
+            self._report_unless_frequent(found, self._event(found, topic, time))
+
+    def begin(self, found: Finding, topic: str, time: float, since: float) -> None:
+        """Begin the conditions of a finding, active `since`; report an event unless they are initial or flapping."""
+        keys, kind = _keys_of(found), KINDS[found.kind]
+        if found.switch and keys[0] in self.conditions:
+            return
+        event = self._event(found, topic, time, is_alone=self._is_alone(found))
+        condition = Condition(found.kind, found.severity or kind.severity, found.text, since, event, found.initial)
+        for key in keys:
+            self.usual.pop(key, None)
+        if found.initial and kind.usual:
+            self.usual |= dict.fromkeys(keys, condition)
+            return
+        self.conditions |= dict.fromkeys(keys, condition)
+        if kind.validity:
+            self._invalid = math.inf
+        if found.initial and len(self.initial) < _MAX_RECENT:
+            self.initial.append(condition)
+        self._report_unless_frequent(found, event)
+
+    def end(self, found: Finding, topic: str, time: float, until: float) -> None:
+        """End the conditions of a finding, active `until`; report an event unless they were initial or are flapping."""
+        keys = _keys_of(found)
+        if found.switch and keys[0] not in self.conditions:
+            return
+        is_alone = self._is_alone(found)
+        for key in keys:
+            self.usual.pop(key, None)
+        ended = [self.conditions.pop(key) for key in keys if key in self.conditions]
+        if KINDS[found.kind].validity and not any(KINDS[kind].validity for kind, _ in self.conditions):
+            self._invalid = until
+        starts = [condition.since for condition in ended if not condition.initial]
+        text, lasted = found.text, None
+        if starts:
+            lasted = max(0.0, until - min(starts))
+            text = f"{text} after {format_duration(lasted)}"
+        elif KINDS[found.kind].first:
+            text = KINDS[found.kind].first
+        event = self._event(replace(found, text=text), topic, time, lasted=lasted, is_alone=is_alone)
+        self._report_unless_frequent(found, event)
+
+    def _event(
+        self, found: Finding, topic: str, time: float, *, lasted: float | None = None, is_alone: bool = False
+    ) -> Event:
+        boot = None if self.boot is None else round(self.boot + time - self.time, 6)
+        numbers = dict(found.numbers)
+        if self.armed and found.kind == "text":
+            numbers["armed"] = 1
+        if is_alone:
+            numbers[ALONE] = 1
+        return Event(
+            self.name, found.kind, found.change, self._severity(found, time), found.text, time, boot, topic, numbers,
+            found.names, lasted,
+        )  # fmt: skip
+
+    def _severity(self, found: Finding, time: float) -> Severity:
+        """Return the severity of an event: of its kind, unless the finding or the ground changes it."""
+        kind = KINDS[found.kind]
+        if found.change == "end":
+            return found.severity or "info"
+        severity = found.severity or kind.severity
+        if self.armed is False and kind.on_ground is not None and severity != "info":
+            return kind.on_ground
+        if self.armed and found.is_large and time - self._invalid >= rules.RECOVERY:
+            return "bad"
+        return severity
+
+    def _is_alone(self, found: Finding) -> bool:
+        """Return whether the value that changes now began with the message just before, of a PERIODIC stream."""
+        if KINDS[found.kind].message not in rules.PERIODIC or self.time - self._before > rules.MAX_ALONE:
+            return False
+        held = [self.conditions[key] for key in _keys_of(found) if key in self.conditions]
+        return any(condition.begin.time == self._before and not condition.initial for condition in held)
+
+    def _report_unless_frequent(self, found: Finding, event: Event) -> None:
+        if not found.initial and not self._is_frequent(event):
             self._report(event)
 
     @property
@@ -271,9 +352,15 @@ class Vehicle:
         return () if self._position is None else self._position.unknown
 
     @property
+    def held(self) -> list[Condition]:
+        """Conditions active since the first messages or now, including the usual ones."""
+        return [*dict.fromkeys([*self.initial, *self.conditions.values(), *self.usual.values()])]
+
+    @property
     def held_from_start(self) -> str:
         """Bad and watch conditions active since the first message, as text; "" if none."""
-        held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
+        active = self.conditions.values()
+        held = [condition.text for condition in active if condition.initial and condition.severity != "info"]
         return ", ".join(dict.fromkeys(held))
 
     def _count(self, kind: str, time: float, count: int, topic: str = "") -> None:
@@ -291,7 +378,8 @@ class Vehicle:
             unused = [each for each in self._detectors if each.topic == rules.POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
-        if instance and topic not in (*rules.POSITIONS, _EKF):  # only the first instance of sensors and batteries
+        is_of_ekf = topic in (*rules.POSITIONS, *rules.AID_SOURCES, _EKF)
+        if instance and not is_of_ekf:  # only the first instance of sensors and batteries
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
@@ -308,16 +396,29 @@ class Vehicle:
                 self._end(address, lambda kind, _: KINDS[kind].message == message)
         if group is rules.POSITIONS:
             self.main, self._position = address, PositionDetector()
+            self._comparison.reset()
             return self._position
-        own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
-        if own is not None and topic == _EKF:
-            own = *own[:2], partial(self._detect_flags, instance, own[2])
-        kind = detectors.TextDetector if topic == "log_message" else ChangeDetector
-        is_reference = topic in REFERENCES
-        found = ReferenceDetector(topic, self._comparison, own) if is_reference else kind(*own) if own else None
+        found = self._detector_of(topic, instance)
         if found is not None and topic in _EVIDENCE_OF:
             self._supplies.setdefault(_EVIDENCE_OF[topic], _Supply()).detectors[address] = found
         return found
+
+    def _detector_of(self, topic: str, instance: int) -> ChangeDetector | None:
+        """Return a detector for a topic other than the positions, None if it has no events."""
+        own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        if topic in rules.AID_SOURCES:
+            return AidDetector(topic, lambda primary: primary == self._ekf)
+        if topic in rules.VISION:
+            return VisionDetector(self._is_vision_fused)
+        if topic in REFERENCES:
+            return ReferenceDetector(topic, self._comparison, own)
+        if topic == MAGNETOMETER:
+            return ChangeDetector((), (), detectors.detect_nothing)
+        if own is None:
+            return None
+        if topic == _EKF:
+            own = *own[:2], partial(self._detect_flags, instance, own[2])
+        return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
 
     def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
@@ -346,7 +447,7 @@ class Vehicle:
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
         """End conditions, selected by kind and flag, because a preferred stream is now in use."""
-        self._on_ground = {key: each for key, each in self._on_ground.items() if not is_over(*key)}
+        self.usual = {key: condition for key, condition in self.usual.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
             self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
@@ -361,7 +462,6 @@ class Vehicle:
         for each in found:
             if each.kind in ("armed", "disarmed"):
                 self.armed = each.kind == "armed"
-                self._armed_at = time if self.armed else math.inf
             self.emit(each, address.topic, time - each.age)
             if each.kind == "ekf_changed":
                 self._use_ekf(int(each.numbers["to"]))
@@ -400,8 +500,8 @@ class Vehicle:
             detector.reset()
         self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
         self.armed = None
-        self._armed_at = math.inf
-        self._on_ground.clear()
+        self.usual.clear()
+        self._invalid = -math.inf
         last, self._rebooted = self._rebooted, time
         if time - last >= rules.PAUSE and ("duplicate", "") not in self.conditions:
             text = f"reboot: time since boot is {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
@@ -410,16 +510,26 @@ class Vehicle:
     def _report(self, event: Event) -> None:
         common = () if self._common is None else (self._common,)
         recent = [earlier for each in (*common, self) for earlier in each.recent]
-        conditions = [known for each in (self, *common) for known in each.conditions.values()]
+        conditions = [*self.conditions.values(), *self.usual.values()]
+        if self._common is not None:
+            conditions += self._common.conditions.values()
         self.recent.append(event)
-        held = [each for each in conditions if each.begin is not event]
+        held = [condition for condition in conditions if condition.begin is not event]
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
-    def _is_flapping(self, event: Event) -> bool:
-        """Count an event; return True if its kind is too frequent to report each one; `settle` reports the last one."""
-        keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in any combination
-        limits = [*zip(keys, rules.FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
-        for key, limit in [(keys[1], rules.MAX_SINGLE)] if event.change == "once" else limits:
+    def _is_frequent(self, event: Event) -> bool:
+        """Count an event; return True if there are too many like it to report each; `settle` reports the last one."""
+        if event.change == "once":
+            alike = event.text if event.kind == "text" else (event.names, event.severity)
+            limits: dict[tuple[str, object], int] = {
+                (event.kind, alike): rules.EQUAL_EVENTS,
+                (event.kind, None): rules.SINGLE_EVENTS,
+            }
+        else:  # flags of a kind may change in any combination
+            limits = {(event.kind, event.names): rules.CONDITION_CHANGES, (event.kind, None): rules.KIND_CHANGES}
+            if (event.kind, None) in self._suppressed:
+                del limits[event.kind, event.names]
+        for key, limit in limits.items():
             events = self._changes.setdefault(key, deque(maxlen=limit))
             is_fast = len(events) == limit and event.time - events[0].time < WINDOW
             events.append(event)
@@ -427,6 +537,18 @@ class Vehicle:
                 self._suppressed[key] += 1
                 return True
         return False
+
+
+def _summary(last: Event, count: int) -> Event:
+    """Return the event that stands for `count` suppressed ones; PX4's own words stay as they are."""
+    if last.kind == "text":
+        return replace(last, numbers={**last.numbers, SUPPRESSED: count})
+    return replace(last, text=f"{last.text}, the last of {count} suppressed changes")
+
+
+def _keys_of(found: Finding) -> list[tuple[str, str]]:
+    """Return the keys of the conditions of a finding: its kind, and each of its flags."""
+    return [(found.kind, flag) for flag in KINDS[found.kind].conditions(found.names)]
 
 
 @dataclass(frozen=True, slots=True)

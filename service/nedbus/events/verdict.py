@@ -1,20 +1,26 @@
 """Verdict on a vehicle in one or two sentences: usable or not, since when, for how long, and why."""
 
 import math
+import re
 import textwrap
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
 
-from .event import ALL, WINDOW, Condition, Event, rank
-from .kinds import KINDS
-from .rules import POSITIONS
-from .story import TOGETHER, Story, stories_of
-from .times import Times
+from .event import ALL, WINDOW, Condition, Event
+from .kinds import KINDS, importance
+from .position import large_part
+from .rules import POSITIONS, SUBJECTS
+from .story import TOGETHER, Story, is_alarm, stories_of
+from .times import Times, format_duration
 
 _GLOBAL: Final = "vehicle_global_position"
-_WIDTH: Final = 97  # columns next to a short vehicle name; a verdict has at most three lines
+_WIDTH: Final = 97  # columns next to a short vehicle name
+_LINES: Final = 3
+_MODULE: Final = re.compile(r'(?<=PX4: )"\[\w+\] ')  # the name of PX4's module before a text
+_MAX_TEXTS: Final = 2  # of PX4 in the evidence
+_MAX_CAUSES: Final = 3  # other events in the evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +41,71 @@ class Verdict:
     stories: tuple[Story, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """The parts of a verdict's text; `render` joins as many as fit into three lines, each of them whole.
+
+    `state`: the worst fault and its period. `evidence`: most important first. `missing`: topics that may hold more.
+    `none`: says that there is no evidence. `others`: the other faults, most important first; `is_another_bad`: the
+    first of them is bad.
+    """
+
+    state: str
+    evidence: tuple[Event, ...] = ()
+    none: str = ""
+    missing: str = ""
+    others: tuple[str, ...] = ()
+    is_another_bad: bool = False
+
+    def render(self, times: Times) -> str:
+        chosen: list[Event] = []
+        missing, others = "", list[str]()
+
+        def text() -> str:
+            sentences = [self.state]
+            if chosen:
+                sentences.append(f"Evidence: {_listed(chosen, times)}.")
+            elif self.none:
+                sentences.append(self.none)
+            if missing:
+                sentences.append(missing)
+            if others:
+                sentences.append(f"Also {'; '.join(others)}.")
+            return " ".join(sentences)
+
+        def fits() -> bool:
+            return len(textwrap.wrap(text(), _WIDTH)) <= _LINES
+
+        def add_evidence(events: Iterable[Event]) -> None:
+            for event in events:
+                chosen.append(event)
+                if not fits():
+                    chosen.pop()
+
+        def add_others(parts: Iterable[str]) -> None:
+            for part in parts:
+                others.append(part)
+                if not fits():
+                    others.pop()
+
+        def add_missing() -> None:
+            nonlocal missing
+            missing = self.missing
+            if not fits():
+                missing = ""
+
+        is_quoted_only = all(event.kind == "text" for event in self.evidence)
+        add_evidence(self.evidence[:1] if is_quoted_only else self.evidence[:2])
+        if self.is_another_bad:
+            add_others(self.others[:1])
+        if is_quoted_only:
+            add_missing()
+        add_evidence(event for event in self.evidence if event not in chosen)
+        add_missing()
+        add_others(part for part in self.others if part not in others)
+        return textwrap.shorten(text(), _LINES * _WIDTH, placeholder="...") if not fits() else text()
+
+
 def _describe_unknown(topics: Collection[str]) -> str:
     """Describe data without the validity of positions."""
     text = "the data has no position validity"
@@ -53,82 +124,176 @@ def verdict_of(
     times: Times,
     end: float,
     at: float | None = None,
+    since: float | None = None,
 ) -> Verdict:
     """Return the verdict on a vehicle.
 
     `events`: events in chronological order; only those of this vehicle and of ALL are used. `held`: conditions active
     after the last event. `topics`: published topics. `unknown`: flags that its position does not provide.
     `end`: now, or the end of the file, on the event log's clock [s]. `at`: the time in question, None for all.
+    `since`: time of the first message, if it is not the start of a file.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
+    held = list(held)
     stories = stories_of(events, held, topics=topics, at=at)
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
+<<<<<<< HEAD
         length = "the services' history" if times.is_live else f"{end:.0f} s"
         remark = "" if known else f"; {_describe_unknown(topics)}"
         return Verdict(f"no faults in {length}{remark}", known)
+=======
+        return Verdict(_without_faults(held, times, end, since, is_known=known is True), known)
+>>>>>>> main
     is_now = times.is_live and at is None
-    past = [story for story in stories if is_now and story.has_ended(end)]
-    ranked = sorted(stories, key=lambda story: (story in past, rank(story.spans[0], story.until, is_now=is_now)))
+    past = [story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)]
+    ranked = sorted(stories, key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank))
     worst = ranked[0]
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and worst not in past and is_then else known
-    of_estimate = [story for story in stories if story.is_bad and story.spans[0].is_of_estimate]
-    head = f"position valid {'now' if of_estimate else 'throughout'}, but " if usable else ""
-    if worst.is_bad:
-        head = ("was " * (worst in past) + "not usable: ") * (worst in of_estimate)
-    head = head if is_then else "no fault at that time; nearest: "
-    # Evidence: events before the fault, and PX4's log messages until a second after its start, or all of them for a bad
-    # fault that was active in the first message. Texts that also appeared long before the first fault are excluded.
-    said = [event for event in events if event.kind == "text"]
-    earlier = {each.text for each in said if each.time < stories[0].since - WINDOW}
-    late = TOGETHER if worst.begin else math.inf if worst.is_bad else -WINDOW
-    said = [event for event in said if event is not worst.begin]
-    near = (e for e in said if e.severity != "info" and -WINDOW <= e.time - worst.since <= late)
-    found = [each for each in near if each.text not in earlier] + [e for e in worst.before if e.kind != "text"]
-    cause = tuple(sorted(found, key=lambda each: each.time))
-    text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
-    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # reserved for the others
-    text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
-    largest = {each.spans[0].kind: each for each in reversed(ranked)}
-    also = ""  # the worst other fault of each kind, nearest in time first
-    for each in sorted(largest.values(), key=lambda each: abs(each.since - worst.since)):
-        if each.begin is None or each.begin in (worst.begin, *cause):
-            continue
-        part = f"{times.text(each.begin)} {_cut(each.what, 60)}{_count(each, stories)}"
-        longer = f"{also}; {part}" if also else f" Also {part}"
-        also = longer if len(textwrap.wrap(f"{text}{longer}.", _WIDTH)) < 4 else also
-    text += f"{also}." * bool(also)
+    head = _head(worst, stories, times, since, is_past=worst in past, usable=usable)
+    if not is_then:
+        head = "no fault at that time; nearest: "
+    cause, ordered = _evidence(worst, stories, events)
+    none = f"No evidence in the {WINDOW:.0f} s before." if worst.begin and worst.is_bad and not cause else ""
+    missing = f"Not in the data: {', '.join(worst.lacking)}." if worst.lacking and (worst.is_bad or not cause) else ""
+    state = f"{head}{_what(worst)}{_count(worst, stories)} {worst.when(times, end)}."
+    others = tuple(_others(worst, ranked, cause, stories, times))
+    is_another_bad = sum(story.is_bad for story in stories) > 1
+    text = _Parts(state, tuple(ordered), none, missing, others, is_another_bad).render(times)
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 
 
-def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[str]:
-    """Return sentences with as much evidence as fits into `room` characters, and with the missing topics."""
-    missing = [f"Not in the data: {', '.join(story.lacking)}"] * bool(story.lacking and (story.is_bad or not cause))
-    said = [
-        (each.numbers.get("level", 0.0), abs(each.time - story.since), each) for each in cause if each.kind == "text"
-    ]
-    texts: list[Event] = []
-    for *_, each in sorted(said, key=lambda text: text[:2]):
-        if not any(each.text in other.text or other.text in each.text for other in texts):
-            texts.append(each)
-    others = [each for each in cause if each.kind != "text"][-3:]
-    others.sort(key=lambda each: KINDS[each.kind].message == "VehicleLocalPosition")  # effects after causes
-    ranked = [*texts[:1], *others, *texts[1:2]]
-    while ranked:
-        groups = groupby(sorted(ranked, key=cause.index), key=times.text)
-        words = ((time, dict.fromkeys(_cut(each.words) for each in group)) for time, group in groups)
-        listed = "; ".join(f"{time} {', '.join(group)}" for time, group in words)
-        if len(listed) + len("".join(missing)) < room:
-            return [f"Evidence: {listed}", *missing]
-        ranked.pop()
-    return [*([f"No evidence in the {WINDOW:.0f} s before"] if story.begin and not cause else []), *missing]
+def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None, *, is_known: bool) -> str:
+    if not times.is_live:
+        text = f"no faults in {end:.0f} s"
+    elif since is None:
+        text = "no faults in the services' history"
+    else:
+        text = f"no faults since {times.text_at(since)} UTC ({format_duration(end - since)})"
+    usual = dict.fromkeys(each.text for each in held if each.initial and KINDS[each.kind].usual)
+    if usual:
+        text += f"; throughout: {', '.join(usual)}"
+    return text if is_known else f"{text}; the data has no position validity"
+
+
+def _head(
+    worst: Story, stories: Iterable[Story], times: Times, since: float | None, *, is_past: bool, usable: bool | None
+) -> str:
+    """Return the words before the worst fault: whether the position is valid, and since when."""
+    of_estimate = [story for story in stories if story.is_bad and story.spans[0].is_of_estimate]
+    if worst.is_bad and worst in of_estimate:
+        return "was not usable: " if is_past else "not usable: "
+    if worst.is_bad or not usable:
+        return ""
+    if any(story.in_flight for story in of_estimate):
+        return "position valid now, but "
+    if of_estimate:
+        return "position valid in flight, but "
+    if times.is_live and since is not None:
+        return f"position valid since {times.text_at(since)} UTC, but "
+    return "position valid throughout, but "
+
+
+def _evidence(worst: Story, stories: Sequence[Story], events: Sequence[Event]) -> tuple[tuple[Event, ...], list[Event]]:
+    """Return all evidence for a story in chronological order, and what the text may show, most important first.
+
+    Texts of PX4 count until TOGETHER after the start, or all of them for a bad fault that was active in the first
+    message; those that also appeared long before the first such fault do not.
+    """
+    first = min(story.since for story in stories if story.kind == worst.kind)
+    texts = [event for event in events if event.kind == "text" and event.severity != "info"]
+    usual = {text.text for text in texts if text.time < first - WINDOW}
+    late = TOGETHER
+    if worst.begin is None:
+        late = math.inf if worst.is_bad else -WINDOW
+    near = [text for text in texts if -WINDOW <= text.time - worst.since <= late and text is not worst.begin]
+    quoted = [text for text in near if text.text not in usual]
+    until = math.inf if worst.until is None else worst.until
+    if not quoted:
+        quoted = [text for text in texts if text.severity == "bad" and worst.since <= text.time <= until][:1]
+        quoted = [text for text in quoted if text is not worst.begin]
+    causes = [event for event in worst.before if event.kind != "text"]
+    cause = tuple(sorted([*quoted, *causes], key=lambda event: event.time))
+    return cause, _by_importance(worst, quoted, causes)
+
+
+def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]) -> list[Event]:
+    """Order evidence: what precedes the fault, nearest in kind and then in time; causes of the sensors first."""
+    subjects = _subjects(worst.what)
+    for event in causes:
+        subjects |= _subjects(event.text)
+
+    def order(text: Event) -> tuple[bool, bool, float, float]:
+        distance = round(abs(text.time - worst.since), 1)
+        if text.time > worst.since or worst.begin is None:
+            return True, False, text.numbers.get("level", 0.0), distance
+        return False, subjects.isdisjoint(_subjects(text.text)), text.severity != "bad", distance
+
+    said: list[Event] = []
+    for text in sorted(texts, key=lambda text: (order(text), len(text.text))):
+        if not any(_is_same(text, other) for other in said):
+            said.append(text)
+    said = said[:_MAX_TEXTS]
+    shown = [event for event in causes if not any(_repeats(text, event) for text in said)]
+    of_worst = _subjects(worst.what)
+    shown.sort(key=lambda event: (of_worst.isdisjoint(_subjects(event.text)), importance(event.kind), -event.time))
+    shown = shown[:_MAX_CAUSES]
+    shown.sort(key=lambda event: KINDS[event.kind].message == "VehicleLocalPosition")  # effects after causes
+    return [*said[:1], *shown, *said[1:]]
+
+
+def _subjects(text: str) -> set[str]:
+    """Return the sensors and quantities that a text names."""
+    return {name for name, pattern in SUBJECTS.items() if re.search(pattern, text, re.IGNORECASE)}
+
+
+def _is_same(text: Event, other: Event) -> bool:
+    """Return whether two texts of PX4 say the same: one contains the other, or both report an injected failure."""
+    if text.text in other.text or other.text in text.text:
+        return True
+    return all(re.search("inject", each.text, re.IGNORECASE) for each in (text, other))
+
+
+def _repeats(text: Event, event: Event) -> bool:
+    """Return whether a text of PX4 reports an event of nedbus, with its reason."""
+    return event.kind == "ekf_changed" and "primary EKF changed" in text.text and abs(text.time - event.time) < TOGETHER
+
+
+def _others(
+    worst: Story, ranked: Sequence[Story], cause: Sequence[Event], stories: Sequence[Story], times: Times
+) -> list[str]:
+    """Return the worst other fault of each kind, worst first."""
+    largest: dict[str, Story] = {}
+    for story in ranked:
+        key = story.what if story.kind == "text" else story.kind
+        largest.setdefault(key, story)
+    parts = []
+    for story in largest.values():
+        if story is worst or story.kind == worst.kind != "text" or story.begin is None or story.begin in cause:
+            continue
+        if story.kind != worst.kind or is_alarm(story.begin):
+            parts.append(f"{times.text(story.begin)} {_what(story)}{_count(story, stories)}")
+    return parts
+
+
+def _listed(events: Iterable[Event], times: Times) -> str:
+    """Format events in chronological order, those of the same time together."""
+    ordered = sorted(events, key=lambda event: event.time)
+    parts = []
+    for time, group in groupby(ordered, key=times.text):
+        words = dict.fromkeys(_MODULE.sub('"', event.words) for event in group)
+        parts.append(f"{time} {', '.join(words)}")
+    return "; ".join(parts)
+
+
+def _what(story: Story) -> str:
+    """Return the text of a story, without the small part of a large reset."""
+    if story.kind == "reset" and len(story.spans) == 1:
+        return large_part(story.spans[0].begin)
+    return _MODULE.sub('"', story.what)
 
 
 def _count(story: Story, stories: Iterable[Story]) -> str:
-    number = sum(each.spans[0].kind == story.spans[0].kind for each in stories)
+    number = sum(each.kind == story.kind for each in stories)
     return f" (one of {number})" if number > 1 else ""
-
-
-def _cut(text: str, width: int = 80) -> str:
-    return textwrap.shorten(text, width, placeholder="...")

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from nedbus.errors import InvalidMessageError
-from nedbus.events import AIR_DATA, EKF_SELECTOR, EventLog, Times
+from nedbus.events import EVENT_TOPICS, EventLog, Times
 from nedbus.samples import SourceMessage
-from nedbus_msgs import TOPICS
 
 from .merge import MergedFlights
 from .readers import ReadOptions
@@ -18,8 +17,8 @@ from .readers import ReadOptions
 MAX_FILE_EVENTS: Final = 100_000
 """Maximum number of events of a file; beyond it, the oldest are discarded."""
 
-EVENT_OPTIONS: Final = ReadOptions(topics={*TOPICS, EKF_SELECTOR, AIR_DATA})
-"""Options to read the messages from which events are derived: all built-in topics, and two other topics."""
+EVENT_OPTIONS: Final = ReadOptions(topics={*EVENT_TOPICS})
+"""Options to read the messages from which events are derived."""
 
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are

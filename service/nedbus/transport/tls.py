@@ -1,14 +1,18 @@
 """TLS files of a client for `tls/` endpoints, and the diagnosis of invalid files."""
 
+from __future__ import annotations
+
 import os
 import re
-import ssl
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from nedbus import clock
 from nedbus.errors import ConfigError
+
+if TYPE_CHECKING:
+    import ssl
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
 UNKNOWN_CA: Final = (7, 18, 19, 20, 21)
@@ -43,6 +47,8 @@ class Tls:
 
         Raises ConfigError for a file that is unreadable or of the wrong kind, and for a key that does not match.
         """
+        import ssl
+
         check_pem(self.ca, "CERTIFICATE")
         settings: dict[str, object] = {"root_ca_certificate": str(self.ca)}
         if self.certificate is not None and self.key is not None:
@@ -58,6 +64,8 @@ class Tls:
 
         Raises OSError (or SSLError) unless `ca` is a certificate, ConfigError for a key that does not match.
         """
+        import ssl
+
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(self.ca)
         if self.certificate is not None and self.key is not None:
@@ -69,6 +77,8 @@ class Tls:
 
         Performs a TLS handshake in memory, with a server that trusts the CA.
         """
+        import ssl
+
         try:
             ours, peer = self.context(), self.context(server=True)
         except OSError:
@@ -109,6 +119,8 @@ def check_pem(path: str | Path, kind: str) -> None:
 
 
 def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:
+    import ssl
+
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except ssl.SSLError as exc:

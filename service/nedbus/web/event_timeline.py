@@ -118,7 +118,7 @@ class EventTimeline:
     def _evidence(self, vehicle: str) -> tuple[list[str], list[Condition]]:
         """Return a vehicle's topics, and its conditions that began before the first event or are still active."""
         state = self.event_log.vehicles.get(vehicle)
-        return ([], []) if state is None else ([*state.topics], [*state.initial, *state.conditions.values()])
+        return ([], []) if state is None else ([*state.topics], state.held)
 
     def _refresh(self) -> None:
         if self._reported == self.event_log.reported:

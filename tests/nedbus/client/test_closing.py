@@ -19,6 +19,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
+from nedbus.client import AsyncBus
 from nedbus.client.receiving import Decoder, Inbox, LayoutLookup, Receiver
 from nedbus.transport import Session, open_router
 from tests.flights.messages import VLP, message
@@ -121,6 +122,66 @@ def test_cancelled_connect_leaves_no_thread() -> None:
 
     asyncio.run(scenario())
     assert not errors
+
+
+def test_bus_that_opens_while_it_is_cancelled_is_closed() -> None:
+    """If `async with connect_async()` is cancelled, a bus that its thread has opened or opens later is closed."""
+    is_opening, may_open = threading.Event(), threading.Event()
+    opened = list[nedbus.Bus]()
+    endpoint = free_endpoint()
+
+    def open_bus(_: threading.Event) -> nedbus.Bus:
+        is_opening.set()
+        assert may_open.wait(DEADLINE)
+        opened.append(nedbus.connect(endpoint))
+        return opened[0]
+
+    async def scenario() -> None:
+        entering = asyncio.create_task(AsyncBus(open_bus).__aenter__())
+        await asyncio.to_thread(is_opening.wait, DEADLINE)
+        entering.cancel()
+        with suppress(asyncio.CancelledError):
+            await entering
+        may_open.set()
+        await asyncio.to_thread(wait_for, lambda: opened and opened[0].closed, what="the closed bus")
+
+    with open_router(listen=[endpoint]):
+        asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("is_open", [False, True], ids=["before it is open", "after it is open"])
+def test_cancelled_publisher_frees_its_address(endpoint: str, monkeypatch: pytest.MonkeyPatch, is_open: bool) -> None:
+    """A cancelled `await bus.publisher(...)` closes the publisher, opened before or after the cancellation."""
+    is_opening, may_open, is_returned = threading.Event(), threading.Event(), threading.Event()
+    original = nedbus.Bus.publisher
+
+    def open_slowly(bus: nedbus.Bus, *message: Any, **options: Any) -> nedbus.Publisher:
+        is_opening.set()
+        if not is_open:
+            assert may_open.wait(DEADLINE)
+        publisher = original(bus, *message, **options)
+        is_returned.set()
+        return publisher
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(endpoint) as bus:
+            with monkeypatch.context() as patch:
+                patch.setattr(nedbus.Bus, "publisher", open_slowly)
+                opening = asyncio.create_task(bus.publisher(VLP, vehicle="7"))
+                await asyncio.to_thread(is_opening.wait, DEADLINE)
+                if is_open:  # blocks the event loop: the task has not yet received the publisher
+                    assert is_returned.wait(DEADLINE)
+                opening.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await opening
+                may_open.set()
+                await asyncio.to_thread(is_returned.wait, DEADLINE)
+            registry = bus._blocking._publishers.publishers
+            await asyncio.to_thread(wait_for, lambda: not registry, what="the free address")
+            async with await bus.publisher(VLP, vehicle="7") as again:
+                assert again.address == nedbus.Address("7", VLP)
+
+    asyncio.run(scenario())
 
 
 def test_connect_uses_first_answering_endpoint_or_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

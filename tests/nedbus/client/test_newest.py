@@ -9,6 +9,7 @@ import math
 import threading
 import time
 import weakref
+from types import SimpleNamespace
 
 import pytest
 
@@ -219,6 +220,26 @@ def test_messages_are_read_while_others_are_added(monkeypatch: pytest.MonkeyPatc
         assert len(list(monitor)) <= 20
     adding.join()
     assert {address.vehicle for address in monitor} == {f"v{number}" for number in range(30, 50)}
+
+
+def test_only_the_last_added_stream_of_a_monitor_is_updated() -> None:
+    """`updated` of a Monitor is true for the stream of the last `add`, until another one is added."""
+    monitor = Monitor()
+    monitor.add(sample("7"))
+    assert [monitor[Address("7", VLP)].updated] == [True]
+    monitor.add(sample("8"))
+    assert [each.updated for each in monitor.values()] == [False, True]
+
+
+def test_update_lists_a_stream_once(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream of which `update` reads two messages, one it waited for and one behind it, is listed once."""
+    with bus.newest(nedbus.VehicleLocalPosition) as view:
+        waited = sample("1", 5)
+        arrived = [sample("1", 6), sample("2", 7)]
+        inbox = SimpleNamespace(ended=False, waiting=2, pop=lambda: arrived.pop(0))
+        monkeypatch.setattr(view, "_inbox", inbox)
+        news = view._read(waited)
+        assert [(each.sample.vehicle, each.message.timestamp) for each in news] == [("1", 6), ("2", 7)]
 
 
 def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: nedbus.Bus) -> None:

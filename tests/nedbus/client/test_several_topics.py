@@ -157,6 +157,25 @@ def test_callback_that_cannot_be_called_raises(client: nedbus.Bus) -> None:
         client.on_link(3)  # type: ignore[arg-type] # not a function
 
 
+def test_closed_callback_is_not_called() -> None:
+    """`on_link` returns an object whose `close`, or `with` block, ends the calls; all share one watch of the link."""
+    endpoint = free_endpoint()
+    calls: list[str] = []
+    router = open_router(listen=[endpoint])
+    with nedbus.connect(endpoint) as bus:
+        with bus.on_link(lambda is_up: calls.append(f"first {is_up}")) as first:
+            second = bus.on_link(lambda is_up: calls.append(f"second {is_up}"))
+            bus.on_link(lambda is_up: calls.append(f"third {is_up}"))
+        router.close()
+        wait_for(lambda: len(calls) == 2, what="the loss of the link")
+        second.close()
+        second.close()
+        with open_router(listen=[endpoint]):
+            wait_for(lambda: "third True" in calls, what="the link")
+            first.close()
+    assert sorted(calls) == ["second False", "third False", "third True"]
+
+
 def test_changes_of_the_link_are_reported() -> None:
     """`on_link` calls a function when the router is gone and when it is back, with asyncio in the event loop."""
     endpoint = free_endpoint()

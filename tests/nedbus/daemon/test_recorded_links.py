@@ -61,7 +61,8 @@ def test_gps_that_falls_silent_is_an_event_and_evidence(monkeypatch: pytest.Monk
     assert "no GPS message" in service.verdict().text
     found = service.run().verdict()
     assert [each.kind for each in found.cause if each.kind != "text"] == ["no_messages", "dead_reckoning"]
-    assert ". Evidence: 08:30:02.7 no GPS message; 08:30:03.8 dead reckoning; " in found.text
+    injected = '08:30:02.6 PX4: "inject failure unit: gps (4), type: off (1), instance: 0"'
+    assert f". Evidence: {injected}; 08:30:02.7 no GPS message; 08:30:03.8 dead reckoning; " in found.text
     logged = read_file_events(PX4 / "gps_off_in_flight.ulg").event_log.events
     assert [each.text for each in logged if each.kind == "no_messages"] == ["no GPS message"]
 
@@ -84,7 +85,7 @@ def test_link_cut_is_the_end_of_messages_of_no_topic(monkeypatch: pytest.MonkeyP
 
 
 def test_sensor_failure_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PX4's text about a failed sensor leads the verdict for a minute, unless a condition is active; so in the log."""
+    """PX4's text about a failed sensor is a fault, and evidence for the missing messages that follow; so in the log."""
     service = Service(PX4 / "baro_failure_mavlink.bin.gz", monkeypatch).run(until=21)
     assert service.verdict().text.startswith(
         'position valid throughout, but PX4: "Baro sensor #0 failure: Timeout" at 07:24:54.0 UTC.'
@@ -96,7 +97,8 @@ def test_sensor_failure_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     report = report_of(read.event_log, "", "", read.end, within=1e9).vehicles["4"]
     logged = verdict_of("4", read.event_log.events, report.held, topics=report.topics, times=read.times, end=read.end)
     assert logged.usable
-    assert logged.text.startswith('position valid throughout, but PX4: "Baro sensor #0 failure: Timeout" at 07:24:53.7')
+    assert logged.text.startswith("position valid throughout, but no barometer message from 07:24:53.4 to 07:25:18.1")
+    assert 'PX4: "Baro sensor #0 failure: Timeout"' in logged.text
 
 
 def test_missing_seconds_of_the_log_are_logged_once(

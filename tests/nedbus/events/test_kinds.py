@@ -16,7 +16,7 @@ def test_causes_are_kinds_in_the_table() -> None:
 def test_row_in_the_table_defines_a_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     """A row in the table is sufficient for a flag to become an event, a state, a cause and a story."""
     row = Kind(
-        "freefall", "bad", "VehicleLandDetected", ("gps_fix_lost",), fault=True, flags={"freefall": "freefall"},
+        "freefall", "bad", "VehicleLandDetected", ("gps_fix_lost",), flags={"freefall": "freefall"},
         begin="free fall", end="free fall ended",
     )  # fmt: skip
     monkeypatch.setitem(KINDS, "freefall", row)

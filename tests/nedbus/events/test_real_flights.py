@@ -17,7 +17,19 @@ from typing import Final
 import pytest
 from pyulog import ULog
 
-from nedbus.events import Event, EventLog, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
+from nedbus.events import (
+    Event,
+    EventLog,
+    Story,
+    Times,
+    Verdict,
+    events_outside,
+    is_alarm,
+    spans_of,
+    state_at,
+    stories_of,
+    verdict_of,
+)
 from nedbus.flights import FileEvents
 from nedbus_msgs import ResetTracker
 from nedbus_msgs.frames import wrap
@@ -27,10 +39,13 @@ from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
 from tests.nedbus.events import events_table
 from tests.nedbus.events.events_table import Row
+from tests.peers.command_line import run_command
 
 TABLE: Final = json.loads(events_table.TABLE.read_text())
 TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
 NAMES: Final = [name for name in TABLE if name != "from"]
+FREQUENT: Final = "ev_refused"  # a script counted messages in reset_counter: hundreds of resets, mostly suppressed
+STEADY: Final = [name for name in NAMES if name != FREQUENT]
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
 FLAPPING: Final = 4, 10.0, 5.0  # changes per window, window [s], pause until the last one is reported [s]
 TRACKED: Final = {
@@ -38,6 +53,7 @@ TRACKED: Final = {
 }  # fmt: skip
 NOT_IN_TABLE: Final = (
     "dropout", "text", "ekf_changed", "other_ekf", "height_contradicted", "position_contradicted", "no_messages",
+    "aid_rejected", "aid_unused", "vision_unused", "vehicle_type", "transition", "origin_contradicted",
 )  # fmt: skip
 RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # PX4 1.15 name: current name
 
@@ -101,7 +117,7 @@ def sizes_of(event: Event) -> Mapping[str, float]:
     return {**event.numbers, **(down if event.kind == "reset" else {})}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", STEADY)
 def test_events_equal_the_independent_table(name: str) -> None:
     """Events and table rows are the same: kind, change, time within a millisecond, flags and sizes.
 
@@ -123,11 +139,12 @@ def test_events_equal_the_independent_table(name: str) -> None:
                 assert sizes[number] == pytest.approx(value, rel=0.01)
             elif number not in ("flags", "quantities", "origin"):  # without sizes if the origin changed
                 assert sizes[number] == pytest.approx(value, abs=2e-4), (number, row)
+    left = [event for event in left if "superseded" not in event.text]  # by the flags of another EKF
     assert [(time_of(event), event.kind, event.text) for event in left] == []
 
 
 @pytest.mark.parametrize("thinned", [False, True])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", STEADY)
 def test_events_and_track_agree_in_every_reset(name: str, thinned: bool) -> None:
     """A reset event has the sizes that ResetTracker removes from the track, at full rate and at 10 Hz."""
     event_log, tracker, last = EventLog(), ResetTracker(), -math.inf
@@ -207,13 +224,6 @@ def test_healthy_flight_has_no_story() -> None:
     assert why("sitl_1.15_events") == []
 
 
-def test_flight_without_gnss_has_one_story() -> None:
-    """A flight without GNSS has one "watch" story: no fix and no global reference since the first message."""
-    (only,) = why("cuav_1.16_gps_interference")
-    assert (only.begin, only.until, only.is_bad) == (None, None, False)
-    assert only.what == "no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
-
-
 @pytest.mark.parametrize(
     ("name", "lacking"),
     [
@@ -233,12 +243,15 @@ def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...])
 def test_conditions_that_last_a_whole_flight(name: str) -> None:
     """Of watch and bad conditions, only no fix, no global reference and invalid estimates last a whole flight."""
     (vehicle,) = cached_events(name).event_log.vehicles.values()
-    held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
+    active = [*vehicle.conditions.values(), *vehicle.usual.values()]
+    held = {each.text for each in active if each.initial and each.severity != "info"}
     not_global = {"xy has no global reference", "z has no global reference"}
     assert held == {
         "cuav_1.16_gps_interference": {"no GPS fix, 0 satellites", *not_global},
         "cubeorange_1.12_small": {"xy not valid", "vxy not valid", *not_global},
         "sitl_1.13_three_topics": {"xy not valid", "vxy not valid"},
+        "ev_right": not_global,
+        "ev_refused": not_global,
     }.get(name, set())
 
 
@@ -276,7 +289,7 @@ def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
 
 def test_stories_at_a_time_are_those_active_then() -> None:
     """`at` selects the stories active at that time, bad or not, or if there are none the last one before it."""
-    assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
+    assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid"]
     assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
     assert [each.what for each in why("gps_loss", at=36.0)] == ["failsafe"]
 
@@ -316,7 +329,7 @@ def test_contradicted_height_has_evidence_and_reset() -> None:
     """The story of a diverged height contains its evidence, the contradicted position, and the reset that ended it."""
     height = next(each for each in why("nxp_v0_ekf_failure") if each.begin and each.begin.kind == "height_contradicted")
     assert [each for each in short(height.before) if each[0] != "text"] == [
-        ("dead_reckoning", 116.238), ("estimator_fault", 116.609),
+        ("aid_unused", 115.36), ("dead_reckoning", 116.238), ("estimator_fault", 116.609),
     ]  # fmt: skip
     assert "position_contradicted" in [each.kind for each in height.meanwhile]
     assert "reset of height by 24.3 m, vz by 4.8 m/s" in [each.text for each in height.after]  # delta_z: -19.2
@@ -347,7 +360,8 @@ def verdict(path: Path) -> Verdict:
     """Return the verdict on the vehicle in a log."""
     read = ulogs.cached_events(path)
     events, (followed,) = read.event_log.events_since(0)[0], read.event_log.vehicles.values()
-    held = [each for each in followed.conditions.values() if each.severity != "info"]
+    events = sorted(events, key=lambda event: event.time)
+    held = [each for each in [*followed.conditions.values(), *followed.usual.values()] if each.severity != "info"]
     return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)
 
 
@@ -396,10 +410,8 @@ def test_vehicle_with_vision_is_usable_without_gps() -> None:
     """A vehicle with vision is usable, although it has no GPS fix or global reference for the whole flight."""
     found = verdict(path_of("cuav_1.16_gps_interference"))
     assert found.usable is True
-    text = (
-        "position valid throughout, but no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
-    )
-    assert found.text == f"{text} from the first message until the end (62.3 s)."
+    usual = "no GPS fix, 0 satellites, xy has no global reference, z has no global reference"
+    assert found.text == f"no faults in 62 s; throughout: {usual}"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -414,8 +426,11 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
             found = verdict_of(
                 followed.name, before, state.conditions, topics=followed.topics, times=Times(is_live=True), end=now
             )
-            worst = next(each for each in found.stories if each.spans[0].text == state.text)
-            assert found.text.startswith(f"not usable: {worst.what} " if state.text != "failsafe" else state.text), now
+            alike = [each for each in found.stories if each.spans[0].text == state.text]
+            worst = next(each for each in alike if each.begin is found.begin)
+            assert found.usable is False, now
+            if worst.kind not in ("failsafe", "reset"):  # the text omits the small part of a large reset
+                assert found.text.startswith(f"not usable: {worst.what} "), now
             states += 1
     assert bool(states) == (name != "cuav_1.16_gps_interference")
 
@@ -427,3 +442,123 @@ def test_verdict_has_at_most_three_lines(path: Path) -> None:
     assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3
     is_healthy = path.stem in ("sitl_1.15_events", "ulog_stream_flight1", "ulog_stream_lossy1")
     assert not is_healthy or re.fullmatch(r"no faults in \d+ s", text)
+
+
+@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+def test_every_fault_event_is_in_a_story(path: Path) -> None:
+    """Of the events of severity bad and watch, only texts of PX4 are in no story; `--all` lists those separately."""
+    read = ulogs.cached_events(path)
+    events = sorted(read.event_log.events, key=lambda event: event.time)
+    outside = events_outside(verdict(path).stories, events)
+    assert {event.kind for event in outside} <= {"text"}
+    assert not any(is_alarm(event) for event in outside)
+
+
+FIRST_SENTENCES: Final = {
+    "baro_failure": "position valid throughout, but no barometer message from 07:24:53.4 to 07:25:18.1 UTC (24.7 s).",
+    "ev_refused": "not usable: xy and vxy not valid (one of 6) from 22:10:57.1 UTC, until the end (7.5 s).",
+    "ev_right": "position valid throughout, but dead reckoning (one of 2) from 22:11:51.6 to 22:11:53.9 UTC (2.3 s).",
+    "gps_off_in_flight": "not usable: xy and vxy not valid from 08:30:07.2 UTC, until the end (11.0 s).",
+    "mag_failure": "position valid throughout, but no magnetometer message (one of 2) from 22:12:57.6 to 22:13:11.3",
+    "multi_ekf_switch": 'position valid throughout, but PX4: "Attitude failure detected" at 22:12:07.7 UTC.',
+    "fmuv6c_1.17_selector_whipsaw": "not usable: reset of height by -129.8 m, vz by -33.5 m/s (one of 23) at 16:25",
+}  # fmt: skip
+DECISIVE: Final = {
+    "baro_failure": ["Injected: baro off", "Baro sensor #0 failure: Timeout"],
+    "ev_refused": ["stopped fusing vision position", "vision arrives, but the EKF does not fuse it"],
+    "ev_right": ["stopped fusing vision position", "reset of xy by 2.2 m"],
+    "gps_off_in_flight": ["no GPS message", "gps off", "dead reckoning"],
+    "mag_failure": ["mag off", "Magnetometer sensor #0 failure: Timeout"],
+    "multi_ekf_switch": ["Injected: gyro stuck", "primary EKF changed 1 (gyro fault) -> 0"],
+    "fmuv6c_1.17_selector_whipsaw": [
+        "primary EKF changed 1 (filter fault) -> 0", "Accel 1 clipping, not safe to fly!",
+        "primary EKF changed from 0 to 1",
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FIRST_SENTENCES)
+def test_verdict_begins_with_what_a_pilot_must_know(name: str) -> None:
+    """The first sentence is the worst fault in flight; the causes precede it, the decisive ones are quoted, uncut."""
+    found = verdict(path_of(name))
+    assert found.text.startswith(FIRST_SENTENCES[name])
+    evidence = found.text.partition("Evidence")[2]
+    assert all(words in evidence for words in DECISIVE[name])
+    assert "..." not in found.text
+
+
+def test_vision_that_is_not_fused_is_an_event() -> None:
+    """Vision that the EKF refuses is an event: rejected in another frame, and not fused with wrong times."""
+    found = [each.text for each in events_in("ev_refused") if each.change == "begin"]
+    assert {"EKF rejects vision position, vision height"} & {*found} or "EKF rejects vision position" in found
+    assert "EKF rejects vision yaw" in found
+    assert found.count("vision arrives, but the EKF does not fuse it") >= 3
+    [rejected] = [each for each in events_in("ev_right") if each.kind == "aid_rejected" and each.change == "begin"]
+    assert (rejected.text, rejected.severity) == ("EKF rejects vision position", "watch")
+    resets = [each for each in events_in("ev_right") if each.kind == "reset" and each.severity == "watch"]
+    assert "aid_rejected" in [each.kind for each in resets[-1].evidence]
+
+
+def same_events(read: FileEvents) -> list[tuple[object, ...]]:
+    """Return events without what a conversion cannot keep: dropouts, invalid messages, and rounded durations."""
+    events = [each for each in read.event_log.events if each.kind not in ("dropout", "rejected")]
+    return sorted(
+        (
+            each.kind,
+            each.change,
+            each.severity,
+            each.text.partition(" after ")[0],
+            0.0 if each.kind == "vision_unused" else round(each.boot or 0.0, 2),
+        )
+        for each in events  # flags and vision differ in rate: their order decides within 0.1 s
+    )
+
+
+def convert_whole(path: Path, folder: Path) -> Path:
+    """Convert all topics of a log to MCAP."""
+    converted = folder / f"{path.stem}.mcap"
+    assert run_command("convert", str(path), str(converted), "--topics", "*").exit_code == 0
+    return converted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+def test_conversion_has_the_same_events_and_verdict(path: Path, tmp_path: Path) -> None:
+    """A log and its conversion, which hold the messages in different orders, have the same events and verdict."""
+    converted = convert_whole(path, tmp_path)
+    assert same_events(ulogs.cached_events(converted)) == same_events(ulogs.cached_events(path))
+    assert verdict(converted).text == verdict(path).text
+
+
+def test_conversion_of_a_failed_estimate_has_the_same_contradictions(tmp_path: Path) -> None:
+    """The contradicted height of 2 s is in the log and in its conversion."""
+    path = path_of("nxp_v0_ekf_failure")
+    converted = tmp_path / "a.mcap"
+    topics = "vehicle_local_position,vehicle_gps_position,vehicle_air_data,vehicle_status"
+    assert run_command("convert", str(path), str(converted), "--topics", topics).exit_code == 0
+    both = [
+        [each for each in same_events(read) if str(each[0]).endswith("_contradicted")]
+        for read in (ulogs.cached_events(path), ulogs.cached_events(converted))
+    ]
+    assert both[0] == both[1]
+    assert len(both[0]) == 3
+
+
+TURN6: Final = LOGS.parents[1] / "cases" / "turn6"
+
+
+@pytest.mark.parametrize(
+    "name", ["21_origin_altitude_baro_later", "21b_origin_altitude_baro", "21c_origin_altitude_no_baro"]
+)
+def test_wrong_origin_altitude_is_one_statement(name: str) -> None:
+    """With or without a barometer: the origin's altitude is wrong during the whole flight, and z is right."""
+    statement = "origin altitude (ref_alt) 488 m below GNSS (z is right) from 08:53:40.4 UTC, until the end (29.4 s)."
+    assert verdict(TURN6 / f"{name}.ulg").text == f"position valid throughout, but {statement}"
+
+
+def test_balloon_and_vtol_are_explained() -> None:
+    """A barometer alone contradicts no height at 23 km; a transition is the evidence for a position lost in it."""
+    assert "above barometer" not in verdict(TURN6 / "20_balloon.ulg").text
+    assert "Evidence: 50.000 VTOL transition to rotary wing." in verdict(TURN6 / "14_vtol.ulg").text
+    texts = [each.text for each in ulogs.cached_events(TURN6 / "14_vtol.ulg").event_log.events]
+    assert "vehicle type changed from rotary wing to fixed wing" in texts

@@ -91,7 +91,7 @@ def test_report_has_all_events_of_its_period() -> None:
     """A report contains all kept events of the period, and no events for a period of NaN."""
     flight = Flight()
     for number in range(1500):
-        flight.wait(0.1).status(ARMED, nav_state=number % 3)
+        flight.wait(0.1).status(ARMED, nav_state=number % 20)
     sent = report(flight)
     assert len(sent.events) == 1499
     assert sent.events[-1].time == flight.now

@@ -88,8 +88,8 @@ def test_end_of_one_fault_does_not_end_another() -> None:
     assert [(each.what, each.until) for each in why(flight)] == [("EKF fault: heading", None)]
 
 
-def test_watch_condition_is_a_story_if_none_is_bad() -> None:
-    """A "watch" condition is a story if no condition is "bad", or if `at` selects its time."""
+def test_watch_condition_is_a_story_beside_a_bad_one() -> None:
+    """A "watch" condition that has ended is a story, also if a "bad" one follows; `at` selects the one of its time."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -100,7 +100,7 @@ def test_watch_condition_is_a_story_if_none_is_bad() -> None:
     assert [each.what for each in why(flight)] == ["GNSS jamming: indicator 100"]
     flight.fly(100)
     flight.wait(0.1).send(xy_valid=False)
-    assert [each.what for each in why(flight)] == ["xy not valid"]
+    assert [each.what for each in why(flight)] == ["GNSS jamming: indicator 100", "xy not valid"]
     assert [each.what for each in why(flight, at=jammed)] == ["GNSS jamming: indicator 100"]
     assert [each.what for each in why(flight, at=flight.now - 50)] == ["GNSS jamming: indicator 100"]
     assert [each.what for each in why(flight, at=flight.now + 50)] == ["xy not valid"]

@@ -373,4 +373,4 @@ def test_number_of_initial_conditions_is_limited() -> None:
         flight.status(ARMED)
         flight.fly(PAUSE + 1.0)
         flight.update()
-    assert len(flight.event_log.vehicles["1"].initial) == 100
+    assert 90 <= len(flight.event_log.vehicles["1"].initial) <= 100

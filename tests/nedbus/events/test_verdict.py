@@ -271,20 +271,16 @@ def condition_of(kind: str, flag: str, words: str, since: float = 0.0) -> Condit
     return Condition(kind, "watch", words, since, begin, initial=True)
 
 
-def test_conditions_of_whole_flight_are_one_fault() -> None:
-    """Conditions active for a whole flight form one fault, or are its evidence if the position was never valid."""
+def test_missing_global_reference_of_a_whole_flight_is_no_fault() -> None:
+    """A flight without GNSS has no fault, only a note on it; it is evidence if the position was never valid."""
     conditions = [
         condition_of("gps_fix_lost", "", "no GPS fix"),
         condition_of("xy_not_global", "xy_global", "xy has no global reference", 0.1),
     ]  # fmt: skip
     topics = ["vehicle_local_position", "vehicle_gps_position"]
     found = verdict_of("1", [], conditions, topics=topics, times=Times(), end=62.0)
-    assert has_words(
-        found.text, "position valid", "no GPS fix", "no global reference", "first message", "end", "62.0 s"
-    )
-    assert (found.usable, len(found.stories), found.begin, found.end) == (True, 1, None, None)
-    assert [span.kind for span in found.stories[0].spans] == ["gps_fix_lost", "xy_not_global"]
-    assert "vidence" not in found.text
+    assert found.text == "no faults in 62 s; throughout: no GPS fix, xy has no global reference"
+    assert (found.usable, found.stories, found.begin, found.end) == (True, (), None, None)
     invalid = replace(condition_of("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
     assert has_words(found.text, "not usable", "xy not valid", "first message", "until the end", "62.0 s")
@@ -374,8 +370,8 @@ def test_shortened_evidence_prefers_sensor_events() -> None:
         flight.wait(1.0).send()
     text = verdict(flight).text
     assert "(one of 3)" in text
-    assert "GPS fix lost" in text
-    assert "dead reckoning" not in text
+    assert "only 0 satellites, dead reckoning" in text
+    assert text.index("GPS fix lost") < text.index("dead reckoning")
 
 
 def test_verdict_fits_three_lines() -> None:
@@ -497,3 +493,128 @@ def test_one_wild_message_of_a_log_is_no_fault(tmp_path: Path, wild: dict[str, A
         found = verdict_of("1", read.event_log.events, topics=topics, times=read.times, end=read.end)
         assert len(read.event_log.events) == 2
         assert found.text.startswith("no faults") == (count == 1)
+
+
+def reset_and_switch(*before: Event) -> list[Event]:
+    """Return events of a change of the EKF and a reset one second later, after others."""
+    return [
+        *before,
+        Event("1", "ekf_changed", "once", "watch", "primary EKF changed from 0 to 1", 100.0),
+        Event("1", "reset", "once", "watch", "reset of xy by 31.9 m", 101.0, names=("xy",), numbers={"north": 31.9}),
+    ]
+
+
+OVERLOAD = [
+    Event(ALL, "overload", "begin", "watch", "reader overloaded", 50.0),
+    Event(ALL, "overload", "end", "info", "reader caught up", 55.0),
+]
+NO_ORIGIN = [Event("1", "xy_not_global", "begin", "watch", "xy has no global reference", 20.0, names=("xy_global",))]
+
+
+@pytest.mark.parametrize("before", [[], OVERLOAD, NO_ORIGIN], ids=["alone", "overload", "no_origin"])
+@pytest.mark.parametrize("times", [Times(), LIVE], ids=["file", "live"])
+def test_what_changed_the_estimate_leads(before: list[Event], times: Times) -> None:
+    """A reset leads, with the change of the EKF as evidence, beside an ended fault and a lasting minor condition."""
+    topics = ("vehicle_local_position", "estimator_selector_status", "vehicle_gps_position")
+    found = verdict_of("1", reset_and_switch(*before), topics=topics, times=times, end=110.0)
+    assert found.text.startswith("position valid throughout, but reset of xy by 31.9 m ")
+    assert has_words(found.text, "Evidence", "primary EKF changed from 0 to 1")
+    assert len(found.stories) == 1 + bool(before)
+
+
+def test_large_reset_in_flight_makes_the_vehicle_unusable() -> None:
+    """A reset of 10 m or more while armed is bad; while disarmed, or as the recovery of an invalid estimate, it is not.
+
+    The text names only the quantities that moved that far.
+    """
+    for state, invalid, usable in ((ARMED, False, False), (DISARMED, False, True), (ARMED, True, False)):
+        flight = Flight()
+        flight.status(state)
+        flight.fly(2)
+        for _ in range(2):
+            flight.wait(0.1).send(xy_valid=not invalid)
+        flight.wait(0.1).send(x=20.0, xy_reset_counter=1, z=0.6, z_reset_counter=1)
+        for _ in range(10):
+            flight.wait(0.1).send(x=20.0, xy_reset_counter=1, z=0.6, z_reset_counter=1)
+        (reset,) = [event for event in flight.event_log.events if event.kind == "reset"]
+        assert reset.severity == ("watch" if invalid else "bad" if state == ARMED else "info")
+        found = verdict(flight)
+        assert found.usable is usable
+        if state == ARMED and not invalid:
+            assert found.text.startswith("not usable: reset of xy by 20.0 m (20.0 north, 0.0 east) at ")
+
+
+def test_fault_in_flight_leads_before_one_on_the_ground() -> None:
+    """In a file, a fault between take-off and disarming leads before a worse one on the ground; live, the present one.
+
+    The ground began again in a simulation of PX4: its log had a hole after the landing.
+    """
+    flight = Flight()
+    flight.status(ARMED)
+    flight.send("vehicle_land_detected", landed=True)
+    flight.fly(2)
+    flight.send("vehicle_land_detected", landed=False)
+    flight.fly(2)
+    flight.send(dead_reckoning=True)
+    flight.wait(1.0).send()
+    flight.fly(2)
+    flight.status(DISARMED)
+    flight.fly(20)
+    flight.wait(6.0).update("stale")
+    flight.send()
+    flight.fly(1)
+    found = verdict(flight)
+    assert found.text.startswith("position valid throughout, but dead reckoning from ")
+    assert has_words(found.text, "Also", "silent: no vehicle_local_position")
+    assert [story.in_flight for story in found.stories] == [True, False]
+
+
+def test_cause_within_half_a_second_after_the_fault_is_evidence() -> None:
+    """Of other topics, which differ in rate, what changes within 0.5 s after the fault is its evidence, not "Also"."""
+    for delay, kinds in ((0.3, ["not_fused"]), (0.7, [])):
+        flight = Flight()
+        flight.status(ARMED)
+        flight.send("estimator_status_flags", instance=0, cs_ev_pos=True)
+        flight.fly(1)
+        flight.send(dead_reckoning=True)
+        flight.wait(delay).send("estimator_status_flags", instance=0, cs_ev_pos=False)
+        flight.wait(0.1).send(dead_reckoning=True)
+        found = verdict(flight)
+        assert [event.kind for event in found.cause] == kinds
+        assert ("Also" in found.text) == (not kinds)
+
+
+def test_evidence_is_nearest_in_kind_before_nearest_in_time() -> None:
+    """Texts about the sensor that fails are quoted before later ones about others; recovered conditions are not."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_baro_fault=False)
+    flight.fly(1)
+    flight.send("estimator_status_flags", instance=0, reject_hor_pos=True, cs_baro_fault=False)
+    flight.wait(1.0).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_baro_fault=False)
+    flight.wait(1.0)
+    px4_text(flight, "Compass 0 inconsistent")
+    for words in ("GPS 0 lost", "Airspeed low", "Battery hot", "Wind high"):
+        flight.wait(1.0)
+        px4_text(flight, words)
+    flight.wait(1.0).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True)
+    flight.wait(0.1).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=False)
+    flight.wait(0.1).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True)
+    found = verdict(flight, times=LIVE)
+    assert found.text.startswith("position valid throughout, but EKF fault: magnetometer")
+    evidence = found.text.partition("Evidence")[2].partition("Also")[0]
+    assert has_words(evidence, "Compass 0 inconsistent", "Wind high")
+    assert "Airspeed" not in evidence
+    assert "rejects" not in evidence
+
+
+def test_live_verdict_tells_since_when() -> None:
+    """A service that was restarted knows the vehicle only since its first message, and its verdict says so."""
+    flight = Flight()
+    flight.fly(30)
+    (known,) = report_of(flight.event_log, "s", "h", flight.now, within=60).vehicles.values()
+    assert known.first == pytest.approx(100.1)
+    sound = verdict_of("1", [], topics=known.topics, times=LIVE, end=flight.now, since=known.first)
+    assert sound.text == "no faults since 00:01:40.1 UTC (29.9 s)"
+    found = verdict_of("1", reset_and_switch(), topics=known.topics, times=LIVE, end=flight.now, since=known.first)
+    assert found.text.startswith("position valid since 00:01:40.1 UTC, but reset of xy by 31.9 m ")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.flights import RecordingWriter, read_file_events
+from nedbus.flights import RecordingWriter, UtcEstimate, read_file_events
 from nedbus_msgs import DEFAULT_TOPIC, Address, Provenance, is_unix_time
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
@@ -89,3 +89,11 @@ def test_damaged_timestamp_leaves_the_utc_known(tmp_path: Path) -> None:
     assert found is not None
     assert (found.offset_us, found.count) == (BOOT_UTC, 19)
     assert nedbus.utc_of(nedbus.read(path, ["*"])) == found
+
+
+def test_most_timestamps_of_all_streams_decide_their_clock() -> None:
+    """Without a stream with UTC, timestamps are Unix times if most of those of all streams are, not of the first."""
+    estimate = UtcEstimate()
+    estimate.add("first", {"timestamp": np.arange(3) + 1_000_000})
+    estimate.add("second", {"timestamp": np.arange(1000) * 1_000_000 + 1_700_000_000_000_000})
+    assert estimate.result() == nedbus.UtcOffset("timestamp", 0, 1000, 0)

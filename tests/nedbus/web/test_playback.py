@@ -191,9 +191,10 @@ def test_recording_page_lists_verdict_and_faults(recording: Recording) -> None:
     Times are on the vehicle's clock, which header and axes name.
     """
     page = open_page(recording)
-    (verdict,), (fault,) = page.texts("list", "verdict"), page.elements("list", "fault")
+    (verdict,), (fault, reset) = page.texts("list", "verdict"), page.elements("list", "fault")
     assert verdict.startswith("not usable: xy not valid from 91.000 to 121.000 s since boot")
     assert (fault.get("data-do"), fault.get("data-with"), fault.findtext("b")) == ("fault", "0", "xy not valid")
+    assert str(reset.findtext("b")).startswith("reset of xy by 4.1 m")
     assert page.texts("list", "fault")[0].endswith(" xy not valid from 91.000 to 121.000 s since boot (30.0 s)")
     assert "1.0 s since boot, 0.0 s since the start" in page.panel("head")
     assert page.viewer._clock.args == {"start": 1.0, "clock": "s since boot"}

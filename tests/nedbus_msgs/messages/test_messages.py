@@ -303,6 +303,7 @@ def test_definition_is_complete(name: str) -> None:
 
 
 @pytest.mark.process
+@pytest.mark.quick  # a new property of a message changes its page
 def test_generated_pages_and_imports_are_up_to_date() -> None:
     """Each message has an up-to-date page (`make generated`) and an import for type checkers."""
     assert [path.name for path, text in committed().items() if not path.exists() or path.read_text() != text] == []

@@ -74,8 +74,9 @@ def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: Htt
     Use it for routers without a nedbus service; a service serves its own metrics (serve --http).
     """
     _split_http("--http", http)
+    make_exporter = monitoring.Exporter  # raises ConfigError without the extra, before a bus is opened
     with open_bus() as bus:
-        exporter = monitoring.Exporter(bus, selection, version=__version__)
+        exporter = make_exporter(bus, selection, version=__version__)
         with serve_pages(http, exporter.pages):
             run_until_stopped(exporter.run)
 
@@ -89,7 +90,8 @@ def foxglove(
     Foxglove can plot every field, and show poses in 3D and positions on a map.
     """
     host, port = _split_http("--http", http)
-    with open_bus() as bus, bridges.FoxgloveServer(bus, host=host, port=port) as server:
+    make_server = bridges.FoxgloveServer  # raises ConfigError without the extra, before a bus is opened
+    with open_bus() as bus, make_server(bus, host=host, port=port) as server:
         write_stderr(f"in Foxglove, choose Open connection > Foxglove WebSocket, and enter {server.url}")
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
 

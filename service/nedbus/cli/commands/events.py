@@ -32,6 +32,7 @@ from nedbus.events import (
     Times,
     Verdict,
     by_vehicle,
+    events_outside,
     format_duration,
     report_of,
     verdict_of,
@@ -158,17 +159,18 @@ def why(
         except ValueError as exc:
             raise ConfigError("--at", f"{at!r}: {exc}: expected {_AT}") from exc
         verdict = verdict_of(
-            name, events, known.held, topics=known.topics, unknown=known.unknown, times=times, end=end, at=moment
-        )
+            name, events, known.held, topics=known.topics, unknown=known.unknown, times=times, end=end, at=moment,
+            since=known.first,
+        )  # fmt: skip
         if json_output:
             write(json.dumps({"vehicle": name} | _verdict_fields(verdict, times)))
             continue
         faults += len(verdict.stories)
         texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
-        worst = next((each.what for each in verdict.stories if each.begin is verdict.begin), "")
-        if worst not in verdict.text and not details:  # the verdict abbreviates it
-            texts.append(fold("    ", to_text(worst, _MAX_TEXT)))
-        texts += ["\n".join(_describe(name, story, times, end, advice)) for story in verdict.stories if details]
+        if details:
+            texts += ["\n".join(_describe(name, story, times, end, advice)) for story in verdict.stories]
+            if other := events_outside(verdict.stories, events):
+                texts.append("\n".join([f"{name}: other texts", *(_timed(event, times) for event in other)]))
     if texts:
         write(("\n\n" if details else "\n").join(texts))
     if faults and not details:
@@ -184,8 +186,7 @@ def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str)
         if shown or title.startswith("ended"):
             yield f"  {title}"
         for each in shown:
-            text = _before(each, story.since) if title == "before it" else _shown(each)
-            yield fold(f"    {times.text(each)}  ", text)
+            yield _timed(each, times, story.since if title == "before it" else None)
     if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before it"
     if story.lacking:
@@ -213,8 +214,14 @@ def _shown(event: Event) -> str:
     return to_text(event.words, _MAX_TEXT)
 
 
+def _timed(event: Event, times: Times, since: float | None = None) -> str:
+    return fold(f"    {times.text(event)}  ", _shown(event) if since is None else _before(event, since))
+
+
 def _before(event: Event, time: float) -> str:
-    return f"{_shown(event)} ({format_duration(max(0.0, time - event.time))} before)"
+    """Format an event with its distance from a time, which it may explain."""
+    distance = format_duration(abs(time - event.time))
+    return f"{_shown(event)} ({distance} {'before' if event.time <= time else 'after'})"
 
 
 def _follow(

@@ -13,8 +13,8 @@ from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
 from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
+from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
-from nedbus.events import format_duration
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
 

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -12,17 +13,17 @@ from nedbus.cli.follow import write_notice
 from nedbus.cli.options import ALL, DurationOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.output.table import show_progress
-from nedbus.cli.recorder import Recorder
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
 from nedbus.errors import NoDataError
+from nedbus.extras import import_optional
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection
 
 
 @command
 def record(
-    bus: Bus,
+    open_bus: Callable[[], Bus],
     selection: Selection = ALL,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="Recording to write")],
@@ -32,9 +33,10 @@ def record(
 
     A crash loses about the last second.
     """
+    recorders = import_optional("mcap", "nedbus.cli.recorder")  # before a bus is opened, and waited for
     notice = time.monotonic() + TIMINGS.first_sample
-    with bus.subscribe_to(selection, mode="every") as subscription:
-        recorder = Recorder(subscription, output)
+    with open_bus() as bus, bus.subscribe_to(selection, mode="every") as subscription:
+        recorder = recorders.Recorder(subscription, output)
 
         def tick() -> None:
             nonlocal notice

@@ -12,11 +12,12 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import Final, Literal, TextIO
+from typing import Final, TextIO
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import EVENTS, About, about
 
+from . import LogFormat, LogLevel
 from .streams import MAX_TEXT, STRUCTURED, counted, printable, to_text
 
 BURST: Final = 50  # lines of one kind that may be logged at once
@@ -27,8 +28,6 @@ _MAX_KINDS: Final = 1000  # nedbus itself has about 40
 _MAX_TRACEBACK: Final = 20_000  # characters; the end is kept, which names the error
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
-LogFormat = Literal["text", "json"]
-LogLevel = Literal["debug", "info", "warning", "error"]
 ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from time import monotonic
@@ -103,13 +104,17 @@ class Heartbeats:
         self._groups: set[Group] = set()  # changed by single atomic calls
         self._job: Job | None = None
         self._closed = False
+        self._lock = threading.Lock()  # guards both: several threads may put the first message
 
     def resume(self, writer: Writer) -> None:
         """Schedule the heartbeat of a writer that has put a message after a silence."""
         writer.is_silent, writer.heartbeat_due = False, writer.last_put + _PAUSES[0]
-        if self._job is None:
-            self._job = Job(self._run)
-        self._job.wake(writer.heartbeat_due)
+        with self._lock:
+            if self._job is None and not self._closed:
+                self._job = Job(self._run)
+            job = self._job
+        if job is not None:
+            job.wake(writer.heartbeat_due)
 
     def watch(self, group: Group) -> bool:
         """Hand over the messages of a group within MAX_HOLD, now and later; return False once closed."""
@@ -123,7 +128,8 @@ class Heartbeats:
 
     def close(self) -> None:
         """Stop all heartbeats, and hand over all groups: now, and from now on after each message. Idempotent."""
-        self._closed = True
+        with self._lock:
+            self._closed = True
         if self._job is not None:
             self._job.end()
         for group in tuple(self._groups):

@@ -11,8 +11,8 @@ import logging
 import queue
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -240,19 +240,18 @@ class Inbox:
         while True:
             with self._lock:
                 taken = self._unread.pop_batch(max_messages) if self._unread else []
-                lost = sum([arrival.lost for arrival in taken])
-                for stream in {arrival.stream for arrival in taken}:
-                    lost, stream.unreported = lost + stream.unreported, 0
+                losses = _take_losses(taken)
             if self._ack_requests:
                 self.acknowledge(drained=False)
             if not taken:
                 return None
-            batch = _batch_maker()(taken, self.decoder, lost=lost)
+            batch = _batch_maker()(taken, self.decoder, lost=losses.total())
             with self._lock:
                 if len(batch):
                     self._counters.received += len(batch)
                     return batch
-                taken[0].stream.unreported += lost
+                for stream, lost in losses.items():  # the next valid message of each stream reports them
+                    stream.unreported += lost
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
         arrived, stream = self._unread.arrived, self.streams.get(request.key)
@@ -302,6 +301,15 @@ class Inbox:
         if text not in self._warned:
             self._warned.add(text)
             _log.warning("%s: %s", self.name, text, extra=about("dropped" if "dropped" in text else "incomplete"))
+
+
+def _take_losses(arrivals: Iterable[Arrival]) -> Counter[Stream]:
+    """Return the unreported losses of each stream of these arrivals, and mark them as reported."""
+    losses = Counter[Stream]()
+    for arrival in arrivals:
+        losses[arrival.stream] += arrival.lost + arrival.stream.unreported
+        arrival.stream.unreported = 0
+    return losses
 
 
 def check_count(name: str, count: object) -> None:

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import islice
 from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import Field, TypeAdapter
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from nedbus.client.closing import join_thread
 from nedbus.client.discovery import parse_replies
@@ -190,7 +190,9 @@ class _Field:
     type: str
 
 
-_FIELDS: Final = TypeAdapter(Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)])
+_FIELDS: Final = TypeAdapter(
+    Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)], config=ConfigDict(defer_build=True)
+)
 
 
 def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: str) -> Schemas:

@@ -301,13 +301,16 @@ class LogStream:
             self._unsaved += len(chunk.data)
 
     def _write(self, file: "LogFile", parts: Iterable[tuple[float, bytes]]) -> None:
+        unsaved = deque(parts)
         try:
-            for gap, data in parts:
+            while unsaved:
+                gap, data = unsaved[0]
                 if gap:
                     file.mark_gap(gap)
                 file.write(data)
+                unsaved.popleft()
         except OSError as exc:
-            self._unsaved += len(data)
+            self._unsaved += sum(len(data) for _, data in unsaved)
             self._stop_saving(str(OutputError(file.path, exc)))
 
     def _save_definitions(self, records: Iterable[ulog.Record], now: float, *, others: int) -> None:

@@ -18,7 +18,8 @@ _LATE: Final = 0.5  # s; a longer wait means that the host is overloaded
 _MEMORY: Final = 5.0  # s without a late or dropped message until the overload has ended
 _MAX_READ: Final = 100  # messages per call of `read`
 _MAX_READ_TIME: Final = 0.1  # s per call of `read`
-_MAX_REJECTIONS: Final = 1000  # different ones that wait
+_MAX_REJECTIONS: Final = 1000  # different ones that wait; further ones count as one of `_FURTHER`
+_FURTHER: Final = Rejection("further places", f"the limit is {_MAX_REJECTIONS} different rejections at a time")
 
 
 def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:
@@ -110,7 +111,7 @@ class ReceiveQueue:
             for item in items:
                 if isinstance(item, Rejection):
                     is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
-                    self._rejections[item if is_known else next(iter(self._rejections))] += item.count
+                    self._rejections[item if is_known else _FURTHER] += item.count
                     continue
                 vehicle = self._vehicles.setdefault(item.system, _VehicleQueue())
                 if not vehicle.waiting:  # time in which it had no messages is not owed to it

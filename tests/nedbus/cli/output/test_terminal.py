@@ -495,8 +495,11 @@ def test_second_signal_exits_at_once(start: Start, number: signal.Signals, exit_
 
 SLOW = """
 import sys, time
+from nedbus.cli import run
 from nedbus.cli.app import make_app
 from nedbus.daemon import daemon
+
+run._END_TIMEOUT = 100.0
 
 def open_slowly(**settings):
     print("opening", flush=True)
@@ -612,17 +615,46 @@ def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> No
         os.close(main)
 
 
+def _make_run(folder: Path) -> list[str]:
+    """Return `make run` with a virtual environment in a folder, which runs this nedbus, and free ports."""
+    program = folder / "venv" / "bin" / "nedbus"
+    program.parent.mkdir(parents=True)
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
+    program.chmod(0o755)
+    (folder / "venv" / ".ready").touch()
+    options = f"-s sim: -l {free_endpoint()} --http 127.0.0.1:{free_port()}"
+    return ["make", "-C", str(ROOT), "run", f"VENV={folder}/venv", f"ARGS={options}"]
+
+
+@pytest.mark.process
+def test_kill_of_make_run_ends_the_service(tmp_path: Path) -> None:
+    """`make run & kill $!` ends the service, too, which frees its port."""
+    command, log = _make_run(tmp_path), tmp_path / "log"
+    with log.open("w") as written:
+        make = subprocess.Popen(command, stdout=written, stderr=written, env=without_coverage(), start_new_session=True)
+    try:
+        wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
+        make.terminate()
+        assert make.wait(DEADLINE) in {2, -signal.SIGTERM}
+        wait_for(lambda: not _is_alive(make.pid), what="the end of all its processes")
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(make.pid, signal.SIGKILL)
+    assert "stopping on SIGTERM" in log.read_text()
+
+
+def _is_alive(group: int) -> bool:
+    with suppress(ProcessLookupError):
+        os.killpg(group, 0)
+        return True
+    return False
+
+
 @pytest.mark.slow
 @pytest.mark.process
 def test_make_run_twice_explains_the_address_conflict(tmp_path: Path) -> None:
     """A second `make run` names the address in use and the remedy; Ctrl-C ends the first without a make error."""
-    program = tmp_path / "venv" / "bin" / "nedbus"
-    program.parent.mkdir(parents=True)
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
-    program.chmod(0o755)
-    (tmp_path / "venv" / ".ready").touch()
-    options = f"-s sim: -l {free_endpoint()} --http 127.0.0.1:{free_port()}"
-    command = ["make", "-C", str(ROOT), "run", f"VENV={tmp_path}/venv", f"ARGS={options}"]
+    command = _make_run(tmp_path)
     log = tmp_path / "log"
     with log.open("w") as written:
         first = subprocess.Popen(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import zenoh
 from nedbus.client.publishing import writer
 from nedbus.client.publishing.writer import HEARTBEAT, Heartbeats, Writer
 from nedbus.transport import Session
+from tests.waits import DEADLINE
 
 
 @dataclass(eq=False)
@@ -154,3 +156,28 @@ def test_many_heartbeats_are_sent_in_batches(stream: Stream) -> None:
     while stream.heartbeats.send_due(0.5) <= 0.0:
         pass
     assert len(stream.sent) == 1000
+
+
+def test_first_messages_on_two_threads_create_one_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two threads that put the first messages of a bus at the same time share a job, which `close` ends."""
+    created, ended = list[str](), list[str]()
+    is_creating, is_second_ready = threading.Event(), threading.Event()
+
+    def make_job(_: Callable[[float], float]) -> SimpleNamespace:
+        created.append("job")
+        is_creating.set()
+        assert is_second_ready.wait(DEADLINE)
+        return SimpleNamespace(wake=lambda _: None, end=lambda: ended.append("job"))
+
+    monkeypatch.setattr(writer, "Job", make_job)
+    heartbeats = Heartbeats(cast("Session", None))
+    first, second = (threading.Thread(target=heartbeats.resume, args=(FakeWriter(),)) for _ in range(2))
+    first.start()
+    assert is_creating.wait(DEADLINE)
+    second.start()
+    is_second_ready.set()
+    first.join()
+    second.join()
+    heartbeats.close()
+    heartbeats.resume(cast("Writer", FakeWriter()))  # a message that another thread puts after `close`
+    assert (created, ended) == (["job"], ["job"])

@@ -408,6 +408,18 @@ def test_losses_are_reported_by_the_next_valid_sample(small_queue: Inbox) -> Non
     assert small_queue.counts == Counts(received=1, lost=2, dropped=2, invalid=9)
 
 
+def test_losses_stay_with_their_stream_after_an_invalid_batch() -> None:
+    """If all messages of a batch are invalid, the next valid message of each stream reports the losses of its own."""
+    inbox = make_queue("every")
+    put(inbox, [raw(0), raw(0, key=OTHER_KEY, publisher="b")])
+    assert len(drain(inbox)) == 2
+    put(inbox, [raw(3, payload=INVALID), raw(6, key=OTHER_KEY, publisher="b", payload=INVALID)])
+    assert inbox.pop_batch() is None
+    put(inbox, [raw(7, key=OTHER_KEY, publisher="b"), raw(4)])
+    assert {sample.vehicle: sample.lost for sample in drain(inbox)} == {"1": 2, "2": 5}
+    assert inbox.counts == Counts(received=4, lost=7, invalid=2)
+
+
 @pytest.mark.parametrize("in_batches", [False, True])
 def test_waiting_samples_release_their_receive_buffer(small_queue: Inbox, in_batches: bool) -> None:
     """Samples deep in the queue are detached from their receive buffers, which Zenoh samples keep alive.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import signal
@@ -296,6 +297,18 @@ class TestFilesOfStream:
         assert [[each.duration for each in log.dropouts] for log in saved] == [[], [1000]]
         assert stream.status(1e6).unsaved == 0
 
+    def test_all_bytes_that_a_full_disk_refuses_are_counted(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """If the disk is full when the stream before the first message is written, all parts of it count."""
+        stream, header, record = stream_with_files(tmp_path)
+        parts = [header[start : start + 7] for start in range(0, len(header), 7)]
+        monkeypatch.setattr("nedbus.sources.mavlink.log_stream.LogFile.write", _refuse)
+        for index, part in enumerate(parts):
+            assert not [*stream.add(Chunk("delivered", part, begins=not index), 100.0)]
+        assert len([*stream.add(Chunk("delivered", record), 100.1)]) == 1
+        assert stream.status(100.1).unsaved == len(header) + len(record)
+
     def test_deleted_folder_is_logged_once_and_counted(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         """Data for a file that was deleted in flight is counted, and its loss is logged once."""
         stream, header, record = stream_with_files(tmp_path)
@@ -344,3 +357,7 @@ def test_changed_definitions_of_continued_stream_are_rejected(tmp_path: Path) ->
     assert (len(found), stream.status(3.0).undecodable, reasons) == (2, 2, [])
     found = [*stream.add(Chunk("delivered", struct.pack("<HBHQ", 10, ord("D"), 0, 1)), 4.0)]
     assert reasons == ["its definitions changed while no process received it"]
+
+
+def _refuse(_: object, data: bytes) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -233,7 +233,7 @@ def test_rejections_are_counted_together(host: Host) -> None:
         host.queue.put(Rejection("link", str(number)))
     assert host.read() == []
     assert host.rejections[0].count >= 5000
-    assert len(host.rejections) == 1000
+    assert len(host.rejections) == 1001  # the last one is for all beyond the limit
     assert sum(each.count for each in host.rejections) == 7000
 
 
@@ -245,3 +245,17 @@ def test_error_is_raised_after_the_last_message() -> None:
     assert next(host.queue.read(DEADLINE, lost_by_host=0))
     with pytest.raises(OSError, match="gone"):
         list(host.queue.read(DEADLINE, lost_by_host=0))
+
+
+def test_rejections_beyond_the_limit_are_counted_apart(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the limit of different rejections, further ones are counted together, and not for an unrelated place."""
+    monkeypatch.setattr(receive_queue, "_MAX_REJECTIONS", 3)
+    host.queue.put(*(Rejection(f"{number} x", "bad") for number in range(3)))
+    host.queue.put(*(Rejection("99 y", "worse", count=2) for _ in range(5)), Rejection("1 x", "bad"))
+    host.read()
+    assert [(each.where, each.count) for each in host.rejections] == [
+        ("0 x", 1), ("1 x", 2), ("2 x", 1), ("further places", 10),
+    ]  # fmt: skip
+    host.queue.put(Rejection("99 y", "worse"))
+    host.read()
+    assert host.rejections[-1] == Rejection("99 y", "worse")
