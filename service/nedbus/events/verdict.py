@@ -138,13 +138,8 @@ def verdict_of(
     stories = stories_of(events, held, topics=topics, at=at)
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
-<<<<<<< HEAD
-        length = "the services' history" if times.is_live else f"{end:.0f} s"
         remark = "" if known else f"; {_describe_unknown(topics)}"
-        return Verdict(f"no faults in {length}{remark}", known)
-=======
-        return Verdict(_without_faults(held, times, end, since, is_known=known is True), known)
->>>>>>> main
+        return Verdict(f"{_without_faults(held, times, end, since)}{remark}", known)
     is_now = times.is_live and at is None
     past = [story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)]
     ranked = sorted(stories, key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank))
@@ -164,7 +159,7 @@ def verdict_of(
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 
 
-def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None, *, is_known: bool) -> str:
+def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None) -> str:
     if not times.is_live:
         text = f"no faults in {end:.0f} s"
     elif since is None:
@@ -174,7 +169,7 @@ def _without_faults(held: Iterable[Condition], times: Times, end: float, since: 
     usual = dict.fromkeys(each.text for each in held if each.initial and KINDS[each.kind].usual)
     if usual:
         text += f"; throughout: {', '.join(usual)}"
-    return text if is_known else f"{text}; the data has no position validity"
+    return text
 
 
 def _head(
