@@ -36,7 +36,7 @@ class VehicleOdometry(Message):
         *(RenamedField(name, f"velocity[{i}]") for i, name in enumerate(("vx", "vy", "vz"))),
         *(RenamedField(f"{name}speed", f"angular_velocity[{i}]") for i, name in enumerate(("roll", "pitch", "yaw"))),
     )
-    RULES = (UnitQuaternion("q", tolerance=0.1),)
+    RULES = (UnitQuaternion("q", tolerance=0.1, or_zeros=True),)
 
     POSE_FRAME_UNKNOWN, POSE_FRAME_NED, POSE_FRAME_FRD = range(3)
     VELOCITY_FRAME_UNKNOWN, VELOCITY_FRAME_NED, VELOCITY_FRAME_FRD, VELOCITY_FRAME_BODY_FRD = range(4)

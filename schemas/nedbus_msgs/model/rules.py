@@ -106,16 +106,23 @@ class NotLater(Rule):
 
 
 class UnitQuaternion(Rule):
-    """A quaternion (w, x, y, z) has norm 1, within `tolerance`, or is unknown: w is NaN, or all elements are zero."""
+    """A quaternion (w, x, y, z) has norm 1, within `tolerance`, or is unknown: w is NaN.
 
-    def __init__(self, field: str, *, tolerance: float = 0.001) -> None:
-        reason = "must have norm 1, or NaN as first element or zeros if unknown"
+    `or_zeros`: it is unknown as well if all elements are zero.
+    """
+
+    def __init__(self, field: str, *, tolerance: float = 0.001, or_zeros: bool = False) -> None:
+        reason = "must have norm 1, or NaN as first element if unknown"
+        if or_zeros:
+            reason = "must have norm 1, or NaN as first element or zeros if unknown"
         least, greatest = (1.0 - tolerance) ** 2, (1.0 + tolerance) ** 2
         middle, deviation = (greatest + least) / 2, (greatest - least) / 2
         norm = f"squared_norm({{{field}}})"
         is_other = f"(not (abs({norm} - {middle!r}) <= {deviation!r}))"
         is_known = f"({{{field}}}[0] == {{{field}}}[0])"
-        super().__init__([Check(field, reason, f"({is_known} and {is_other} and ({norm} != 0))")])
+        wrong = f"({is_known} and {is_other}"
+        wrong += f" and ({norm} != 0))" if or_zeros else ")"
+        super().__init__([Check(field, reason, wrong)])
 
 
 def expression_of(rules: Sequence[Rule], accessors: Mapping[str, str]) -> str:

@@ -33,7 +33,6 @@ PUBLISHED: Final[list[tuple[str, dict[str, Any]]]] = [
     ("BatteryStatus", {"remaining": 1.27}),  # a DroneCAN battery: 127 %
     ("BatteryStatus", {"remaining": 1.0001}),  # a current sensor that reads below 0 on a full battery
     ("BatteryStatus", {"remaining": -0.01}),  # a MAVLink battery with an unknown charge
-    ("VehicleAttitude", {"q": ZEROS}),
     ("VehicleAttitude", {"q": NAN4}),
     ("VehicleOdometry", {"q": ZEROS}),  # vision without attitude
     ("VehicleOdometry", {"q": (1.05, 0.0, 0.0, 0.0)}),  # vision that is not normalised
@@ -44,6 +43,7 @@ WRONG: Final[list[tuple[str, dict[str, Any], str]]] = [
     ("SensorGps", {"eph": -0.5}, "eph: must be 0 to inf, or -1 if unknown"),
     ("BatteryStatus", {"remaining": 2.1}, "remaining: must be -1 to 2"),
     ("BatteryStatus", {"remaining": -1.1}, "remaining: must be -1 to 2"),
+    ("VehicleAttitude", {"q": ZEROS}, "q: must have norm 1"),  # in logs that PX4's replay module wrote
     ("VehicleAttitude", {"q": (1.05, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
     ("VehicleAttitude", {"q": (1e-3, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
     ("VehicleOdometry", {"q": (1.2, 0.0, 0.0, 0.0)}, "q: must have norm 1"),

@@ -187,11 +187,11 @@ class _LinkSession:
 
     def _all_peers(self) -> set[Peer]:
         """Return the addresses of all vehicles, or the only address of the link; none that are behind a satellite."""
-        silent = {system for system, vehicle in self._vehicles.items() if vehicle.is_high_latency}
+        reached = {system for system, vehicle in self._vehicles.items() if not vehicle.is_high_latency}
         if self._link.peer is not None:
-            return set() if silent and silent == self._vehicles.keys() else {self._link.peer}
+            return {self._link.peer} if reached or not self._vehicles else set()
         known = [*self._receiver.vehicles.values()]  # changed on another thread
-        return {vehicle.peers.peer for vehicle in known if vehicle.system not in silent}
+        return {vehicle.peers.peer for vehicle in known if vehicle.system in reached}
 
     def _is_chosen(self, received: Received) -> bool:
         """Return whether a message is from the address to which the messages for its vehicle are sent."""
