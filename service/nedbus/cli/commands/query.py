@@ -113,6 +113,10 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
                 write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
         for text in (each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]):
             write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
+        for source in service.sources:
+            if source.copies:
+                what = "messages that came again, or late, over a second link to their vehicle"
+                write(f"left out: {source.copies} {what}")
         for each in (log for source in service.sources for log in source.log_streams):
             write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
         if refused := service.refused:

@@ -208,3 +208,11 @@ def test_each_message_once_and_in_order(name: str, count: int, seconds: float) -
     assert (np.diff(stamps) > 0).all()
     assert (stamps[-1] - stamps[0]) / 1e6 == pytest.approx(seconds)
     assert "reboot" not in run_command("events", str(CASES / name)).out
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+def test_copies_are_counted() -> None:
+    """A frame that is in the file twice is one sample; a warning counts the copy."""
+    with nedbus.open(CASES / "duplicate.tlog") as flight:
+        assert len(list(flight("*"))) > 0
+        assert "1 copy from a second link left out" in " ".join(flight.warnings)

@@ -158,6 +158,41 @@ def test_order_is_checked_per_topic() -> None:
     assert estimate(vehicle, 2050, 100.1)["timestamp"] == 2_050_000
 
 
+def heartbeat() -> Any:
+    return dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+
+
+def test_second_link_adds_nothing() -> None:
+    """A second link is 0.3 s late, with messages at other times: they, and its old heartbeats, are left out.
+
+    A message that is older than the last one of the same link is out of order, also then.
+    """
+    vehicle = new_vehicle("*")
+    for number in range(60):
+        now, ms = 100 + 0.05 * number, 10_000 + 50 * number
+        vehicle.count_lost(0, now, link=0)
+        assert isinstance(vehicle.handle(position(ms), now), SourceMessage)
+        vehicle.count_lost(0, now, link=1)
+        assert vehicle.handle(position(ms - 320), now) is None
+        assert vehicle.handle(heartbeat(), now) is None
+    assert vehicle.copies == 120
+    vehicle.count_lost(0, 103.0, link=0)
+    assert isinstance(vehicle.handle(position(12_901), 103.0), Rejection)
+    vehicle.count_lost(0, 103.0, link=0)
+    assert isinstance(vehicle.handle(heartbeat(), 103.0), SourceMessage)
+
+
+def test_second_link_replaces_the_first_one() -> None:
+    """After the first link broke, the messages of the second one are used, also those without a time."""
+    vehicle = new_vehicle("*")
+    for number in range(20):
+        vehicle.count_lost(0, 100 + 0.05 * number, link=0)
+        vehicle.handle(position(10_000 + 50 * number), 100 + 0.05 * number)
+    vehicle.count_lost(0, 102.0, link=1)
+    assert isinstance(vehicle.handle(position(11_700), 102.0), SourceMessage)
+    assert isinstance(vehicle.handle(heartbeat(), 102.0), SourceMessage)
+
+
 def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
     """Return the requests to a vehicle that sends a message every half second."""
     requests = []
