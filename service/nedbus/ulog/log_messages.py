@@ -30,6 +30,8 @@ _PROTOCOL: Final = 8  # lowest log level of events meant for ground stations, no
 _ALL_MODES: Final = 2**32 - 1
 _WINDOW: Final = 50_000  # us between an event and its logged string; up to 4 ms were observed
 _MAX_PER_SECOND: Final = 100  # messages; PX4 logs 20 at boot
+_SECOND: Final = 1_000_000  # us
+_MAX_RETURNS: Final = 10  # to an earlier time, in one log or stream
 _MAX_BYTES: Final = 127
 _MAX_CHARACTERS: Final = 1000  # characters read, including colour codes
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
@@ -179,19 +181,35 @@ def _fill(template: str, values: Sequence[Any]) -> str:
 class RateLimit:
     """Limit of 100 messages per second; `omitted`: number of messages above it.
 
-    Earlier messages count in the newest second: a log with alternating times would otherwise have no limit.
+    Earlier messages count in the newest second, because a log with alternating times would otherwise have no limit. Up
+    to ten times they show instead that the newest second was wild, or that the vehicle rebooted.
     """
 
     def __init__(self) -> None:
-        self.omitted = self._begin = self._count = 0
+        self.omitted = self._begin = self._count = self._returns = 0
+        self._before: tuple[int, int] | None = None  # begin and count of the second before
 
     def admits(self, time: int) -> bool:
         """Return whether a message at this time [us] is below the limit."""
-        if time - self._begin >= 1_000_000:
+        if time - self._begin >= _SECOND:
+            self._before = self._begin, self._count
             self._begin, self._count = time, 0
+        elif self._begin - time >= _SECOND and self._returns < _MAX_RETURNS:
+            self._return_to(time)
         self._count += 1
         self.omitted += self._count > _MAX_PER_SECOND
         return self._count <= _MAX_PER_SECOND
+
+    def _return_to(self, time: int) -> None:
+        """Continue the second before the newest one; after a reboot, continue the count at an earlier time."""
+        self._returns += 1
+        if self._before is None:
+            self._begin = time
+        else:
+            self._begin, self._count = self._before
+            self._before = None
+        if time - self._begin >= _SECOND:
+            self._begin, self._count = time, 0
 
 
 class LogMessageBuilder:

@@ -12,7 +12,7 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
+from nedbus.client import Bus, ServiceStatus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
 from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
@@ -85,6 +85,15 @@ def get(
         raise typer.Exit(1)
 
 
+def _write_left_out(service: ServiceStatus) -> None:
+    """Write what a service does not publish: topics that it lacks, and copies."""
+    for what, head in _ABSENT.items():
+        if absent := [each for source in service.sources for each in getattr(source, what)]:
+            write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+    if copies := sum(source.copies for source in service.sources):
+        write(f"left out: {copies} messages that came again, or late, over a second link to their vehicle")
+
+
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     """Show the services on the network with their sources and streams."""
@@ -108,15 +117,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         ]  # fmt: skip
         if rows:
             write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
-        for what, head in _ABSENT.items():
-            if absent := [each for source in service.sources for each in getattr(source, what)]:
-                write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+        _write_left_out(service)
         for text in (each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]):
             write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
-        for source in service.sources:
-            if source.copies:
-                what = "messages that came again, or late, over a second link to their vehicle"
-                write(f"left out: {source.copies} {what}")
         for each in (log for source in service.sources for log in source.log_streams):
             write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
         if refused := service.refused:

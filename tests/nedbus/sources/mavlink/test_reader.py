@@ -272,9 +272,10 @@ class UdpAutopilot:
 
 
 def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopilot) -> None:
-    """After messages that arrived late, the vehicle has rebooted if its times are a second below the newest one, and possible.
+    """After messages that arrived late, the vehicle has rebooted if its times are a second below the newest one.
 
-    After a reboot, its ULog stream is requested again.
+    They are possible: up to 2 s more than the time since its last message. After a reboot, its ULog stream is requested
+    again.
     """
     timings.log_answer = DEADLINE  # no retransmission of START
     attitude, height = dialect.MAVLink_attitude_message, dialect.MAVLink_global_position_int_message
