@@ -63,6 +63,7 @@ class SourceOutput:
         self.unavailable = UnavailableTopics()  # topics that vehicles publish but a live source does not deliver now
         self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
         self.load = LinkLoad()  # of a live source
+        self.copies = 0  # messages that a live source left out
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message, of every 16th one
         self._name = name
         self._text = text

@@ -13,6 +13,7 @@ from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import (
+    LinkCopies,
     LinkLoad,
     LiveItem,
     LiveSource,
@@ -134,6 +135,7 @@ class Worker:
             dropped=output.load.dropped,
             overload=output.load.overload,
             reboots=output.reboots,
+            copies=output.copies,
             done=run.done(self._done) if run else self._done,
             total=run.total if run else None,
             retries=self._retries,
@@ -261,6 +263,8 @@ class Worker:
                     self._output.note(item)
                 elif isinstance(item, LinkLoad):
                     self._output.note_load(item)
+                elif isinstance(item, LinkCopies):
+                    self._output.copies = item.count
                 elif item is not None:
                     self._output.log_streams[item.vehicle] = item
                 if now >= next_poll:

@@ -24,6 +24,16 @@ class LinkLoad:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkCopies:
+    """Messages that came again, or late, over a second link to their vehicle, and were left out; yielded on change.
+
+    `count`: of all vehicles of a source.
+    """
+
+    count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class UnavailableTopics:
     """Topics that vehicles announce but a live source does not deliver; yielded on change.
 
@@ -76,7 +86,7 @@ class ReplaySource:
         return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
 
-LiveItem = SourceMessage | Rejection | UnavailableTopics | LinkLoad | LogStreamStatus | None
+LiveItem = SourceMessage | Rejection | UnavailableTopics | LinkLoad | LinkCopies | LogStreamStatus | None
 
 
 @runtime_checkable

@@ -71,6 +71,7 @@ class TlogReader(FlightReader):
         self._rebooted = False
         self._streams: dict[Address, _ConvertedStream] = {}
         self._shrinkage: list[str] = []
+        self._senders: dict[int, tuple[Vehicle, SequenceCounter]] = {}  # by system id
 
     @property
     def warnings(self) -> list[str]:
@@ -83,11 +84,14 @@ class TlogReader(FlightReader):
             warnings.append(f"truncated (the last {zeros} B are zeros, as after a power cut)")
         elif self._is_cut:
             warnings.append("truncated (the file ends within a message)")
+        copies = sum(vehicle.copies for vehicle, _ in self._senders.values())
+        if copies:
+            warnings.append(f"{copies} {'copy' if copies == 1 else 'copies'} from a second link left out")
         return warnings
 
     def records(self) -> Iterator[Record]:
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
-        vehicles: dict[int, tuple[Vehicle, SequenceCounter]] = {}
+        vehicles = self._senders
         parser, booted = new_parser(), set[int]()
         for due, (stamp, frame) in Clock().pace(self._frames(), itemgetter(0)):
             for item in parse(parser, frame, str(self.path), None, due / 1e6):
@@ -101,7 +105,8 @@ class TlogReader(FlightReader):
                     name = str(item.system)
                     vehicles[item.system] = Vehicle(name, self.options.topics), SequenceCounter()
                 vehicle, sequence = vehicles[item.system]
-                vehicle.count_lost(sequence.add(item.sequence, item.time), item.time)
+                lost = sequence.add(item.sequence, item.time)
+                vehicle.count_lost(lost, item.time, link=sequence.link)
                 for found in vehicle.handle_all(item.message, item.time):
                     if found.address is None:
                         continue

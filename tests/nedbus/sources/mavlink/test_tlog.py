@@ -19,6 +19,7 @@ from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
 
+CASES = Path(__file__).parents[5] / "shared/cases/turn6"
 EPOCH = 1_760_000_000_000_000  # us; 2025-10-09 08:53:20 UTC
 FLAGS = 0x3F  # ESTIMATOR_STATUS: all valid
 
@@ -193,3 +194,25 @@ def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
     for read in (nedbus.read, lambda path: open_replay(f"tlog:{path}")):
         with pytest.raises(SourceError, match=r"no autopilot messages|an empty file"):
             read(path)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+@pytest.mark.parametrize(
+    ("name", "count", "seconds"),
+    [("06_boot_ms_wrap.tlog", 400, 19.95), ("09_two_links_1.5s.tlog", 300, 14.95), ("duplicate.tlog", 5, 0.4)],
+)
+def test_each_message_once_and_in_order(name: str, count: int, seconds: float) -> None:
+    """After the wrap of `time_boot_ms`, over a second, slower link, and with a frame that is in the file twice."""
+    stamps = nedbus.read(CASES / name)["timestamp"]
+    assert stamps.size == count
+    assert (np.diff(stamps) > 0).all()
+    assert (stamps[-1] - stamps[0]) / 1e6 == pytest.approx(seconds)
+    assert "reboot" not in run_command("events", str(CASES / name)).out
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+def test_copies_are_counted() -> None:
+    """A frame that is in the file twice is one sample; a warning counts the copy."""
+    with nedbus.open(CASES / "duplicate.tlog") as flight:
+        assert len(list(flight("*"))) > 0
+        assert "1 copy from a second link left out" in " ".join(flight.warnings)
