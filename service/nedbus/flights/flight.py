@@ -174,7 +174,7 @@ class Flight(AbstractContextManager["Flight"]):
         with self._open(_ALL.topics) as flights:
             duration = 0.0
             for message in flights.messages():
-                duration = message.due
+                duration = message.at
             return flights, duration
 
     def _open(self, topics: Any) -> MergedFlights:
@@ -190,7 +190,7 @@ class Flight(AbstractContextManager["Flight"]):
             for message in flights.messages():
                 utc = self._utc.get(message.address.vehicle)
                 if utc is not None and (timestamp := message.timestamp) is not None:
-                    return time.astimezone(UTC).timestamp() - int(utc.unix_us(timestamp)) / 1e6 + message.due
+                    return time.astimezone(UTC).timestamp() - int(utc.unix_us(timestamp)) / 1e6 + message.at
         raise ArgumentError(name, str(time), "seconds since the first message, because this flight has no UTC")
 
 
@@ -258,13 +258,13 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         flights, is_found = self._flights, False
         try:
             for message in flights.messages():
-                if self._end is not None and message.due > self._end:
+                if self._end is not None and message.at > self._end:
                     return
                 address = message.address
                 if not self._matches(address):
                     continue
                 is_found = True
-                if message.due < self._start:
+                if message.at < self._start:
                     continue
                 try:
                     encoded = message.encode()

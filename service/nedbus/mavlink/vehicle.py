@@ -195,7 +195,7 @@ class Vehicle:
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(topic, fields, timestamp, now)
-        return self.report(SourceMessage(now, address, fields), log)
+        return self.report(SourceMessage(0.0, address, fields, arrived=now), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
