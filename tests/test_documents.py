@@ -450,3 +450,19 @@ def test_guarantees_name_tests_that_exist() -> None:
         names = re.findall(r"`(test_\w+|[A-Z]\w+Machine)`", proof)
         assert names, proof
         assert [name for name in names if not re.search(rf"(def|class) {name}\b", code)] == []
+
+
+def test_logger_topics_fit_beside_the_default_profile() -> None:
+    """PX4 subscribes to ten instances of a topic in a line without one; 255 subscriptions are its limit.
+
+    With 16 lines without an instance and the default profile, a PX4 of 2026-08-21 rejected 68 of 339.
+    """
+    lines = [line.split() for line in (DOCS / "logger_topics.txt").read_text().splitlines()]
+    assert {len(line) for line in lines} == {3}, "topic, interval, instance"
+    requested = {(topic, int(instance)) for topic, _, instance in lines}
+    profile = 255 + 68 - 10 * 16
+    assert len(requested) == len(lines) < 255 - profile
+    assert {"vehicle_local_position", "vehicle_attitude", "home_position"} < {topic for topic, _ in requested}
+    several = {topic for topic, instance in requested if instance > 0}
+    assert several == {"sensor_gps", "battery_status", "estimator_status_flags"}
+    assert all(TOPICS[topic].instances for topic in several)

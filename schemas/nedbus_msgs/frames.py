@@ -87,8 +87,11 @@ def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> _Quaternion:
 
 
 def quaternion_to_euler(q: Sequence[float]) -> Vector:
-    """Return roll, pitch and heading of a rotation from body FRD to NED (w, x, y, z)."""
-    w, x, y, z = q
+    """Return roll, pitch and heading of a rotation from body FRD to NED (w, x, y, z); NaN for zeros, which are none."""
+    norm = math.hypot(*q)
+    if not norm:
+        return math.nan, math.nan, math.nan
+    w, x, y, z = (element / norm for element in q)
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
         math.asin(_clip(2 * (w * y - z * x))),
@@ -118,7 +121,7 @@ class MapProjection:
         x, y = north / EARTH_RADIUS, east / EARTH_RADIUS
         angle = math.hypot(x, y)
         if not angle:
-            return self.latitude, self.longitude
+            return self.latitude, math.remainder(self.longitude, 360.0)
         sine, cosine = _sine_and_cosine(self.latitude)
         sine_angle, cosine_angle = math.sin(angle), math.cos(angle)
         axial = cosine_angle * sine + x * sine_angle * cosine / angle
@@ -162,6 +165,13 @@ class GlobalPosition(NamedTuple):
     latitude: float
     longitude: float
     altitude: float
+
+    @classmethod
+    def wrapped(cls, latitude: float, longitude: float, altitude: float) -> GlobalPosition:
+        """Return a position with a longitude within [-180, 180], which PX4 up to 1.15 exceeds at the antimeridian."""
+        if math.isfinite(longitude):
+            longitude = math.remainder(longitude, 360.0)
+        return cls(latitude, longitude, altitude)
 
 
 def to_global(message: Message) -> GlobalPosition | None:

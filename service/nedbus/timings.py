@@ -29,6 +29,8 @@ class Timings:
     log_silence: float = 1.0  # without data until START is sent again; at least three times the interval of the stream
     log_longest_silence: float = 15.0  # longest silence of a live stream: sync alone fills a LOGGING_DATA in 11.3 s
     log_link: float = 3.0  # without any message until the link is lost
+    log_measure: float = 0.8  # between two measurements of the round trip, before a stream is refused
+    log_measure_again: float = 5.0  # until the round trip is measured again, while a stream is refused because of it
     log_retry: float = 30.0  # after a temporary refusal
     log_slow_retry: float = 300.0  # after a refusal caused by the configuration or the link
     log_header: float = 10.0  # for the header, which blocks PX4's logger and so leaves a gap in its own log

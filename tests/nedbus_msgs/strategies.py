@@ -31,9 +31,9 @@ FLAG_FIELDS: Mapping[str, tuple[str, ...]] = {
     "dist_bottom_valid": ("dist_bottom",),
 }
 NOT_NEGATIVE = ("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv")
-WITHIN = {"heading": struct.unpack("<f", struct.pack("<f", math.pi))[0], "ref_lat": 90.0, "ref_lon": 180.0}
+WITHIN = {"heading": struct.unpack("<f", struct.pack("<f", math.pi))[0], "ref_lat": 90.0, "ref_lon": 360.0}
 BEYOND = {"heading": float(np.nextafter(np.float32(math.pi), np.float32(4)))} | {
-    name: math.nextafter(bound, 360.0) for name, bound in WITHIN.items() if name != "heading"
+    name: math.nextafter(bound, math.inf) for name, bound in WITHIN.items() if name != "heading"
 }
 VIOLATIONS: list[Mapping[str, object]] = [
     *(
@@ -69,7 +69,7 @@ TYPES: Mapping[str, st.SearchStrategy[object]] = {
 SAME_TYPE = {
     **TYPES,
     "float32": float32s | st.sampled_from([-1.0, 3.2, math.nan]),
-    "float64": st.floats() | st.sampled_from([90.0, 90.5, -180.0, 181.0]),
+    "float64": st.floats() | st.sampled_from([90.0, 90.5, -360.0, 361.0]),
 }
 FIELDS_WITH_FLAGS = [name for names in FLAG_FIELDS.values() for name in names]
 FIELDS_WITH_RULES = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FIELDS_WITH_FLAGS, *NOT_NEGATIVE, *WITHIN]

@@ -106,7 +106,7 @@ def test_every_flag_guards_a_property() -> None:
 
 @given(messages(), st.booleans())
 def test_properties_return_the_fields(message: VehicleLocalPosition, as_row: bool) -> None:
-    """Each property returns its fields in order, bit for bit; height is positive up."""
+    """Each property returns its fields in order, bit for bit; height is positive up, longitudes are wrapped."""
     either = row_of(message) if as_row else message
     has_position, has_origin = message.xy_valid and message.z_valid, message.xy_global and message.z_global
     assert either.position == (Ned(message.x, message.y, message.z) if has_position else None)
@@ -115,7 +115,7 @@ def test_properties_return_the_fields(message: VehicleLocalPosition, as_row: boo
     assert either.height == (-message.z if message.z_valid else None)
     assert either.good_heading == (message.heading if message.heading_good_for_control else None)
     assert either.height_above_ground == (message.dist_bottom if message.dist_bottom_valid else None)
-    origin = GlobalPosition(message.ref_lat, message.ref_lon, message.ref_alt) if has_origin else None
+    origin = GlobalPosition.wrapped(message.ref_lat, message.ref_lon, message.ref_alt) if has_origin else None
     assert either.origin == origin
     assert either.global_position == (to_global(message) if has_position and has_origin else None)
 

@@ -22,6 +22,7 @@ from nedbus_msgs.frames import (
     ned_to_enu,
     quaternion_enu_to_ned,
     quaternion_ned_to_enu,
+    quaternion_to_euler,
     to_global,
     to_local,
     variances_enu_to_ned,
@@ -191,3 +192,21 @@ def test_converted_attitude_rotates_vectors_the_same_way(roll: float, pitch: flo
         north, east, down = rotate(q, vector)
         assert rotate(enu, frd_to_flu(vector)) == pytest.approx(ned_to_enu((north, east, down)), abs=1e-9)
     assert quaternion_enu_to_ned(enu) == pytest.approx(q)
+
+
+@given(angles, angles, angles)
+def test_angles_of_a_quaternion_do_not_depend_on_its_norm(roll: float, pitch: float, yaw: float) -> None:
+    """A quaternion that vision did not normalise has the same angles; zeros, which are no rotation, have none."""
+    q = euler_to_quaternion(roll, pitch, yaw)
+    expected = quaternion_to_euler(q)
+    found = quaternion_to_euler([1.05 * element for element in q])
+    assert all(abs(wrap(one - other)) < 1e-6 for one, other in zip(found, expected, strict=True))
+    assert all(map(math.isnan, quaternion_to_euler([0.0] * 4)))
+
+
+@pytest.mark.parametrize(("east", "expected"), [(0.0, -179.5), (100.0, -179.4991), (-60_000.0, 179.96)])
+def test_reprojected_longitude_is_wrapped(east: float, expected: float) -> None:
+    """An origin east of 180 degrees, as PX4 up to 1.15 sends it, gives longitudes within 180 degrees."""
+    projection = MapProjection(0.0, 180.5)
+    assert projection.reproject(0.0, east)[1] == pytest.approx(expected, abs=1e-3)
+    assert projection.project(0.0, -179.5) == pytest.approx((0.0, 0.0), abs=1e-6)

@@ -10,7 +10,8 @@ class BatteryStatus(Message):
     """State of one battery: voltage, current and charge; smart batteries provide more fields than power modules.
 
     One uORB instance per battery; id (from 1) identifies the battery on its vehicle.
-    Unknown values are -1 in current_a, current_average_a, discharged_mah, remaining and scale, NaN in time_remaining_s
+    Unknown values are -1 in current_a, current_average_a, discharged_mah, remaining and scale (any negative value of
+    remaining, because PX4 divides the -1 of a MAVLink battery by 100), NaN in time_remaining_s
     and temperature, and 0 in the others. Simulators always report a current of -1 and no cell voltages.
     Bit n (1 << n) of faults stands for the FAULT_ constant n; warning may also be STATE_UNHEALTHY or STATE_CHARGING.
     """
@@ -25,7 +26,7 @@ class BatteryStatus(Message):
         Layout("1.17", """*, without serial_number voltage_filtered_v current_filtered_a custom_faults mode
             average_power available_energy design_capacity average_time_to_full"""),
     )  # fmt: skip
-    RULES = (InRange("remaining", 0.0, 1.0, or_=-1.0),)
+    RULES = (InRange("remaining", -1.0, 2.0),)
 
     MAX_INSTANCES: ClassVar = 3
     SOURCE_POWER_MODULE, SOURCE_EXTERNAL, SOURCE_ESCS = range(3)
@@ -43,7 +44,7 @@ class BatteryStatus(Message):
     current_average_a: Float32 = field("Average current in level flight [A], -1 if unknown")
     discharged_mah: Float32 = field("Discharged capacity [mAh], -1 if unknown")
 
-    remaining: Float32 = field("Remaining charge, 0 (empty) to 1 (full), -1 if unknown")
+    remaining: Float32 = field("Remaining charge, 0 (empty) to 1 (full); above 1 while charging, negative if unknown")
     scale: Float32 = field("Thrust compensation for battery sag, at least 1, -1 if unknown")
     time_remaining_s: Float32 = field("Predicted time until empty at the recent load [s], NaN if unknown")
     temperature: Float32 = field("Temperature [deg C], NaN if unknown")

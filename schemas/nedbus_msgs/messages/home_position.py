@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from nedbus_msgs.frames import GlobalPosition, Ned
-from nedbus_msgs.model import FiniteWhile, Layout, Message, Topic, Within
+from nedbus_msgs.model import LONGITUDE_LIMIT, FiniteWhile, Layout, Message, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field, while_valid
 
 
@@ -23,10 +23,13 @@ class HomePosition(Message):
         Layout("1.17", "1.15, z: roll pitch"),
         Layout("main", "*"),
     )
-    RULES = (Within(lat=90.0, lon=180.0), FiniteWhile(valid_hpos="lat lon", valid_alt="alt", valid_lpos="x y z"))
+    RULES = (
+        Within(lat=90.0, lon=LONGITUDE_LIMIT),
+        FiniteWhile(valid_hpos="lat lon", valid_alt="alt", valid_lpos="x y z"),
+    )
 
     lat: Float64 = field("Latitude [deg] [WGS84]")
-    lon: Float64 = field("Longitude [deg] [WGS84]")
+    lon: Float64 = field("Longitude [deg] [WGS84], up to PX4 1.15 also beyond +-180")
     alt: Float32 = field("Altitude above mean sea level [m]")
 
     x: Float32 = field("North position [m] [local NED]")
@@ -45,4 +48,6 @@ class HomePosition(Message):
     update_count: Uint32 = field("Number of home position updates since boot")
 
     position: ClassVar = while_valid(Ned, "x, y and z [m] [local NED]", "valid_lpos")
-    global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "valid_hpos", "valid_alt")
+    global_position: ClassVar = while_valid(
+        GlobalPosition.wrapped, "lat, lon [deg], alt [m]", "valid_hpos", "valid_alt"
+    )

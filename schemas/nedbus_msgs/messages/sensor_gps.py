@@ -3,7 +3,7 @@
 import math
 
 from nedbus_msgs.frames import GlobalPosition, Ned
-from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, RenamedField, Topic, Within
+from nedbus_msgs.model import LONGITUDE_LIMIT, FiniteWhile, InRange, Layout, Message, RenamedField, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64, field
 
 
@@ -44,9 +44,9 @@ class SensorGps(Message):
         RenamedField("alt_ellipsoid", "altitude_ellipsoid_m", lambda mm: mm / 1e3, lambda m: _integer(m, 1e3), "int32"),
     )
     RULES = (
-        NotLater("timestamp_sample", "timestamp"),
-        Within(latitude_deg=90.0, longitude_deg=180.0),
-        NotNegative("eph", "epv"),
+        Within(latitude_deg=90.0, longitude_deg=LONGITUDE_LIMIT),
+        InRange("eph", 0.0, math.inf, or_=-1.0),
+        InRange("epv", 0.0, math.inf, or_=-1.0),
         FiniteWhile(vel_ned_valid="vel_n_m_s vel_e_m_s vel_d_m_s"),
     )
 
@@ -66,10 +66,10 @@ class SensorGps(Message):
     ) = 0, 1, 2, 4, 8, 16, 32, 64  # fmt: skip
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
-    timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
+    timestamp_sample: Uint64 = field("Time of the underlying sensor data [us]; with PPS up to 0.1 s after timestamp")
     device_id: Uint32 = field("Device ID, unchanged by restarts")
     latitude_deg: Float64 = field("Latitude [deg] [WGS84]")
-    longitude_deg: Float64 = field("Longitude [deg] [WGS84]")
+    longitude_deg: Float64 = field("Longitude [deg] [WGS84], also beyond +-180 if receivers are blended")
     altitude_msl_m: Float64 = field("Altitude above mean sea level [m]")
     altitude_ellipsoid_m: Float64 = field("Altitude above the ellipsoid [m] [WGS84]")
 
@@ -118,7 +118,7 @@ class SensorGps(Message):
     def global_position(self) -> GlobalPosition | None:
         """Latitude, longitude [deg] [WGS84] and altitude above mean sea level [m]; None without a 3D fix."""
         has_fix = self.fix_type >= SensorGps.FIX_TYPE_3D
-        return GlobalPosition(self.latitude_deg, self.longitude_deg, self.altitude_msl_m) if has_fix else None
+        return GlobalPosition.wrapped(self.latitude_deg, self.longitude_deg, self.altitude_msl_m) if has_fix else None
 
     @property
     def velocity(self) -> Ned | None:

@@ -9,7 +9,7 @@ class VehicleAttitude(Message):
 
     Quaternions follow the Hamilton convention, (w, x, y, z), with norm 1; FRD: x forward, y right, z down.
     q rotates a vector from the body frame to NED; q and -q are the same attitude, and both occur.
-    The attitude is unknown if the first element of q is NaN.
+    The attitude is unknown if the first element of q is NaN, or if q is all zeros.
 
     delta_q_reset holds the latest reset: it explains a jump only if quat_reset_counter rose by exactly 1.
     In some ground truth, delta_q_reset is all zeros, which is not a rotation.

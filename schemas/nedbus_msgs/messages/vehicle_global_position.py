@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from nedbus_msgs.frames import GlobalPosition
-from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
+from nedbus_msgs.model import LONGITUDE_LIMIT, FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field, while_valid
 
 
@@ -28,14 +28,14 @@ class VehicleGlobalPosition(Message):
     )
     RULES = (
         NotLater("timestamp_sample", "timestamp"),
-        Within(lat=90.0, lon=180.0),
+        Within(lat=90.0, lon=LONGITUDE_LIMIT),
         NotNegative("eph", "epv"),
         FiniteWhile(lat_lon_valid="lat lon", alt_valid="alt", terrain_alt_valid="terrain_alt"),
     )
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
     lat: Float64 = field("Latitude [deg] [WGS84]")
-    lon: Float64 = field("Longitude [deg] [WGS84]")
+    lon: Float64 = field("Longitude [deg] [WGS84], up to PX4 1.15 also beyond +-180")
     alt: Float32 = field("Altitude above mean sea level [m]")
     alt_ellipsoid: Float32 = field("Altitude above the ellipsoid [m] [WGS84]")
     lat_lon_valid: Bool = field("lat and lon are valid")
@@ -54,5 +54,7 @@ class VehicleGlobalPosition(Message):
     terrain_alt_valid: Bool = field("terrain_alt is valid")
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
-    global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "lat_lon_valid", "alt_valid")
+    global_position: ClassVar = while_valid(
+        GlobalPosition.wrapped, "lat, lon [deg], alt [m]", "lat_lon_valid", "alt_valid"
+    )
     ground_altitude: ClassVar = while_valid(float, "terrain_alt [m]", "terrain_alt_valid")

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.model import Layout, Message, RenamedField, Topic
 from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Uint8, Uint64, field, while_valid
-from nedbus_msgs.model.rules import FLOAT32_PI, FiniteWhile, NotLater, NotNegative, Within
+from nedbus_msgs.model.rules import FLOAT32_PI, LONGITUDE_LIMIT, FiniteWhile, NotLater, NotNegative, Within
 
 _VALID: Final = {"xy_valid": "xy", "z_valid": "z", "v_xy_valid": "vxy", "v_z_valid": "vz"}
 _WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # bad if set
@@ -58,7 +58,7 @@ class VehicleLocalPosition(Message):
             xy_global="ref_lat ref_lon", z_global="ref_alt", dist_bottom_valid="dist_bottom",
         ),
         NotNegative("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv"),
-        Within(heading=FLOAT32_PI, ref_lat=90.0, ref_lon=180.0),
+        Within(heading=FLOAT32_PI, ref_lat=90.0, ref_lon=LONGITUDE_LIMIT),
         NotLater("timestamp_sample", "timestamp"),
     )  # fmt: skip
 
@@ -131,7 +131,9 @@ class VehicleLocalPosition(Message):
     height: ClassVar = while_valid(float.__neg__, "-z, height above the origin [m]", "z_valid")
     height_above_ground: ClassVar = while_valid(float, "dist_bottom [m]", "dist_bottom_valid")
     good_heading: ClassVar = while_valid(float, "heading, good for control [rad]", "heading_good_for_control")
-    origin: ClassVar = while_valid(GlobalPosition, "ref_lat, ref_lon [deg], ref_alt [m]", "xy_global", "z_global")
+    origin: ClassVar = while_valid(
+        GlobalPosition.wrapped, "ref_lat, ref_lon [deg], ref_alt [m]", "xy_global", "z_global"
+    )
 
     @property
     def global_position(self) -> GlobalPosition | None:

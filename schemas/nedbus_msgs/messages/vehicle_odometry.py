@@ -9,8 +9,9 @@ class VehicleOdometry(Message):
 
     pose_frame is the frame of position and q, velocity_frame that of velocity: NED, aligned to true north, or FRD with
     arbitrary origin and heading; z points down in both. The body frame is also FRD: x forward, y right.
-    An array is unknown if its first element is NaN. There are variances, but no covariances.
+    An array is unknown if its first element is NaN; q also if it is all zeros. There are variances, but no covariances.
     reset_counter counts resets of all kinds; no field holds their deltas.
+    q of vision or motion capture is as its sender wrote it: PX4 normalises it when it is fused, and ignores zeros.
     timestamp_sample may be from another computer's clock, and later than timestamp.
 
     Layout 1.13 lacks quality; its covariance matrices and q_offset are dropped on upgrade, and NaN on downgrade.
@@ -35,7 +36,7 @@ class VehicleOdometry(Message):
         *(RenamedField(name, f"velocity[{i}]") for i, name in enumerate(("vx", "vy", "vz"))),
         *(RenamedField(f"{name}speed", f"angular_velocity[{i}]") for i, name in enumerate(("roll", "pitch", "yaw"))),
     )
-    RULES = (UnitQuaternion("q"),)
+    RULES = (UnitQuaternion("q", tolerance=0.1),)
 
     POSE_FRAME_UNKNOWN, POSE_FRAME_NED, POSE_FRAME_FRD = range(3)
     VELOCITY_FRAME_UNKNOWN, VELOCITY_FRAME_NED, VELOCITY_FRAME_FRD, VELOCITY_FRAME_BODY_FRD = range(4)

@@ -14,6 +14,12 @@ from typing import Any, Final, NamedTuple, cast
 FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
 """The largest angle that PX4 sends: float32(pi), which exceeds pi as a double."""
 
+LONGITUDE_LIMIT: Final = 360.0
+"""The largest longitude that PX4 sends [deg].
+
+Up to 1.15 PX4 does not wrap: MapProjection::reproject adds up to 180 degrees to the longitude of the origin.
+"""
+
 _QUATERNION: Final = struct.Struct("<4f")
 
 
@@ -100,14 +106,16 @@ class NotLater(Rule):
 
 
 class UnitQuaternion(Rule):
-    """A quaternion (w, x, y, z) has norm 1, within 0.001, or is not provided (w is NaN)."""
+    """A quaternion (w, x, y, z) has norm 1, within `tolerance`, or is unknown: w is NaN, or all elements are zero."""
 
-    def __init__(self, field: str) -> None:
-        reason = "must have norm 1, or NaN as first element if unknown"
-        middle, tolerance = (0.999**2 + 1.001**2) / 2, (1.001**2 - 0.999**2) / 2
-        value = f"{{{field}}}"
-        bad = f"not (abs(squared_norm({value}) - {middle!r}) <= {tolerance!r})"
-        super().__init__([Check(field, reason, f"(({value}[0] == {value}[0]) and {bad})")])
+    def __init__(self, field: str, *, tolerance: float = 0.001) -> None:
+        reason = "must have norm 1, or NaN as first element or zeros if unknown"
+        least, greatest = (1.0 - tolerance) ** 2, (1.0 + tolerance) ** 2
+        middle, deviation = (greatest + least) / 2, (greatest - least) / 2
+        norm = f"squared_norm({{{field}}})"
+        is_other = f"(not (abs({norm} - {middle!r}) <= {deviation!r}))"
+        is_known = f"({{{field}}}[0] == {{{field}}}[0])"
+        super().__init__([Check(field, reason, f"({is_known} and {is_other} and ({norm} != 0))")])
 
 
 def expression_of(rules: Sequence[Rule], accessors: Mapping[str, str]) -> str:

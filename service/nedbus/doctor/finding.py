@@ -6,6 +6,12 @@ from typing import Final, Literal, get_args
 
 State = Literal["ok", "unknown", "warning", "wrong"]
 _STATES: Final[tuple[State, ...]] = get_args(State)  # worst last
+FIRST_PARTNER: Final = (
+    "PX4 sends only to the first address that sent to its port since its boot: if that was another program or port,"
+    " reboot the vehicle, or send from that port with udpout:HOST:PORT@LOCAL_PORT"
+)
+"""Advice for a link of udpout on which nothing arrives."""
+
 _MAX_FINDINGS: Final = 10  # per check: a peer may claim to be a thousand vehicles
 _MAX_NAME: Final = 140  # characters of a name from a peer; an address has up to 133
 

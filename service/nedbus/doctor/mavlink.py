@@ -7,15 +7,17 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.sources import DuplicateIds, Link, expected_header, ignore_reason, open_link
+from nedbus.mavlink import AUTOPILOT, HIGH_LATENCY, NO_HEARTBEAT, Senders
+from nedbus.sources import DuplicateIds, Link, expected_header, open_link, parse_link
 from nedbus.timings import TIMINGS
 
-from .finding import Finding, limit_findings, list_names
+from .finding import FIRST_PARTNER, Finding, limit_findings, list_names
 
 _READ_TIMEOUT: Final = 0.25  # s
 _MAX_SENDERS: Final = 5
@@ -26,11 +28,25 @@ _BACKEND: Final = "SDLOG_BACKEND"
 _TO_MAVLINK: Final = 2  # bit 1 of SDLOG_BACKEND
 
 
+@dataclass(slots=True)
+class _Traffic:
+    """What arrived on a link.
+
+    `packets`: by sender. `systems`: the messages of autopilots by system id. `ignored`: why the messages of a sender
+    are ignored, by system and component id. `duplicates`: two addresses with one system id, by system id.
+    """
+
+    packets: Counter[str] = field(default_factory=Counter)
+    systems: dict[int, list[Any]] = field(default_factory=dict)
+    ignored: dict[tuple[int, int], str] = field(default_factory=dict)
+    duplicates: dict[int, str] = field(default_factory=dict)
+
+
 def check_mavlink(link: str) -> Iterator[Finding]:
     """Listen to a link for 3 s and yield the findings; raise ConfigError for an invalid link."""
     try:
         with closing(open_link(link, baud=_BAUD)) as opened:
-            senders, systems, faults = _listen(opened)
+            traffic = _listen(opened)
     except SourceError as exc:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check the address and port, or the device and its permissions"
@@ -38,30 +54,43 @@ def check_mavlink(link: str) -> Iterator[Finding]:
             advice = "fine if 'nedbus serve' is the other program; 'ss -ulpn' shows it"
         yield Finding("mavlink", link, "warning" if is_taken else "wrong", exc.reason, advice)
         return
-    if not senders:
+    packets, systems = traffic.packets, traffic.systems
+    if not packets:
         advice = "check firewalls, and that the vehicle sends to this host and port ('mavlink status' in PX4's shell)"
+        if parse_link(link).kind == "udpout":
+            advice = f"{advice}; {FIRST_PARTNER}"
         yield Finding("mavlink", link, "wrong", f"no packet within {TIMINGS.listen:g} s", advice)
-    elif not systems and not faults:
-        seen = f"no MAVLink among the packets from {list_names(sorted(senders))} (total: {senders.total()})"
+    elif not systems and not traffic.ignored:
+        seen = f"no MAVLink among the packets from {list_names(sorted(packets))} (total: {packets.total()})"
         advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
-    # Ground stations and cameras are normal, but not alone.
-    reported = {ids: fault for ids, fault in faults.items() if not systems or not all(ids) or not ignore_reason(*ids)}
+    yield from limit_findings(_check_ignored(link, traffic))
     yield from limit_findings(
-        Finding("mavlink", f"{link} system {system} component {component}", "wrong", fault)
-        for (system, component), fault in sorted(reported.items())
+        Finding("mavlink", f"{link} system {system} component {AUTOPILOT}", "wrong", fault)
+        for system, fault in sorted(traffic.duplicates.items())
     )
     ordered = sorted(systems.items())
     yield from limit_findings(_check_system(link, number, messages) for number, messages in ordered)
     yield from limit_findings(_check_log(link, number, each) for number, each in ordered if any(map(_is_px4, each)))
 
 
-def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[int, int], str]]:
-    """Count packets by sender, collect messages by system and faults by component; request SDLOG_BACKEND from PX4."""
-    faults: dict[tuple[int, int], str] = {}
-    both = DuplicateIds()
-    senders: Counter[str] = Counter()
-    systems: dict[int, list[Any]] = {}
+def _check_ignored(link: str, traffic: _Traffic) -> Iterator[Finding]:
+    """Yield the senders that are ignored; cameras and ground stations are normal, but not alone."""
+    for (system, component), reason in sorted(traffic.ignored.items()):
+        subject, seen = f"{link} system {system} component {component}", f"ignored: {reason}"
+        if not (system and component) or not traffic.systems:
+            yield Finding("mavlink", subject, "wrong", seen)
+        elif system in traffic.systems and component == AUTOPILOT:
+            advice = "another program uses the ids of the autopilot; give it a component id of its own"
+            yield Finding("mavlink", subject, "warning", f"some HEARTBEATs are {seen}", advice)
+        elif component == AUTOPILOT:
+            advice = f"only autopilots should use component id {AUTOPILOT}; give this program another one"
+            yield Finding("mavlink", subject, "ok", seen, advice)
+
+
+def _listen(link: Link) -> _Traffic:
+    """Collect what arrives; request SDLOG_BACKEND and TIMESYNC from each PX4."""
+    traffic, senders, addresses = _Traffic(), Senders(), DuplicateIds()
     end, next_heartbeat, parser = time.monotonic() + TIMINGS.listen, 0.0, None
     sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
     heartbeat = dialect.MAVLink_heartbeat_message(
@@ -73,27 +102,30 @@ def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[
             link.send(heartbeat.pack(sender), link.peer)
         for data, peer, _ in link.read(_READ_TIMEOUT):
             name = ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
-            if name in senders or len(senders) < _MAX_SENDERS:
-                senders[name] += 1
+            if name in traffic.packets or len(traffic.packets) < _MAX_SENDERS:
+                traffic.packets[name] += 1
             if parser is None or not link.stream:
                 parser = dialect.MAVLink(None)
                 parser.robust_parsing = True
             for message in parser.parse_buffer(data) or []:
-                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these types have no header
-                    ids = message.get_srcSystem(), message.get_srcComponent()
-                    ignored = ignore_reason(*ids)
-                    if fault := f"ignored: {ignored}" if ignored else both.add(ids[0], peer, now):
-                        faults[ids] = fault
-                    if ignored:
-                        continue
-                    systems.setdefault(ids[0], []).append(message)
-                    if _is_px4(message):
-                        request = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
-                        link.send(request.pack(sender), peer)
-                        link.send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()).pack(sender), peer)
-                    elif message.get_type() == "TIMESYNC" and message.tc1:
-                        message.round_trip = (time.monotonic_ns() - message.ts1) / 1e9
-    return senders, systems, faults
+                if message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these types have no header
+                    continue
+                ids = message.get_srcSystem(), message.get_srcComponent()
+                if reason := senders.ignore_reason(message, *ids):
+                    traffic.ignored[ids] = reason
+                    continue
+                if traffic.ignored.get(ids) == NO_HEARTBEAT:
+                    del traffic.ignored[ids]  # it has identified itself since
+                if duplicate := addresses.add(ids[0], peer, now):
+                    traffic.duplicates[ids[0]] = duplicate
+                traffic.systems.setdefault(ids[0], []).append(message)
+                if _is_px4(message):
+                    request = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
+                    link.send(request.pack(sender), peer)
+                    link.send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()).pack(sender), peer)
+                elif message.get_type() == "TIMESYNC" and message.tc1:
+                    message.round_trip = (time.monotonic_ns() - message.ts1) / 1e9
+    return traffic
 
 
 def _is_px4(message: Any) -> bool:
@@ -108,6 +140,9 @@ def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
         seen = f"{_POSITION} at {counts[_POSITION] / TIMINGS.listen:.0f} Hz; messages: {types}"
         advice = "" if counts["ODOMETRY"] else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
         return Finding("mavlink", name, "ok", seen, advice)
+    if set(counts) == {HIGH_LATENCY}:
+        advice = "'nedbus serve' publishes global position, status and battery, and sends nothing to the vehicle"
+        return Finding("mavlink", name, "ok", f"a satellite link: {HIGH_LATENCY} only", advice)
     seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}, only {types}"
     advice = (
         f"'nedbus serve --source mavlink:{link}' requests it; if none arrives, PX4 may have no estimate, or may need"

@@ -7,12 +7,13 @@ from nedbus.client import SourceStatus
 from nedbus.events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
-from .finding import Finding, State, brief, list_names
+from .finding import FIRST_PARTNER, Finding, State, brief, list_names
 from .observation import Observation
 
 _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _MAX_TEXT: Final = 300  # characters of text from a peer
+_MAX_REMARKS: Final = 3  # of a source
 _MAX_WARNING: Final = 602  # characters of the origin and the reason of a rejection
 _SILENT_PERIODS: Final = 3.0  # message intervals after which an address is silent
 _MAX_TIME: Final = 1e11  # s; maximum Unix time accepted from a service
@@ -100,6 +101,8 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; see the log of its service")
     elif state in {"waiting", "starting"}:
         advice = "check that the vehicle sends to the service; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
+        if source.source.startswith("mavlink:udpout:"):
+            advice = f"{advice}; {FIRST_PARTNER}"
         yield Finding("source", name, "warning", f"{state}: no message yet", advice)
     if source.overload:
         yield Finding("source", name, "wrong", source.overload[:_MAX_TEXT], "stop other programs on its host")
@@ -128,6 +131,9 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         first = "".join(f"; {text[:_MAX_WARNING]}" for text in source.warnings[:1])
         advice = "rejected messages are not published; see the service's log or the @rejected keys for all reasons"
         yield Finding("source", name, "warning", f"messages rejected: {source.rejected:,}{why}{first}", advice)
+    elif source.warnings:  # remarks, such as that on a satellite link
+        remarks = "; ".join(text[:_MAX_WARNING] for text in source.warnings[:_MAX_REMARKS])
+        yield Finding("source", name, "ok", remarks)
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:

@@ -13,6 +13,7 @@ from .rules import POSITIONS
 from .story import TOGETHER, Story, stories_of
 from .times import Times
 
+_GLOBAL: Final = "vehicle_global_position"
 _WIDTH: Final = 97  # columns next to a short vehicle name; a verdict has at most three lines
 
 
@@ -32,6 +33,14 @@ class Verdict:
     end: Event | None = None
     cause: tuple[Event, ...] = ()
     stories: tuple[Story, ...] = ()
+
+
+def _describe_unknown(topics: Collection[str]) -> str:
+    """Describe data without the validity of positions."""
+    text = "the data has no position validity"
+    if set(POSITIONS).isdisjoint(topics) and _GLOBAL in topics:
+        text += ", only a global position, as over a satellite link (HIGH_LATENCY2)"
+    return text
 
 
 def verdict_of(
@@ -56,7 +65,8 @@ def verdict_of(
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
         length = "the services' history" if times.is_live else f"{end:.0f} s"
-        return Verdict(f"no faults in {length}{'' if known else '; the data has no position validity'}", known)
+        remark = "" if known else f"; {_describe_unknown(topics)}"
+        return Verdict(f"no faults in {length}{remark}", known)
     is_now = times.is_live and at is None
     past = [story for story in stories if is_now and story.has_ended(end)]
     ranked = sorted(stories, key=lambda story: (story in past, rank(story.spans[0], story.until, is_now=is_now)))

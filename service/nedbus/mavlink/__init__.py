@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
-from .senders import AUTOPILOT, ignore_reason
-
 if TYPE_CHECKING:
-    from .boot_clock import BootClock
-    from .fields import CONVERSIONS
+    from .boot_time import new_clock, read_time
+    from .fields import CONVERSIONS, HIGH_LATENCY
     from .log_reassembly import Chunk, Reassembly
     from .parser import Received, new_parser, parse
+    from .senders import AUTOPILOT, NO_HEARTBEAT, Senders
     from .sequence import PacketRate, SequenceCounter
     from .vehicle import Vehicle
 else:
     _NAMES = {
-        "boot_clock": "BootClock", "fields": "CONVERSIONS", "log_reassembly": "Chunk Reassembly",
-        "parser": "Received new_parser parse", "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",
+        "boot_time": "new_clock read_time", "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
+        "parser": "Received new_parser parse", "senders": "AUTOPILOT NO_HEARTBEAT Senders",
+        "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",
     }  # fmt: skip
     _MODULES = {name: ("mavlink", module) for module, names in _NAMES.items() for name in names.split()}
     __getattr__ = lazy_exports(__name__, _MODULES)

@@ -8,9 +8,9 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.samples import Rejection
 
-from .fields import DECODED
+from .fields import DECODED, HIGH_LATENCY
 from .log_reassembly import Chunk
-from .senders import ignore_reason
+from .senders import Senders
 
 _SIGNATURE: Final = 13  # bytes
 _HEADER, _OLD_HEADER = 10, 6  # bytes, of MAVLink 2 and 1
@@ -48,18 +48,40 @@ class Received(NamedTuple):
 
 
 def parse(parser: Any, data: bytes, name: str, peer: Any, now: float) -> Iterator[Received | Rejection]:
-    """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival."""
+    """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival.
+
+    The sender is looked at before the checksum: a damaged message of an ignored component is ignored, too.
+    """
+    senders: Senders = parser.senders
     for message in parser.parse_buffer(data) or ():
         kind, raw = message.get_type(), message.get_msgbuf()
         if kind == "BAD_DATA":
-            yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
+            if not (_is_frame(raw) and senders.ignores(*_ids(raw))):
+                yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue
         # Only the header of a message can be parsed if the dialect lacks its definition.
-        sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
-        if not (reason := ignore_reason(system, component)):
+        system, component = _ids(raw)
+        if not (reason := senders.ignore_reason(message, system, component)):
+            sequence = raw[4] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2]
             yield Received(message, system, sequence, peer, now)
         elif not ((system and component) or kind.startswith("UNKNOWN")):  # cameras etc. are normal
             yield Rejection(f"{name} system {system} component {component}", reason)
+
+
+def _ids(frame: bytes) -> tuple[int, int]:
+    """Return system and component id of a frame."""
+    start = 5 if frame[0] == dialect.PROTOCOL_MARKER_V2 else 3
+    return frame[start], frame[start + 1]
+
+
+def _is_frame(data: bytes) -> bool:
+    """Return whether these bytes are as long as the frame that they begin with."""
+    if len(data) < _OLD_HEADER + 2:
+        return False
+    if data[0] == dialect.PROTOCOL_MARKER_V2:
+        signature = _SIGNATURE if data[2] & dialect.MAVLINK_IFLAG_SIGNED else 0
+        return len(data) == _HEADER + data[1] + 2 + signature
+    return data[0] == dialect.PROTOCOL_MARKER_V1 and len(data) == _OLD_HEADER + data[1] + 2
 
 
 class _Layout(NamedTuple):
@@ -89,6 +111,8 @@ def _layout_of(message: Any) -> _Layout:
         key = f"_{name}_raw" if code == "c" else name  # pymavlink's name of the bytes of a text
         fields[key] = unpack.unpack_from, bool(length) and code != "c"
         offset = unpack.size
+    if message.msgname == HIGH_LATENCY:
+        fields["time_boot_ms"] = fields["timestamp"]
     return _Layout(message.msgname, bytes([message.crc_extra]), message.instance_field, offset, fields)
 
 
@@ -181,8 +205,12 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
         return kind(number, layout, bytes(msgbuf), bytes(msgbuf[_HEADER if is_v2 else _OLD_HEADER : end]))
 
 
-def new_parser() -> Any:
-    """Return a parser that reports bytes that are not MAVLink as BAD_DATA."""
+def new_parser(senders: Senders | None = None) -> Any:
+    """Return a parser that reports bytes that are not MAVLink as BAD_DATA.
+
+    `senders`: those on the link so far; None for a new link or file.
+    """
     parser = _Parser(None)
     parser.robust_parsing = True
+    parser.senders = senders or Senders()
     return parser

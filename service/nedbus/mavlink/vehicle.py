@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any, Final, Protocol, cast
 
@@ -11,12 +11,13 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.log_event import about
 from nedbus.samples import Rejection, SourceMessage
+from nedbus.timeline import RecentTimes, TimeKind
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
-from .boot_clock import BootClock
-from .fields import CONVERSIONS
+from .boot_time import new_clock, read_time
+from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
 
 _log = logging.getLogger(__name__)
 
@@ -26,10 +27,14 @@ _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is res
 _FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose messages
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _UNKNOWN_HEADING: Final = 65535
+_MAX_LATITUDE: Final = 90e7  # 1e-7 deg
+_HEARTBEAT_TIMEOUT: Final = 10.0  # s without a HEARTBEAT until a link with HIGH_LATENCY2 is a satellite link
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
 _DEBUG: Final = 7
+_COPY_TIMEOUT: Final = 10.0  # s after a copy for which late messages are those of a second link
+_SENT_ONCE: Final = frozenset({"sensor_gps", "vehicle_odometry"})  # their messages have `time_usec`
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
 _POSITION, _STATUS, _QUATERNION = 32, 230, 31
@@ -90,6 +95,7 @@ class Vehicle:
     `topics`: those to deliver, None for all; `rate`: positions per second to request.
     `baud`: of a serial link; None for other links, whose bandwidth is unknown.
     `lost`, `rebooted`: losses and a reboot that were not reported yet.
+    `copies`: messages that came again or late over a second link, and were dropped.
     """
 
     def __init__(
@@ -100,10 +106,14 @@ class Vehicle:
         self._rates = request_rates(rate, baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
-        self.clock = BootClock()
+        self.clock = new_clock()
+        self.copies = 0
+        self._copied = -math.inf  # time at which the last copy arrived
         self._last_message = 0.0
+        self._last_heartbeat = self._high_latency = -math.inf  # time of the last HEARTBEAT and HIGH_LATENCY2
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self.rebooted = False
+        self._is_wild = self._is_copy = False  # by the time of the last message
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
@@ -112,6 +122,7 @@ class Vehicle:
         """Discard all state and request everything again, after silence or a reboot."""
         self._stored: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
         self._last: dict[Address, int] = {}  # newest timestamps
+        self._delivered = RecentTimes()
         self._texts = _StatusTexts()
         self._started = now
         self._arrivals: dict[int, float] = {}  # last arrival of each requested message
@@ -143,7 +154,7 @@ class Vehicle:
 
         Each message is requested three times, and then every 5 s until it arrives.
         """
-        if now - self._last_message > _SILENCE_TIMEOUT:
+        if now - self._last_message > _SILENCE_TIMEOUT or self.is_high_latency:
             return None
         if not self._pending and now >= self._next_round:
             self._next_round = now + _REQUEST_INTERVAL
@@ -159,6 +170,30 @@ class Vehicle:
         number = self._pending.pop(0)
         return number, self._rates[number]
 
+    @property
+    def is_high_latency(self) -> bool:
+        """Whether the link is a satellite link, whose only message is HIGH_LATENCY2."""
+        return self._high_latency > self._last_heartbeat + _HEARTBEAT_TIMEOUT
+
+    def handle_all(
+        self, message: Any, now: float, log: StreamedTopics | None = None
+    ) -> list[SourceMessage | Rejection]:
+        """Convert a message as `handle` does; HIGH_LATENCY2 contains several topics."""
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            self._last_heartbeat = now
+        if kind != HIGH_LATENCY:
+            item = self.handle(message, now, log)
+            return [] if item is None else [item]
+        self._high_latency = now
+        timestamp = self._track_time(message, now)
+        items = [
+            self._publish(self._address(topic), fields_of(message), timestamp, now, log)
+            for topic, fields_of in OF_HIGH_LATENCY.items()
+            if topic in self._topics and timestamp is not None
+        ]
+        return [item for item in items if item is not None]
+
     def handle(self, message: Any, now: float, log: StreamedTopics | None = None) -> SourceMessage | Rejection | None:
         """Convert a message; return a Rejection if it is out of order, or there are too many texts.
 
@@ -167,6 +202,11 @@ class Vehicle:
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now)
+        if timestamp is not None and self._is_wild:
+            return self._rejected(topic, message, f"wild time ({timestamp // 1000} ms since boot)")
+        if self._is_copy:
+            self._count_copy(now)
+            return None
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
         is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
@@ -181,20 +221,45 @@ class Vehicle:
             timestamp = self.clock.newest
         if topic not in self._topics or is_redundant or timestamp is None:
             return None
-        instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
-        address = Address(self._name, topic, instance)
-        is_delivered = log is not None and log.delivers(address)
-        if is_delivered and kind in CONVERSIONS:
+        address = self._address(topic, message.id if kind == "BATTERY_STATUS" else 0)
+        if kind in CONVERSIONS and log is not None and log.delivers(address):
             return None
-        fields = {name: value for name, value in fields_of(message).items() if value is not None}
-        if not fields or is_delivered:  # a text is discarded
+        return self._publish(address, fields_of(message), timestamp, now, log)  # a text is discarded only now
+
+    def _count_copy(self, now: float) -> None:
+        self.copies += 1
+        self._copied = now
+
+    def _rejected(self, topic: str, message: Any, reason: str) -> Rejection | None:
+        if topic not in self._topics:
+            return None
+        address = self._address(topic, message.id if message.get_type() == "BATTERY_STATUS" else 0)
+        return Rejection(str(address), reason, address)
+
+    def _address(self, topic: str, instance: int = 0) -> Address:
+        return Address(self._name, topic, instance if TOPICS[topic].instances else None)
+
+    def _publish(
+        self, address: Address, fields: Mapping[str, object], timestamp: int, now: float, log: StreamedTopics | None
+    ) -> SourceMessage | Rejection | None:
+        """Return the message of an address, from which unknown fields are left out; see `handle`."""
+        fields = {name: value for name, value in fields.items() if value is not None}
+        if not fields or (log is not None and log.delivers(address)):
+            return None
+        if self._delivered.contains(address, timestamp) and address.topic in _SENT_ONCE:
+            self._count_copy(now)
             return None
         if timestamp < (last := self._last.get(address, 0)):
+            if now - self._copied <= _COPY_TIMEOUT:  # lost on the faster link
+                self._count_copy(now)
+                return None
+            self._copied = now  # further late ones are those of a second link, whose times need not be equal
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
+        self._delivered.add(address, timestamp)
         fields = {"timestamp": timestamp, **fields}
-        self._add_stored_fields(topic, fields, timestamp, now)
+        self._add_stored_fields(address.topic, fields, timestamp, now)
         return self.report(SourceMessage(0.0, address, fields, arrived=now), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
@@ -203,7 +268,7 @@ class Vehicle:
                 self._store("heading", now + _VALUE_TIMEOUT, heading=wrap(math.radians(message.hdg / 100)))
             case "ATTITUDE" if math.isfinite(message.yaw):
                 self._store("yaw", now + _VALUE_TIMEOUT, heading=wrap(message.yaw))
-            case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
+            case "GPS_GLOBAL_ORIGIN" if _is_origin(message):
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
@@ -216,14 +281,14 @@ class Vehicle:
             case "ODOMETRY":
                 covariance, known = message.velocity_covariance, {}
                 north, east, down = covariance[0], covariance[6], covariance[11]
-                if math.isfinite(north + east) and min(north, east) >= 0:
+                if math.isfinite(north + east) and min(north, east) >= 0 and north + east > 0:
                     known["evh"] = math.sqrt(north + east)
-                if math.isfinite(down) and down >= 0:
+                if math.isfinite(down) and down > 0:
                     known["evv"] = math.sqrt(down)
                 self._store("velocity", now + _VALUE_TIMEOUT, **known)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
-                known = {name: value for name, value in deviations.items() if math.isfinite(value)}
+                known = {name: value for name, value in deviations.items() if math.isfinite(value) and value > 0}
                 valid = _validity(message.flags)
                 self._store("status", now + _STATUS_TIMEOUT, **valid, **known)
                 is_global = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS)
@@ -260,7 +325,11 @@ class Vehicle:
 
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
-        if self.clock.add(message, now):
+        reading = read_time(self.clock, message, now)
+        kind = None if reading is None else reading.kind
+        self._is_wild = kind is TimeKind.WILD
+        self._is_copy = kind is TimeKind.COPY
+        if kind is TimeKind.REBOOT:
             self.rebooted = True
             self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
             self._reset(now)
@@ -268,7 +337,14 @@ class Vehicle:
         if 0 < microseconds < YEAR_2000:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", None)
-        return self.clock.newest if ms is None else 1000 * ms
+        if reading is not None:
+            return reading.time
+        return self.clock.newest if ms is None else self.clock.unwrap(1000 * ms, now)
+
+
+def _is_origin(message: Any) -> bool:
+    """Return whether GPS_GLOBAL_ORIGIN has an origin: zeros are none, and PX4 up to 1.15 exceeds 180 degrees."""
+    return abs(message.latitude) <= _MAX_LATITUDE and bool(message.latitude or message.longitude)
 
 
 def _validity(bits: int) -> dict[str, object]:

@@ -250,11 +250,15 @@ def test_service_status_produces_findings(zenoh_session: Session, endpoint: str)
         source(state="failed", error="the disk is gone"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
         source(source="px4-zenoh:", state="waiting"),
+        source(source="mavlink:udpout:10.0.0.1:14580", state="waiting"),
+        source(source="mavlink:satellite", warnings=["system 5: a satellite link"]),
     ]
     with service_status(zenoh_session, version="99.1.0", sources=sources):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
-    find(findings, "source", "warning", "px4-zenoh:: waiting")
+    assert "first address" not in find(findings, "source", "warning", "px4-zenoh:: waiting").advice
+    assert "first address" in find(findings, "source", "warning", "mavlink:udpout:10.0.0.1:14580: waiting").advice
+    find(findings, "source", "ok", "mavlink:satellite: system 5: a satellite link")
     find(findings, "source", "warning", "no more messages of 9/x")
     find(findings, "source", "warning", r"messages rejected: 7 \(xy_valid\)")
     find(findings, "version", "warning", r"the service runs nedbus 99\.1\.0")
@@ -617,7 +621,12 @@ def test_mavlink_traffic_produces_findings() -> None:
     """Packets, messages, positions, ULog stream, ignored senders and a port in use produce findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
-    find(check_link(), "mavlink", "wrong", "no packet within")
+    satellite = mavlink.MAVLink_high_latency2_message(5000, 2, 12, *[0] * 24)
+    assert "sends nothing" in find(check_link(*packets_of(7, satellite)), "mavlink", "ok", "a satellite link").advice
+    assert "first address" not in find(check_link(), "mavlink", "wrong", "no packet within").advice
+    findings = diagnose(free_endpoint(), mavlink=f"udpout:127.0.0.1:{free_port()}", listen=0.1)
+    silent = find(findings, "mavlink", "wrong", "no packet within")
+    assert "PX4 sends only to the first address that sent to its port since its boot" in silent.advice
     junk = check_link(b"GET / HTTP/1.1")
     find(junk, "mavlink", "wrong", r"no MAVLink among the packets from 127\.0\.0\.1:\d+ ")
     findings = check_link(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position))
@@ -645,6 +654,31 @@ def test_mavlink_traffic_produces_findings() -> None:
         owner.bind(("127.0.0.1", free_port()))
         findings = diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")
     find(findings, "mavlink", "warning", r"address already in use")
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, "the type MAV_TYPE_ONBOARD_CONTROLLER"), (250, "the unknown type 250")],
+)
+def test_heartbeats_of_others_with_component_1_are_named(kind: int, text: str) -> None:
+    """A router or an unknown component with component id 1 is no vehicle, and is named, alone or beside a vehicle."""
+    vehicle = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    other = mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+    reason = f"not an autopilot: its HEARTBEAT has {text}"
+    findings = check_link(*packets_of(42, other))
+    find(findings, "mavlink", "wrong", f"system 42 component 1: ignored: {reason}")
+    assert not any("PX4 found" in each.seen for each in findings)
+    findings = check_link(*packets_of(7, vehicle), *packets_of(42, other))
+    find(findings, "mavlink", "ok", f"system 42 component 1: ignored: {reason}")
+    assert not any("system 42: " in f"{each.subject}: " for each in findings), "it is no vehicle"
+    findings = check_link(*packets_of(7, vehicle), *packets_of(7, other))
+    shared = find(findings, "mavlink", "warning", f"system 7 component 1: some HEARTBEATs are ignored: {reason}")
+    assert "give it a component id of its own" in shared.advice
+    find(findings, "mavlink", "ok", "system 7: PX4 found")
+    pressure = mavlink.MAVLink_scaled_pressure_message(1, 1.0, 1.0, 1)
+    findings = check_link(*packets_of(7, pressure, vehicle), *packets_of(8, pressure))
+    assert not any("system 7 component 1" in each.subject for each in findings), "its heartbeat came second"
+    find(findings, "mavlink", "ok", "system 8 component 1: ignored: not known to be an autopilot")
 
 
 def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch) -> None:

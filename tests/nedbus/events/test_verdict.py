@@ -170,6 +170,9 @@ def test_verdict_reports_absence_of_faults() -> None:
     assert all("position validity" not in verdict(flight, times=times).text for times in (Times(), LIVE))
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
     assert (unknown.usable, "the data has no position validity" in unknown.text) == (None, True)
+    assert "satellite" not in unknown.text
+    satellite = verdict_of("1", [], topics=["vehicle_global_position"], times=Times(), end=5.0)
+    assert "only a global position, as over a satellite link (HIGH_LATENCY2)" in satellite.text
 
 
 def test_verdict_without_validity_flags_is_unknown() -> None:

@@ -1,10 +1,12 @@
 """Reader of .tlog files of QGroundControl or MAVProxy: MAVLink frames, each preceded by the host's time in 8 bytes."""
 
+import os
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
@@ -21,6 +23,8 @@ _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and 
 _MAX_RECORD: Final = _HEAD.size + 290  # bytes of a record
 _OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}  # bytes of a frame without payload
 _SIGNATURE: Final = 13  # bytes
+_MARKERS: Final = re.compile(b"[%c%c]" % (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2))
+_BLOCK: Final = 2**16  # bytes per read
 
 
 class _ConvertedStream:
@@ -61,15 +65,25 @@ class TlogReader(FlightReader):
         self._file, self.total = open_file(path), path.stat().st_size
         self._resources.append(self._file)
         self._boots: set[int] = set()  # Unix times [us]
-        self._foreign = self._lost = 0  # bytes that are not MAVLink; messages before the next one
+        self._foreign = self._lost = 0  # bytes that are not MAVLink; messages lost before the next one
+        self._end = self.total  # the rest of the file is zeros
+        self._is_cut = False  # the file ends within a record, or in zeros
         self._rebooted = False
         self._streams: dict[Address, _ConvertedStream] = {}
         self._shrinkage: list[str] = []
 
     @property
     def warnings(self) -> list[str]:
-        """Damage so far."""
-        return [f"damaged ({self._foreign} B are not MAVLink)"] * bool(self._foreign) + self._shrinkage
+        """Damage so far, and a truncated end, which is no damage."""
+        warnings = [*self._shrinkage]
+        if self._foreign:
+            warnings.append(f"damaged ({self._foreign} B are not MAVLink)")
+        if self._is_cut and self._end < self.total:
+            zeros = self.total - self._end
+            warnings.append(f"truncated (the last {zeros} B are zeros, as after a power cut)")
+        elif self._is_cut:
+            warnings.append("truncated (the file ends within a message)")
+        return warnings
 
     def records(self) -> Iterator[Record]:
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
@@ -78,27 +92,30 @@ class TlogReader(FlightReader):
         for arrived, (stamp, frame) in arrivals(self._frames(), itemgetter(0)):
             for item in parse(parser, frame, str(self.path), None, arrived):
                 if isinstance(item, Rejection):
-                    self._skip(len(frame) if item.where == str(self.path) else 0)
+                    if self.position > self._end:
+                        self._is_cut = True  # a record whose end was not written
+                    elif item.where == str(self.path):
+                        self._skip(len(frame))
                     continue
                 if item.system not in vehicles:
                     name = str(item.system)
                     vehicles[item.system] = Vehicle(name, self.options.topics), SequenceCounter()
                 vehicle, sequence = vehicles[item.system]
                 vehicle.count_lost(sequence.add(item.sequence, item.time), item.time)
-                found = vehicle.handle(item.message, item.time)
-                if found is None or found.address is None:
-                    continue
-                stream = self._stream(found.address)
-                if isinstance(found, Rejection):
-                    yield Record(stream, {}, stamp, found.reason)
-                    continue
-                if found.rebooted or item.system not in booted:
-                    # The message may have the time of an old sample.
-                    booted.add(item.system)
-                    self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
-                    self.boot_utc = next(iter(self._boots)) if len(self._boots) == 1 else 0
-                self._lost, self._rebooted = found.lost, found.rebooted
-                yield Record(stream, found.fields, stamp)
+                for found in vehicle.handle_all(item.message, item.time):
+                    if found.address is None:
+                        continue
+                    stream = self._stream(found.address)
+                    if isinstance(found, Rejection):
+                        yield Record(stream, {}, stamp, found.reason)
+                        continue
+                    if found.rebooted or item.system not in booted:
+                        # The message may have the time of an old sample.
+                        booted.add(item.system)
+                        self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
+                        self.boot_utc = next(iter(self._boots)) if len(self._boots) == 1 else 0
+                    self._lost, self._rebooted = found.lost, found.rebooted
+                    yield Record(stream, found.fields, stamp)
         if not self.definitions:
             reason = "this file has no autopilot messages for these topics"
             raise SourceError(str(self.path), "; ".join([reason, *self.warnings]))
@@ -118,28 +135,76 @@ class TlogReader(FlightReader):
 
     def _skip(self, count: int) -> None:
         self._foreign += count
-        self.damaged |= count > 0
+        self.damaged = True
 
     def _frames(self) -> Iterator[tuple[int, bytes]]:
         """Yield each frame with its time [us]; after damage, search for two consecutive records."""
         with self._file as file:
-            data, is_found = b"", True
-            while data := data + file.read(2 * _MAX_RECORD - len(data)):
-                length = _record_length(data)
-                is_found = bool(length) and (is_found or len(data) == length or _record_length(data[length:]) > 0)
-                if not is_found or length > len(data):
-                    self._skip(1)
-                    self.position, data = self.position + 1, data[1:]
-                    continue
-                yield _HEAD.unpack_from(data)[0], data[8:length]
-                self.position, data = self.position + length, data[length:]
+            self._end = _end_of_content(file, self.total)
+            data, at, is_synchronised = b"", 0, True
+            while True:
+                if len(data) - at < 2 * _MAX_RECORD:
+                    data, at = data[at:] + file.read(_BLOCK), 0
+                if at == len(data):
+                    break
+                length = _record_length(data, at)
+                is_record = 0 < length <= len(data) - at and self.position < self._end
+                if is_record and (is_synchronised or _is_next(data, at + length)):
+                    is_synchronised = True
+                    self.position += length
+                    yield _HEAD.unpack_from(data, at)[0], data[at + 8 : at + length]
+                    at += length
+                elif self.position >= self._end or (is_synchronised and _is_cut(data[at:], self._end - self.position)):
+                    self._is_cut = True
+                    self.position = self.total if self._end < self.total else self.position + len(data) - at
+                    break
+                else:
+                    is_synchronised = False
+                    skipped = _next_candidate(data, at) - at
+                    self._skip(skipped)
+                    self.position, at = self.position + skipped, at + skipped
             self._shrinkage = self.shrinkage()
 
 
-def _record_length(data: bytes) -> int:
-    """Return the length of the record at the start of these bytes, 0 if there is none."""
-    if len(data) < _HEAD.size + 1:
+def _end_of_content(file: BinaryIO, size: int) -> int:
+    """Return the position behind the last byte of a file that is not zero; do not move in the file."""
+    begin, end = file.tell(), size
+    while end > begin:
+        start = max(begin, end - _BLOCK)
+        file.seek(start)
+        block = file.read(end - start)
+        if block != bytes(len(block)):  # ten times as fast as to strip it
+            end = start + len(block.rstrip(b"\0"))
+            break
+        end = start
+    file.seek(begin, os.SEEK_SET)
+    return end
+
+
+def _record_length(data: bytes, at: int) -> int:
+    """Return the length of the record at a position of these bytes, 0 if there is none."""
+    if len(data) - at < _HEAD.size + 1:
         return 0
-    marker, payload, flags = data[8:11]
+    marker, payload, flags = data[at + 8 : at + 11]
     signature = _SIGNATURE if marker == dialect.PROTOCOL_MARKER_V2 and flags & dialect.MAVLINK_IFLAG_SIGNED else 0
     return 8 + _OVERHEAD[marker] + payload + signature if marker in _OVERHEAD else 0
+
+
+def _is_next(data: bytes, at: int) -> bool:
+    """Return whether the data ends at a position, or another record begins there."""
+    return at == len(data) or _record_length(data, at) > 0
+
+
+def _is_cut(rest: bytes, content: int) -> bool:
+    """Return whether the rest of a file is the beginning of a record; `content`: its size without zeros at the end."""
+    if content >= _MAX_RECORD:
+        return False
+    return min(content, len(rest)) <= 8 or rest[8] in _OVERHEAD
+
+
+def _next_candidate(data: bytes, at: int) -> int:
+    """Return the next position at which a record may begin; the end of the data if there is none."""
+    found = _MARKERS.search(data, at + 9)
+    if found is not None:
+        return found.start() - 8
+    return max(at + 1, len(data) - 8) if len(data) - at > 8 else len(data)

@@ -9,6 +9,7 @@ import struct
 import sys
 import threading
 import time
+import zlib
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -21,6 +22,8 @@ Peer = Any  # remote address, as returned by the socket
 
 _CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect causes 1, a reordered packet 2 more
 _WINDOW: Final = 5.0  # s
+_PEER_TIMEOUT: Final = 3.0  # s without a message from an address until another one replaces it
+_PEER_RUN: Final = 20  # messages in a row from another address that replace it earlier
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
 _MAX_UNSENT: Final = 4096  # bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
@@ -30,8 +33,9 @@ _TIMESTAMPS: Final = 35  # Linux's SO_TIMESTAMPNS: the arrival of a datagram
 _DROPS: Final = 40  # Linux's SO_RXQ_OVFL: the number of datagrams dropped before it
 _TIME: Final = struct.Struct("qq")  # s and ns since the epoch
 _MAX_CONTROL: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
-_LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
+_LINK: Final = re.compile(r"(udpin|tcp):(.+):(\d{1,5})|(udpout):(.+):(\d{1,5})(?:@(\d{1,5}))?|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
+_LOCAL_PORTS: Final = range(20_000, 30_000)  # below those that Linux gives to sockets without a port
 
 
 class Packet(NamedTuple):
@@ -42,13 +46,28 @@ class Packet(NamedTuple):
     time: float
 
 
+class LinkAddress(NamedTuple):
+    """The parts of a link. `host`: of a serial port, its device; `local_port`: from which udpout sends, else 0."""
+
+    kind: str
+    host: str
+    port: int = 0
+    local_port: int = 0
+
+
 class _UdpLink:
-    """A UDP socket; `peer` is None if it listens. `dropped`: datagrams dropped because they were read too late."""
+    """A UDP socket; `peer` is None if it listens. `dropped`: datagrams dropped because they were read too late.
+
+    udpout sends from a fixed local port: PX4 sends to the first address from which it received after its boot, so a
+    restarted service would receive nothing at another port.
+    """
 
     stream, baud = False, None
 
-    def __init__(self, host: str, port: int, *, listens: bool) -> None:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    def __init__(self, link: LinkAddress) -> None:
+        family, _, _, _, address = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)[0]
+        listens = link.kind == "udpin"
+        local = address if listens else ("", link.local_port)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
@@ -57,12 +76,11 @@ class _UdpLink:
         self.dropped, self._drained = 0, time.monotonic()
         self.close = self._socket.close
         self.peer: Peer = None if listens else address
-        if listens:
-            try:
-                self._socket.bind(address)
-            except OSError:
-                self.close()
-                raise
+        try:
+            self._socket.bind(local)
+        except OSError:
+            self.close()
+            raise
 
     def read(self, timeout: float) -> Iterator[Packet]:
         """Yield received datagrams; wait up to `timeout` seconds for the first."""
@@ -142,30 +160,50 @@ Link = _UdpLink | _StreamLink
 """An open connection to one or more vehicles; its methods raise OSError."""
 
 
-def parse_link(text: str) -> tuple[str, str, int]:
-    """Split a link into kind, host or device, and port; raise ConfigError if it is invalid."""
+def parse_link(text: str) -> LinkAddress:
+    """Parse a link; raise ConfigError if it is invalid."""
+    error = ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link; write {_FORMS}")
     found = _LINK.fullmatch(text)
-    if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
-        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link; write {_FORMS}")
-    return (found[1], found[2].strip("[]"), int(found[3])) if found[1] else (found[4], found[5], 0)
+    if found is None:
+        raise error
+    if found[8]:
+        return LinkAddress("serial", found[9])
+    if found[1]:
+        link = LinkAddress(found[1], found[2].strip("[]"), int(found[3]))
+    else:
+        local_port = int(found[7]) if found[7] else _local_port(f"{found[5]}:{found[6]}")
+        link = LinkAddress("udpout", found[5].strip("[]"), int(found[6]), local_port)
+    if not 0 < link.port < 2**16 or link.local_port >= 2**16:
+        raise error
+    return link
+
+
+def _local_port(target: str) -> int:
+    """Return the port from which to send to a target: the same one after each start, and for most targets its own."""
+    return _LOCAL_PORTS[zlib.crc32(target.encode()) % len(_LOCAL_PORTS)]
 
 
 def open_link(text: str, *, baud: int) -> Link:
     """Open a link; raise SourceError if that fails, ConfigError if the link is invalid."""
-    kind, host, port = parse_link(text)
+    link = parse_link(text)
+    host, port = link.host, link.port
     try:
-        if kind == "serial":
+        if link.kind == "serial":
             from serial import Serial
 
             return _StreamLink(Serial(host, baud, timeout=0), host, baud)
-        if kind == "tcp":
+        if link.kind == "tcp":
             with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
                 return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps the socket open
-        return _UdpLink(host, port, listens=kind == "udpin")
+        return _UdpLink(link)
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
         reason = os.strerror(number).lower() if number and number > 0 else str(exc)
-        remedy = ": close the other program or use another port" * (number == errno.EADDRINUSE)
+        remedy = ""
+        if number == errno.EADDRINUSE and link.kind == "udpout":
+            remedy = f" at local port {link.local_port}: close the other program or use another one, as in {text}@14555"
+        elif number == errno.EADDRINUSE:
+            remedy = ": close the other program or use another port"
         raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason}){remedy}") from exc
 
 
@@ -174,6 +212,39 @@ def _wait(file: Any, timeout: float, events: int = 0) -> int:
     poll = select.poll()  # unlike select(), without a limit on file descriptors
     poll.register(file, select.POLLIN | events)
     return next((found for _, found in poll.poll(timeout * 1000)), 0)
+
+
+def name_of(peer: Peer) -> str:
+    """Return an address as text."""
+    return ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
+
+
+class PeerChoice:
+    """The address to which the messages for one vehicle are sent: the one that has delivered its data.
+
+    Another address that sends with the id of the vehicle, a second link or a stranger, does not replace it at once. It
+    replaces an address that is silent for 3 s, or once it has delivered 20 messages in a row.
+
+    `peer`: the chosen address. `second`: another address that sent while the chosen one did, None if there is none.
+    """
+
+    def __init__(self, peer: Peer, now: float) -> None:
+        self.peer, self.second = peer, None
+        self._last = now  # time of the last message from the chosen address
+        self._other: tuple[Peer, float] | None = None  # last message from another address since then, and its time
+        self._run = 0  # messages from that address since then
+
+    def add(self, peer: Peer, now: float) -> None:
+        """Add a message from an address, at monotonic time `now` [s]."""
+        if peer == self.peer:
+            if self._other is not None and now - self._other[1] < _PEER_TIMEOUT:
+                self.second = self._other[0]
+            self._other, self._run, self._last = None, 0, now
+            return
+        self._run = self._run + 1 if self._other is not None and self._other[0] == peer else 1
+        self._other = peer, now
+        if now - self._last > _PEER_TIMEOUT or self._run >= _PEER_RUN:
+            self.peer, self._other, self._run, self._last = peer, None, 0, now
 
 
 class DuplicateIds:
@@ -192,5 +263,5 @@ class DuplicateIds:
         if len(changes) < _CHANGES or now - changes[0][1] > _WINDOW or system in self._found:
             return ""
         self._found.add(system)
-        both = " and ".join(":".join(map(str, each[:2])) for each in (changes[-2][0], peer))  # only UDP has several
+        both = f"{name_of(changes[-2][0])} and {name_of(peer)}"
         return f"{both} both send as system {system}, and their messages are mixed; give each its own MAV_SYS_ID"

@@ -13,7 +13,8 @@ COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_C
 
 _TRIES: Final = 3  # transmissions of an unanswered command
 _RESTARTS: Final = 2  # after START was accepted, but no data arrived
-_PINGS: Final = 3  # TIMESYNC requests before START; the shortest round trip counts, the others may have been queued
+_PINGS: Final = 3  # TIMESYNC requests of a measurement; the shortest round trip counts, the others may have been queued
+_MEASUREMENTS: Final = 3  # before the stream is refused, because a vehicle that boots answers late
 _MIN_COUNT: Final = 32  # messages of a header before its duration is estimated, or fewer if they took `_MIN_TIME`
 _MIN_TIME: Final = 1.0  # s
 _STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
@@ -102,7 +103,8 @@ class LogStreamClient:
         self._unreadable = ""  # reason given to `reject`, until the next `tick`
         self._awaited: Literal["pong", "start", "stop", "data"] | None = None
         self._pings: set[int] = set()  # times of unanswered TIMESYNC requests [ns]
-        self._round_trips: list[float] = []  # since START became due [s]
+        self._round_trips: list[float] = []  # since the first measurement [s]
+        self._measurements = 0  # of the link, since START became due
         self._expected_count = DEFAULT_COUNT  # messages of the next header
         self._due = 0.0  # deadline of the awaited event, or else time of the next START
         self._tries = self._restarts = 0
@@ -199,7 +201,7 @@ class LogStreamClient:
             return []
         self._pings.remove(sent)
         self._round_trips.append(now - sent / 1e9)
-        return self._ping(now) if len(self._round_trips) < _PINGS else self._start(now)
+        return self._ping(now) if self._tries < _PINGS else self._start(now)
 
     def tick(self, now: float) -> list[Command]:
         """Return the commands that are due."""
@@ -264,22 +266,43 @@ class LogStreamClient:
         """Measure the round trip, before START."""
         ping = round(now * 1e9)
         if self._awaited != "pong":
-            self._tries, self._round_trips = 0, []
+            self._tries = 0
             self._pings.clear()
+            if not self._measurements:
+                self._round_trips = []
         self._awaited, self._tries, self._due = "pong", self._tries + 1, now + TIMINGS.log_answer
         self._pings.add(ping)
         return [Command("ping", ping)]
 
     def _start(self, now: float) -> list[Command]:
-        """Send START, unless the header would take too long; without an answer to TIMESYNC, START will show it."""
+        """Send START, unless the header would take too long; without an answer to TIMESYNC, START will show it.
+
+        A vehicle that boots, or a busy link, answers late: the link is measured several times before the stream is
+        refused, and again while it waits.
+        """
         self._awaited = None
+        if not self._may_start():
+            return []
         interval = min(self._round_trips, default=0.0) + PROCESSING
-        is_allowed = self._may_start() and self._allows(self._expected_count, interval, now)
-        return self._send("start", now) if is_allowed else []
+        self._measurements += 1
+        is_slow = self._expected_count * interval > self._limit
+        if is_slow and self._measurements < _MEASUREMENTS:
+            self._due = now + TIMINGS.log_measure
+            return []
+        self._measurements = 0
+        if not self._allows(self._expected_count, interval, now):
+            self._due = now + TIMINGS.log_measure_again
+            return []
+        return self._send("start", now)
+
+    @property
+    def _limit(self) -> float:
+        """The longest header [s]."""
+        return self._longest_header or TIMINGS.log_header
 
     def _allows(self, count: int, interval: float, now: float, elapsed: float = 0.0) -> bool:
         """Return whether the header may take as long as `count` more messages need; if not, refuse the stream."""
-        limit = self._longest_header or TIMINGS.log_header
+        limit = self._limit
         expected = elapsed + count * interval
         if expected <= limit:
             return True

@@ -37,6 +37,8 @@ _MAX_DROPOUT: Final = 2**16 - 1  # ms
 _MAX_SAME_NAME: Final = 100
 _MAX_REASONS: Final = 100  # different ones for damaged records of a stream
 _FILE_INTERVAL: Final = 5.0  # s between two files of a vehicle
+_MIN_SIZES: Final = 100  # messages until their mean size can be known
+_MAX_ERROR: Final = 0.02  # of the mean size
 _MAX_PENDING: Final = 2**22  # bytes of a stream that wait for its file
 
 
@@ -61,7 +63,7 @@ class LogStream:
         self._logged = LogStatus("idle")
         self._streamed: set[Address] = set()
         self._received = self._gaps = self._lost = self._undecodable = 0
-        self._records = self._record_bytes = 0  # data messages, whose mean size estimates the number of lost ones
+        self._sizes = _MeanSize()  # of data messages, which estimates the number of lost ones
         self._lost_messages = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
@@ -81,6 +83,10 @@ class LogStream:
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
         self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
         self._new_header = True  # not yet logged
+
+    def serves(self, client: LogStreamClient) -> bool:
+        """Return whether this is the stream of a client."""
+        return client is self._client
 
     @property
     def is_streaming(self) -> bool:
@@ -111,10 +117,10 @@ class LogStream:
             return
         self._undecodable += self._parser.undecodable - undecodable
         sizes = [len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)]
-        is_first = not self._records
-        self._records, self._record_bytes = self._records + len(sizes), self._record_bytes + sum(sizes)
-        if is_first and self._gaps:  # a stream that continues that of an earlier process begins with a gap
-            self._estimate_lost()
+        was_known = self._sizes.is_known
+        self._sizes.add(sizes)
+        if self._gaps and self._sizes.is_known and not was_known:
+            self._estimate_lost()  # a stream that continues that of an earlier process begins with a gap
         yield from self._check_definitions(is_first=not undecodable)
         self._save_definitions(records, now, others=len(records) - len(sizes))
         for record in self._texts.merge(records):
@@ -274,8 +280,11 @@ class LogStream:
         self._parser.gap()
 
     def _estimate_lost(self) -> None:
-        """Update the number of lost messages: each gap cuts one, and covers others by their mean size so far."""
-        covered = _CHUNK_SIZE * self._lost * self._records / max(1, self._record_bytes)
+        """Update the number of lost messages: each gap cuts one, and covers others by their mean size so far.
+
+        The number never decreases, so the others count only once the mean size is known.
+        """
+        covered = _CHUNK_SIZE * self._lost / self._sizes.mean if self._sizes.is_known else 0.0
         before, self._lost_messages = self._lost_messages, max(self._lost_messages, round(self._gaps + covered))
         self._unreported += self._lost_messages - before
 
@@ -337,6 +346,31 @@ class LogStream:
         self.close()
         extra = about("log_stream", self._address, reason=reason)
         _log.error("vehicle %s: stopped saving the ULog stream: %s", self._name, reason, extra=extra)
+
+
+class _MeanSize:
+    """Mean size of messages [bytes]; known when its standard error is at most 2 %.
+
+    In recordings of PX4, with topics of 20 to 1,000 bytes, it is then within 10 % of that of a gap before: the mean of
+    the first five messages is up to 2.6 times too small.
+    """
+
+    def __init__(self) -> None:
+        self._count = self._sum = self._squares = 0
+        self.is_known = False
+
+    def add(self, sizes: Iterable[int]) -> None:
+        """Add the sizes of messages."""
+        for size in sizes:
+            self._count, self._sum, self._squares = self._count + 1, self._sum + size, self._squares + size * size
+        if not self.is_known and self._count >= _MIN_SIZES:
+            variance = max(0.0, self._squares / self._count - self.mean**2)
+            self.is_known = math.sqrt(variance / self._count) <= _MAX_ERROR * self.mean
+
+    @property
+    def mean(self) -> float:
+        """The mean size."""
+        return self._sum / self._count
 
 
 class LogFile:

@@ -8,11 +8,22 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.mavlink import AUTOPILOT, BootClock, Chunk, Reassembly, Received, SequenceCounter, new_parser, parse
+from nedbus.mavlink import (
+    AUTOPILOT,
+    Chunk,
+    Reassembly,
+    Received,
+    SequenceCounter,
+    new_clock,
+    new_parser,
+    parse,
+    read_time,
+)
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import LinkLoad, Rejection
+from nedbus.timeline import TimeKind, VehicleClock
 
-from .link import Link, Peer
+from .link import Link, Peer, PeerChoice
 from .log_client import COMMANDS, Command, LogStreamClient
 from .receive_queue import ReceiveQueue, join_data
 from .saved_stream import read_stream, state_path
@@ -22,6 +33,7 @@ SYSTEM: Final = 245
 COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 _MAX_VEHICLES: Final = 100  # per link
+_MIN_SILENCE: Final = 5.0  # s without a message until a vehicle can be removed in favour of another one
 _TICK: Final = 0.05  # s, the longest wait of the thread
 _PAUSE: Final = 0.02  # s between two reads during a stream: several messages at once need less processor time
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
@@ -43,25 +55,33 @@ class LinkReader:
             yield from parse(self._parser, data, self.name, peer, now)
             if not self.link.stream and self._parser.buf_len():
                 yield Rejection(self.name, f"truncated message ({self._parser.buf_len()} B)")
-                self._parser = new_parser()  # the next datagram may be from another sender
+                self._parser = new_parser(self._parser.senders)  # the next datagram may be from another sender
 
 
 @dataclass(slots=True)
 class _Vehicle:
+    """State of one vehicle on the thread of the link.
+
+    `peers`: where the messages for it are sent. `last`: time of its last message [s].
+    `refusal`: why the stream of an earlier process cannot be continued.
+    """
+
     system: int
     client: LogStreamClient
-    peer: Peer
+    peers: PeerChoice
+    last: float
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     reassembly: Reassembly = field(default_factory=Reassembly)
-    clock: BootClock = field(default_factory=BootClock)
+    clock: VehicleClock = field(default_factory=new_clock)
     is_known: bool = False  # a heartbeat has arrived
-    refusal: str = ""  # why the stream of an earlier process cannot be continued
+    refusal: str = ""
 
 
 class LogReceiver:
     """Read a link on a dedicated thread, which acknowledges PX4's log stream even while publishing blocks.
 
-    `send`: sends a MAVLink message to a peer, without blocking. `vehicles`: by system id, at most 100.
+    `send`: sends a MAVLink message to a peer, without blocking.
+    `vehicles`: by system id, at most 100; for a further one, the one that has been silent longest is removed.
     Without the option `log`, no stream is requested.
     """
 
@@ -114,22 +134,34 @@ class LogReceiver:
         system, now = received.system, received.time
         vehicle = self.vehicles.get(system)
         if vehicle is None:
-            if len(self.vehicles) == _MAX_VEHICLES:
+            if len(self.vehicles) == _MAX_VEHICLES and not self._evict(now):
                 reason = f"a link has up to {_MAX_VEHICLES}; give the others a link of their own"
                 return Rejection(f"{self._reader.name} further vehicles", reason)
             ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
             client = LogStreamClient(options.log, **ids, header=options.header)
-            vehicle = self.vehicles[system] = _Vehicle(system, client, received.peer)
+            vehicle = self.vehicles[system] = _Vehicle(system, client, PeerChoice(received.peer, now), now)
+        vehicle.last = now
+        vehicle.peers.add(received.peer, now)
         if lost := vehicle.sequence.add(received.sequence, now):
             received = received._replace(lost=lost)
         return self._follow_stream(vehicle, received) if self._options.log else received
+
+    def _evict(self, now: float) -> bool:
+        """Remove the vehicle that has been silent longest; return False if none has been silent for long enough."""
+        oldest = min(self.vehicles.values(), key=lambda vehicle: vehicle.last)
+        if now - oldest.last < _MIN_SILENCE:
+            return False
+        del self.vehicles[oldest.system]
+        return True
 
     def _follow_stream(self, vehicle: _Vehicle, received: Received) -> Received | Rejection:
         message, kind, now = received.message, received.message.get_type(), received.time
         if kind.startswith("LOGGING_DATA"):
             return self._process_data(received, vehicle, kind)
+        if received.peer != vehicle.peers.peer:  # another link, or a stranger
+            return received
         if kind == "HEARTBEAT":
-            vehicle.peer, vehicle.is_known = received.peer, True
+            vehicle.is_known = True
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             self._execute(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
         elif kind == "COMMAND_ACK":
@@ -137,7 +169,7 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
         elif kind == "TIMESYNC" and message.tc1:
             self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
-        elif vehicle.clock.add(message, now):
+        elif (reading := read_time(vehicle.clock, message, now)) and reading.kind is TimeKind.REBOOT:
             vehicle.client.on_reboot()
             vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received
@@ -153,7 +185,7 @@ class LogReceiver:
             if (adopted := self._adopt(vehicle, now)) or not vehicle.refusal:
                 return received._replace(chunk=adopted)
         if not vehicle.client.accepts(*target):
-            if not is_ours:
+            if not (is_ours and vehicle.is_known):  # before a HEARTBEAT, perhaps the stream of an earlier process
                 return received
             where = f"{self._reader.name} system {received.system}"
             if not vehicle.refusal:
@@ -196,4 +228,4 @@ class LogReceiver:
             else:
                 parameters = [COMMANDS[command.kind], 0, *(0,) * 7]
                 message = dialect.MAVLink_command_long_message(vehicle.system, AUTOPILOT, *parameters)
-            self._send(message, vehicle.peer)
+            self._send(message, vehicle.peers.peer)

@@ -19,12 +19,18 @@ from nedbus.transport import Session
 from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .link import DuplicateIds, Link, Peer, open_link, parse_link
+from .link import DuplicateIds, Link, Peer, name_of, open_link, parse_link
 from .log_stream import LogStream
 from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from .saved_stream import StreamFile, state_path
 
 _log = logging.getLogger(__name__)
+
+HIGH_LATENCY_LINK: Final = (
+    "a satellite link, because only HIGH_LATENCY2 arrives: global position, status and battery at its rate; nothing is"
+    " sent to the vehicle"
+)
+"""Description of a link of a vehicle that sends only HIGH_LATENCY2."""
 
 _STATUS_INTERVAL: Final = 1.0  # s between heartbeats, and between status reports of ULog streams
 
@@ -38,7 +44,7 @@ class MavlinkSource:
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
-        if parse_link(link)[0] != "serial" and "baud" in options.model_fields_set:
+        if parse_link(link).kind != "serial" and "baud" in options.model_fields_set:
             raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
@@ -67,7 +73,8 @@ class _LinkSession:
         self._sending = threading.Lock()
         self._unsent = 0  # messages that the link did not accept, to be logged
         self._vehicles: dict[int, Vehicle] = {}
-        self._peers: dict[int, Peer] = {}
+        self._remarked: set[int] = set()  # system ids whose second address was reported
+        self._high_latency: set[int] = set()  # system ids whose satellite link was reported
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
         self._receiver = LogReceiver(LinkReader(link, name=name), options, self._send)
@@ -92,12 +99,15 @@ class _LinkSession:
                 # Routers and vehicles send only to components that have announced themselves.
                 kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
                 heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
-                for peer in {self._link.peer} - {None} or set(self._peers.values()):
+                self._remove_evicted()
+                for peer in self._all_peers():
                     self._send(heartbeat, peer)
                 self._log_unsent()
                 for system, log in self._logs.items():
                     yield log.status(now)
-                    self._send(dialect.MAVLink_timesync_message(0, log.request_time()), self._peers[system])
+                    if self._vehicles[system].is_high_latency:
+                        continue
+                    self._send_to(system, dialect.MAVLink_timesync_message(0, log.request_time()))
 
     def close(self) -> None:
         """Stop the ULog streams, and close their files."""
@@ -114,16 +124,18 @@ class _LinkSession:
             options, name = self._options, self._name_of(system)
             vehicle = Vehicle(name, options.chosen_topics, rate=options.rate, baud=self._link.baud)
             self._vehicles[system] = vehicle
-        self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
+        yield from self._second_address(system)
         vehicle.count_lost(received.lost, now, counted=chunk.lost if chunk else None)
         log = self._log_of(system)
-        if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
+        if log is not None and message.get_type() == "TIMESYNC" and message.tc1 and self._is_chosen(received):
             log.add_timesync(message.tc1, message.ts1, now)
         if chunk is None:
-            converted = vehicle.handle(message, now, log)
-            items: Iterable[SourceMessage | Rejection] = () if converted is None else (converted,)
+            items: Iterable[SourceMessage | Rejection] = vehicle.handle_all(message, now, log)
+            if vehicle.is_high_latency and system not in self._high_latency:
+                self._high_latency.add(system)
+                yield Rejection(f"{self._name} system {system}", HIGH_LATENCY_LINK, count=0)
         else:
             items = log.add(chunk, now) if log is not None else ()
         is_measured = log is None or chunk is None  # the delay is that of the first message in each part of a stream
@@ -152,8 +164,9 @@ class _LinkSession:
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`."""
-        if system not in self._logs and self._options.log:
-            client = self._receiver.vehicles[system].client
+        known = self._receiver.vehicles.get(system)
+        if system not in self._logs and self._options.log and known is not None:
+            client = known.client
             state = StreamFile(state_path(self._options, self._name, system), system)
             self._logs[system] = LogStream(self._name_of(system), self._options, client, state)
         return self._logs.get(system)
@@ -170,7 +183,47 @@ class _LinkSession:
                 command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL if rate else dialect.MAV_CMD_REQUEST_MESSAGE
                 parameters = [number, 1e6 / rate if rate else 0, 0, 0, 0, 0, 0]
                 message = dialect.MAVLink_command_long_message(system, AUTOPILOT, command, 0, *parameters)
-                self._send(message, self._peers[system])
+                self._send_to(system, message)
+
+    def _all_peers(self) -> set[Peer]:
+        """Return the addresses of all vehicles, or the only address of the link; none that are behind a satellite."""
+        silent = {system for system, vehicle in self._vehicles.items() if vehicle.is_high_latency}
+        if self._link.peer is not None:
+            return set() if silent and silent == self._vehicles.keys() else {self._link.peer}
+        known = [*self._receiver.vehicles.values()]  # changed on another thread
+        return {vehicle.peers.peer for vehicle in known if vehicle.system not in silent}
+
+    def _is_chosen(self, received: Received) -> bool:
+        """Return whether a message is from the address to which the messages for its vehicle are sent."""
+        known = self._receiver.vehicles.get(received.system)
+        return known is not None and known.peers.peer == received.peer
+
+    def _second_address(self, system: int) -> Iterator[Rejection]:
+        """Yield a remark, once, if a vehicle's id also arrives from another address."""
+        known = self._receiver.vehicles.get(system)
+        if known is None or known.peers.second is None or system in self._remarked:
+            return
+        self._remarked.add(system)
+        text = f"also arrives from {name_of(known.peers.second)}; requests go to {name_of(known.peers.peer)} only"
+        yield Rejection(f"{self._name} system {system}, second address", text, count=0)
+
+    def _remove_evicted(self) -> None:
+        """Forget the vehicles that the receiver has removed."""
+        known = dict(self._receiver.vehicles)  # changed on another thread
+        for system in [*self._vehicles]:
+            log = self._logs.get(system)
+            if system in known and (log is None or log.serves(known[system].client)):
+                continue
+            del self._vehicles[system]
+            self._remarked.discard(system)
+            if log is not None:
+                del self._logs[system]
+                log.end()
+
+    def _send_to(self, system: int, message: Any) -> None:
+        """Send a message to a vehicle, unless it was removed."""
+        if (known := self._receiver.vehicles.get(system)) is not None:
+            self._send(message, known.peers.peer)
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread of LogReceiver also sends

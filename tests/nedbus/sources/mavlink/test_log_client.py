@@ -428,7 +428,27 @@ class TestHeader:
         session.wait(2 * TIMINGS.log_slow_retry)
         assert session.commands == []
         session.round_trip = 0.001
-        session.wait(TIMINGS.log_slow_retry)
+        session.wait(TIMINGS.log_measure_again + 3)
+        assert session.commands[:1] == ["start"]
+
+    @pytest.mark.parametrize("busy", [1.0, 4.0])
+    def test_busy_vehicle_at_boot_is_measured_again(self, session: Session, busy: float) -> None:
+        """A vehicle that boots answers TIMESYNC late: the stream starts some seconds later, before it is armed."""
+        session.round_trip = 0.03
+        session.wait(busy)
+        session.round_trip = 0.002
+        session.wait(10 - busy)
+        assert session.commands[:1] == ["start"]
+
+    def test_armed_vehicle_is_not_measured(self, session: Session) -> None:
+        """While a refused vehicle is armed, nothing is sent; the link is measured again after disarming."""
+        session.round_trip = 0.03
+        session.wait(4)
+        session.armed, session.round_trip, session.sent = True, 0.002, []
+        session.wait(60)
+        assert session.sent == []
+        session.armed = False
+        session.wait(2)
         assert session.commands[:1] == ["start"]
 
     def test_refusal_names_number_of_topics_that_fit_and_longer_limit(self, session: Session) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import socket
 import tracemalloc
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
+from functools import partial
 from typing import Any, Self
 
 import pytest
@@ -13,12 +14,15 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.mavlink.parser import new_parser, parse
 from nedbus.sources import Rejection
-from nedbus.sources.mavlink import receive_queue
-from nedbus.sources.mavlink.link import open_link
+from nedbus.sources.mavlink import reader, receive_queue
+from nedbus.sources.mavlink.link import PeerChoice, open_link
 from nedbus.sources.mavlink.reader import LinkReader
 from nedbus.sources.mavlink.receive_queue import Received
+from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings
+from tests.flights.recorded_link import Receiver
 from tests.peers.live_source import Listener
+from tests.peers.ports import free_port
 from tests.waits import DEADLINE, wait_for
 
 WAITING = 1000  # messages
@@ -94,16 +98,18 @@ def position(ms: int) -> Any:
 def test_reads_that_end_within_a_message_lose_nothing(autopilot: Autopilot) -> None:
     """If no read of a stream ends with a message, all messages arrive, and the parsed ones are freed."""
     file_part = dialect.MAVLink_file_transfer_protocol_message(0, 245, 191, [1] * 251)
-    data = b"".join(autopilot.pack(*[file_part] * 1536))
+    data = b"".join(autopilot.pack(heartbeat(), *[file_part] * 1535))
     size = 4 * len(data) // 1536 + 1  # no divisor of the length
     received: list[object] = []
     with closing(open_link(autopilot.link, baud=57600)) as link:
-        reader = LinkReader(link, name="tcp")
+        link_reader = LinkReader(link, name="tcp")
         tracemalloc.start()
         try:
             for begin in range(0, len(data), size):
                 autopilot.send(data[begin : begin + size])
-                received += (each.sequence if isinstance(each, Received) else each for each in reader.read(DEADLINE))
+                received += (
+                    each.sequence if isinstance(each, Received) else each for each in link_reader.read(DEADLINE)
+                )
             peak = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
@@ -131,7 +137,7 @@ def test_messages_that_are_not_used_are_not_decoded() -> None:
     encoder = dialect.MAVLink(None, 9, 1)
     pressure = dialect.MAVLink_scaled_pressure_message(1, 1.0, 1.0, 1)
     for version in (pressure.pack(encoder), pressure.pack(encoder, force_mavlink1=True)):
-        [received] = parse(new_parser(), version, "link", None, 1.0)
+        _, received = parse(new_parser(), heartbeat().pack(encoder) + version, "link", None, 1.0)
         assert isinstance(received, Received)
         assert (received.system, received.message.get_type()) == (9, "UNKNOWN_29")
         damaged = bytes([*version[:-3], version[-3] ^ 1, *version[-2:]])
@@ -148,6 +154,121 @@ def test_vehicles_of_a_link_are_limited(autopilot: Autopilot) -> None:
         listener.step_until(lambda: listener.rejected == 3, what="rejections")
     assert [int(each.address.vehicle) for each in received] == [*range(1, 101)]
     assert {each.where.rpartition(" ")[2] for each in listener.rejections} == {"vehicles"}
+
+
+def receive(receiver: Receiver, system: int, now: float, *, peer: object = "peer") -> Received | Rejection:
+    """Pass a HEARTBEAT of a vehicle to a receiver without a thread."""
+    [received] = parse(new_parser(), heartbeat().pack(dialect.MAVLink(None, system, 1)), "link", peer, now)
+    assert isinstance(received, Received)
+    return receiver.process(received)
+
+
+def test_vehicle_that_is_silent_longest_is_removed_for_another_one() -> None:
+    """100 heartbeats of a stranger lock out no vehicle: after some seconds, the one silent longest is removed."""
+    receiver = Receiver(MavlinkOptions())
+    for system in range(1, 101):
+        receive(receiver, system, system / 100)
+    assert isinstance(receive(receiver, 101, 2.0), Rejection), "none is silent"
+    receive(receiver, 1, 6.0)
+    assert isinstance(receive(receiver, 101, 6.1), Received)
+    assert receiver.vehicles.keys() == {1, *range(3, 102)}, "2 was silent longest"
+
+
+def test_removed_vehicle_has_no_state(monkeypatch: pytest.MonkeyPatch, timings: Timings, autopilot: Autopilot) -> None:
+    """A vehicle that was removed and returns is a new one, on both threads: its stream is requested again."""
+    monkeypatch.setattr(reader, "_MAX_VEHICLES", 1)
+    monkeypatch.setattr(reader, "_MIN_SILENCE", 0.0)
+    timings.log_answer = DEADLINE  # no retransmission of START
+    with Listener(f"mavlink:{autopilot.link}?log=1&state=0") as listener:
+        for attempt in (1, 2):
+            autopilot.send(*autopilot.pack(heartbeat(), position(1000 * attempt)))
+            wait_for(partial(has_started, autopilot, attempt), what="START")
+            autopilot.send(position(1000).pack(dialect.MAVLink(None, 8, 1)))
+            listener.step_until(partial(has_received, listener, "8"), what="a position of the other vehicle")
+            listener.messages.clear()
+
+
+def has_started(autopilot: Autopilot, starts: int) -> bool:
+    return autopilot.starts == starts
+
+
+def has_received(listener: Listener, vehicle: str) -> bool:
+    return vehicle in {each.address.vehicle for each in listener.messages}
+
+
+def test_peer_that_delivers_data_keeps_the_requests() -> None:
+    """A datagram with a vehicle's own id from elsewhere does not redirect what is sent to the vehicle."""
+    choice = PeerChoice("vehicle", 0.0)
+    for step in range(100):
+        choice.add("vehicle", step / 10)
+        choice.add("stranger", step / 10 + 0.01)
+        assert choice.peer == "vehicle"
+    assert choice.second == "stranger"
+
+
+def test_peer_is_replaced_when_it_is_silent_or_outnumbered() -> None:
+    """A vehicle with a new address is answered there after 3 s, or after 20 messages in a row."""
+    moved = PeerChoice("old", 0.0)
+    moved.add("new", 2.9)
+    assert (moved.peer, moved.second) == ("old", None)
+    moved.add("new", 3.1)
+    assert (moved.peer, moved.second) == ("new", None)
+    outnumbered = PeerChoice("stranger", 0.0)
+    for _ in range(20):
+        assert outnumbered.peer == "stranger"
+        outnumbered.add("vehicle", 0.1)
+    assert outnumbered.peer == "vehicle"
+
+
+def test_stranger_with_the_id_of_a_vehicle_changes_nothing_but_a_remark() -> None:
+    """Requests go on to the vehicle, the stranger's heartbeat does not arm it, and `info` names the second address."""
+    port = free_port()
+    with (
+        Listener(f"mavlink:udpin:127.0.0.1:{port}?log=1&state=0") as listener,
+        UdpAutopilot(port) as vehicle, UdpAutopilot(port) as stranger,
+    ):  # fmt: skip
+        armed = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 128, 0, 4, 3)
+
+        def is_remarked() -> bool:
+            vehicle.send(heartbeat(), position(1000))
+            stranger.send(armed)
+            return bool(listener.rejections)
+
+        listener.step_until(is_remarked, what="a remark")
+        assert stranger.received() == []
+        assert vehicle.received()
+    [remark] = listener.rejections
+    assert remark.count == 0
+    assert remark.where.endswith("system 9, second address")
+    assert f"also arrives from 127.0.0.1:{stranger.port}; requests go to 127.0.0.1:{vehicle.port} only" in remark.reason
+
+
+class UdpAutopilot:
+    """UDP socket of system 9, which keeps the types of what it receives."""
+
+    def __init__(self, port: int) -> None:
+        self._mav, self._socket = dialect.MAVLink(None, 9, 1), socket.socket(type=socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self._socket.setblocking(False)
+        self.port = self._socket.getsockname()[1]
+
+    def send(self, *messages: Any) -> None:
+        for message in messages:
+            self._socket.send(message.pack(self._mav))
+
+    def received(self) -> list[str]:
+        types = []
+        with suppress(BlockingIOError):
+            while True:
+                parsed = dialect.MAVLink(None).parse_buffer(self._socket.recv(65535))
+                types += [message.get_type() for message in parsed or ()]
+        return types
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
 
 
 def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopilot) -> None:

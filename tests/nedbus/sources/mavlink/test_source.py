@@ -258,6 +258,33 @@ def test_vehicles_on_one_port_are_separate(timings: Timings, listener: Listener,
     assert list(requested.values()) == [pytest.approx(expected)] * 2
 
 
+def test_nothing_is_sent_over_a_satellite_link(timings: Timings, port: int) -> None:
+    """To a vehicle that sends only HIGH_LATENCY2 nothing is sent, with log=1 as well; its kind of link is a remark."""
+    timings.source_tick = 0.01
+    message = dialect.MAVLink_high_latency2_message(
+        5000, 2, 12, 0, 10, 20, 30, *[0] * 12, 0, 0, 50, *[0] * 5
+    )  # fmt: skip
+    with (
+        Listener(f"mavlink:udpin:127.0.0.1:{port}?log=1&state=0") as listener,
+        Autopilot(port, system=3) as satellite, Autopilot(port) as other,
+    ):  # fmt: skip
+        found: list[object] = []
+
+        def is_requested() -> bool:
+            satellite.send(message)
+            other.send(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3), local_position(1000))
+            found.extend(other.requests())
+            return len(found) > 3
+
+        listener.step_until(is_requested, what="requests to the other vehicle")
+        with pytest.raises(BlockingIOError):
+            satellite._socket.recv(1)
+        topics = {each.address.topic for each in listener.messages if each.address.vehicle == "3"}
+        assert topics == {"vehicle_global_position", "vehicle_status", "battery_status"}
+        [remark] = listener.rejections
+        assert (remark.count, "a satellite link, because only HIGH_LATENCY2 arrives" in remark.reason) == (0, True)
+
+
 def test_receive_buffer_holds_a_burst(port: int) -> None:
     """400 messages that arrive before the service reads are all received, even with Linux's default buffer limit."""
     with closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link, Autopilot(port) as vehicle:

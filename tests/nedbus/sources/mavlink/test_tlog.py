@@ -14,10 +14,12 @@ from pymavlink.dialects.v20 import common as mavlink
 
 import nedbus
 from nedbus.errors import SourceError
+from nedbus.flights.readers import tlog
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
 
+CASES = Path(__file__).parents[5] / "shared/cases/turn6"
 EPOCH = 1_760_000_000_000_000  # us; 2025-10-09 08:53:20 UTC
 FLAGS = 0x3F  # ESTIMATOR_STATUS: all valid
 
@@ -120,6 +122,71 @@ def test_damaged_tlog_loses_only_the_damaged_messages(tmp_path: Path) -> None:
     assert "B are not MAVLink" in run.damage
 
 
+@pytest.mark.parametrize(
+    ("cut", "zeros", "count", "warning"),
+    [
+        (3, 0, 49, "truncated (the file ends within a message)"),
+        (30, 0, 49, "truncated (the file ends within a message)"),
+        (0, 1, 50, "truncated (the last 1 B are zeros, as after a power cut)"),
+        (0, 4096, 50, "truncated (the last 4096 B are zeros, as after a power cut)"),
+        (5, 4096, 49, "truncated (the last"),
+        (30, 4096, 49, "truncated (the last"),
+        (38, 2**22, 49, "truncated (the last"),
+    ],
+)
+def test_end_of_tlog_after_power_cut_is_a_warning(
+    tmp_path: Path, cut: int, zeros: int, count: int, warning: str
+) -> None:
+    """An end within a message, in zeros, or both is a warning and no damage: all whole messages are read."""
+    path = tmp_path / "flight.tlog"
+    records = list(frames(1, 50))[:-1]  # the last one is a position
+    data = b"".join(records)
+    path.write_bytes(data[: len(data) - cut] + bytes(zeros))
+    assert len(nedbus.read(path)) == count
+    run = open_replay(f"tlog:{path}")
+    list(run.messages)
+    assert run.damage is None
+    assert run.warnings[0].startswith(warning)
+    converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
+    assert converted.exit_code == 0
+    assert "truncated" in converted.err
+
+
+def test_zeros_at_the_end_of_tlog_are_not_searched(tmp_path: Path) -> None:
+    """The number of reads of a file with zeros at its end is that of its blocks, not of its bytes."""
+    path = tmp_path / "flight.tlog"
+    size = 2**24
+    path.write_bytes(b"".join(frames(1, 5)) + bytes(size))
+    calls = 0
+    search = tlog._next_candidate
+
+    def count(data: bytes, at: int) -> int:
+        nonlocal calls
+        calls += 1
+        return search(data, at)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tlog, "_next_candidate", count)
+        nedbus.read(path)
+        assert calls == 0
+        path.write_bytes(b"".join(frames(1, 5)) + bytes(size) + b"".join(frames(1, 5)))
+        nedbus.read(path)
+    assert 0 < calls < 2 * size / 2**16
+
+
+def test_damaged_messages_of_other_components_are_no_damage(tmp_path: Path) -> None:
+    """Messages with a wrong checksum of a component that is ignored anyway, usual in logs of stations, are ignored."""
+    path = tmp_path / "flight.tlog"
+    camera = mavlink.MAVLink(None, 1, 100)
+    damaged = bytearray(mavlink.MAVLink_attitude_message(1, 0, 0, 0.5, 0, 0, 0).pack(camera))
+    damaged[-1] ^= 1
+    record = struct.pack(">Q", EPOCH) + damaged
+    path.write_bytes(b"".join(each + record for each in frames(1, 50)))
+    assert len(nedbus.read(path)) == 50
+    result = run_command("convert", str(path), str(tmp_path / "a.mcap"))
+    assert (result.exit_code, "not MAVLink" in result.err) == (0, False)
+
+
 @pytest.mark.parametrize("content", [b"hello", bytes(5000), b"".join(frames(255, 0))])
 def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "flight.tlog"
@@ -127,3 +194,17 @@ def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
     for read in (nedbus.read, lambda path: open_replay(f"tlog:{path}")):
         with pytest.raises(SourceError, match=r"no autopilot messages|an empty file"):
             read(path)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+@pytest.mark.parametrize(
+    ("name", "count", "seconds"),
+    [("06_boot_ms_wrap.tlog", 400, 19.95), ("09_two_links_1.5s.tlog", 300, 14.95), ("duplicate.tlog", 5, 0.4)],
+)
+def test_each_message_once_and_in_order(name: str, count: int, seconds: float) -> None:
+    """After the wrap of `time_boot_ms`, over a second, slower link, and with a frame that is in the file twice."""
+    stamps = nedbus.read(CASES / name)["timestamp"]
+    assert stamps.size == count
+    assert (np.diff(stamps) > 0).all()
+    assert (stamps[-1] - stamps[0]) / 1e6 == pytest.approx(seconds)
+    assert "reboot" not in run_command("events", str(CASES / name)).out

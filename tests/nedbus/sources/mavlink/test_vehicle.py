@@ -11,6 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.mavlink.fields import CONVERSIONS
+from nedbus.mavlink.parser import new_parser
 from nedbus.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_stream import LogStream
@@ -144,7 +145,7 @@ def test_attitude_replaces_missing_attitude_quaternion() -> None:
 
 
 def test_order_is_checked_per_topic() -> None:
-    """Only a message older than the last one of the same topic is out of order."""
+    """Only a message older than the last one of the same topic is out of order; the same one again is a copy."""
     vehicle = new_vehicle("*")
     odometry = [1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [math.nan] * 21, [math.nan] * 21]
     assert estimate(vehicle, 2000, 100.0)
@@ -152,7 +153,9 @@ def test_order_is_checked_per_topic() -> None:
     late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
     assert isinstance(late, Rejection)
     assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order (1800 ms since boot, after 1900 ms)")
-    assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
+    assert vehicle.handle(position(2000), 100.0) is None
+    assert vehicle.copies == 1
+    assert estimate(vehicle, 2050, 100.1)["timestamp"] == 2_050_000
 
 
 def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
@@ -286,6 +289,16 @@ UNKNOWN = {  # messages with the values that mean unknown in MAVLink's common.xm
         dialect.MAVLink_home_position_message(1, 1, 1, NAN, NAN, NAN, [NAN] * 4, NAN, NAN, NAN),
         {"lat", "lon", "alt", "valid_hpos", "valid_alt"},
     ),
+    "home without attitude": (
+        dialect.MAVLink_home_position_message(1, 1, 1, 1, 2, 3, [0] * 4, 0, 0, 0),
+        {"lat", "lon", "alt", "x", "y", "z", "valid_hpos", "valid_alt"},
+    ),
+    "attitude": (dialect.MAVLink_attitude_quaternion_message(1000, 0, 0, 0, 0, 0, 0, 0), set[str]()),
+    "odometry without attitude": (
+        dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [0] * 4, *[0] * 6, [0] * 21, [0] * 21, 0, 8, 100),
+        {"pose_frame", "position", "velocity_frame", "velocity", "angular_velocity", "reset_counter", "quality"},
+    ),
+    "global position": (dialect.MAVLink_global_position_int_message(1000, 0, 0, 0, 0, 0, 0, 0, 0), set[str]()),
     "landed": (dialect.MAVLink_extended_sys_state_message(0, 0), set[str]()),
     "status": (
         dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3),
@@ -306,6 +319,71 @@ def test_unknown_values_are_not_provided(name: str) -> None:
     if name == "further cells":
         assert converted is not None
         assert converted.fields["voltage_v"] == 16.0
+
+
+def high_latency(ms: int, *, autopilot: int = dialect.MAV_AUTOPILOT_PX4, **fields: int) -> Any:
+    """Return a HIGH_LATENCY2 as its receiver decodes it."""
+    values = {
+        "timestamp": ms, "type": 2, "autopilot": autopilot, "custom_mode": 12, "latitude": 473_977_000,
+        "longitude": 85_456_000, "altitude": 500, "target_altitude": 510, "heading": 90, "target_heading": 90,
+        "target_distance": 100, "throttle": 50, "airspeed": 30, "airspeed_sp": 30, "groundspeed": 28, "windspeed": 5,
+        "wind_heading": 10, "eph": 12, "epv": 255, "temperature_air": 20, "climb_rate": 3, "battery": 77, "wp_num": 1,
+        "failure_flags": 0, "custom0": -128, "custom1": 0, "custom2": 0, **fields,
+    }  # fmt: skip
+    frame = dialect.MAVLink_high_latency2_message(**values).pack(dialect.MAVLink(None, 9, 1))
+    [message] = new_parser().parse_buffer(frame)
+    return message
+
+
+def converted_high_latency(message: Any) -> dict[str, dict[str, object]]:
+    items = new_vehicle("*").handle_all(message, 100.0)
+    return {item.address.stream: dict(item.fields) for item in items if isinstance(item, SourceMessage)}
+
+
+def test_high_latency_message_has_position_status_and_battery() -> None:
+    """HIGH_LATENCY2 contains three topics; unknown values are left out, and only ArduPilot sends if it is armed."""
+    status = {"timestamp": 5_000_000, "system_type": 2, "system_id": 9, "component_id": 1}
+    assert converted_high_latency(high_latency(5000)) == {
+        "vehicle_global_position": {
+            "timestamp": 5_000_000, "lat": 47.3977, "lon": 8.5456, "alt": 500.0, "eph": 1.2, "lat_lon_valid": True,
+            "alt_valid": True,
+        },
+        "vehicle_status": status,
+        "battery_status/0": {"timestamp": 5_000_000, "remaining": 0.77},
+    }  # fmt: skip
+    ardupilot = high_latency(5000, autopilot=3, battery=-1, latitude=0, longitude=0)
+    assert converted_high_latency(ardupilot) == {"vehicle_status": {**status, "arming_state": 2}}
+    failed = high_latency(5000, failure_flags=dialect.HL_FAILURE_FLAG_ESTIMATOR)
+    assert converted_high_latency(failed)["vehicle_global_position"]["lat_lon_valid"] is False
+
+
+def test_nothing_is_requested_over_a_satellite_link() -> None:
+    """A vehicle that sends only HIGH_LATENCY2 is on a satellite link; with a HEARTBEAT within 10 s it is not."""
+    vehicle = new_vehicle("*")
+    vehicle.count_lost(0, 100.0)
+    vehicle.handle_all(high_latency(5000), 100.0)
+    assert vehicle.is_high_latency
+    assert vehicle.next_request(100.1) is None
+    vehicle.handle_all(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3), 101.0)
+    assert not vehicle.is_high_latency
+    assert vehicle.next_request(101.1) is not None
+    vehicle.handle_all(high_latency(8000), 103.0)
+    assert not vehicle.is_high_latency
+
+
+def test_zeros_of_other_messages_are_unknown(vehicle: Vehicle) -> None:
+    """An origin at 0, 0 and accuracies of 0 are no values, so the estimate has neither."""
+    vehicle.handle(dialect.MAVLink_gps_global_origin_message(0, 0, 0), 100.0)
+    vehicle.handle(dialect.MAVLink_estimator_status_message(0, 0x3F, *[0] * 8), 100.0)
+    odometry = dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21)
+    vehicle.handle(odometry, 100.0)
+    assert estimate(vehicle, 1000, 100.0).keys().isdisjoint({"ref_lat", "xy_global", "eph", "epv", "evh", "evv"})
+
+
+def test_origin_beyond_the_antimeridian_is_kept(vehicle: Vehicle) -> None:
+    """PX4 up to 1.15 sends an origin east of 180 degrees."""
+    vehicle.handle(dialect.MAVLink_gps_global_origin_message(-170_000_000, 1_800_000_100, 0), 100.0)
+    assert estimate(vehicle, 1000, 100.0)["ref_lon"] == 180.00001
 
 
 @pytest.mark.parametrize(("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)])

@@ -75,6 +75,14 @@ def test_stream_is_continued_once_its_boot_is_known(tmp_path: Path) -> None:
     assert chunk_of(link.data(1501, SAVED + 2.3)) == Chunk("delivered", DEFINITIONS, begins=True)
 
 
+def test_data_before_the_first_heartbeat_is_no_fault(tmp_path: Path) -> None:
+    """Data of a running stream that arrives before a HEARTBEAT is not rejected, because the stream is continued."""
+    link = Link(tmp_path)
+    assert chunk_of(link.data(1499, SAVED + 2.0)) is None
+    link.introduce(SAVED + 2.2, 62.2)
+    assert chunk_of(link.data(1500, SAVED + 2.3)) == Chunk("delivered", DEFINITIONS, begins=True)
+
+
 @pytest.mark.parametrize(("boot", "state", "reason"), [
     (5.0, None, "the vehicle has rebooted since its definitions were saved"),
     (62.0, "0", "state=0 is set"),

@@ -1,0 +1,112 @@
+"""Validation rules: what PX4 publishes in a sound flight is valid; docs/px4-values.md names the code for each case."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from pydantic import ValidationError
+
+from nedbus_msgs import MESSAGES
+from nedbus_msgs.arrays import arrays_of
+from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
+from tests.flights.ulogs import LOGS
+from tests.peers.command_line import run_command
+
+SHARED: Final = LOGS.parents[1]
+FLIGHTS: Final = sorted(
+    [*LOGS.glob("*.ulg"), *SHARED.glob("data/px4/*.ulg"), *SHARED.glob("data/px4/ulog_stream/*.ulg")]
+)
+MANY: Final = 1000  # messages, which are checked by columns
+ZEROS, NAN4 = (0.0,) * 4, (math.nan,) * 4
+
+PUBLISHED: Final[list[tuple[str, dict[str, Any]]]] = [
+    ("VehicleGlobalPosition", {"lat": -17.0, "lon": 180.0000156, "lat_lon_valid": True}),  # MapProjection::reproject
+    ("VehicleGlobalPosition", {"lat": -17.0, "lon": -359.9}),
+    ("HomePosition", {"lat": -17.0, "lon": 180.01, "valid_hpos": True}),  # a copy of the global position
+    ("VehicleLocalPosition", {"ref_lat": -17.0, "ref_lon": 180.01, "xy_global": True}),  # an origin that was moved
+    ("SensorGps", {"latitude_deg": -17.0, "longitude_deg": -180.00001}),  # add_vector_to_global_position, for blending
+    ("SensorGps", {"eph": -1.0, "epv": -1.0}),  # DroneCAN without covariances
+    ("SensorGps", {"timestamp_sample": 10_100_000}),  # PpsTimeSync::correct_gps_timestamp
+    ("BatteryStatus", {"remaining": 1.27}),  # a DroneCAN battery: 127 %
+    ("BatteryStatus", {"remaining": 1.0001}),  # a current sensor that reads below 0 on a full battery
+    ("BatteryStatus", {"remaining": -0.01}),  # a MAVLink battery with an unknown charge
+    ("VehicleAttitude", {"q": ZEROS}),
+    ("VehicleAttitude", {"q": NAN4}),
+    ("VehicleOdometry", {"q": ZEROS}),  # vision without attitude
+    ("VehicleOdometry", {"q": (1.05, 0.0, 0.0, 0.0)}),  # vision that is not normalised
+]
+WRONG: Final[list[tuple[str, dict[str, Any], str]]] = [
+    ("VehicleGlobalPosition", {"lon": 360.1}, "lon: must be within +-360"),
+    ("HomePosition", {"lat": 90.1}, "lat: must be within +-90"),
+    ("SensorGps", {"eph": -0.5}, "eph: must be 0 to inf, or -1 if unknown"),
+    ("BatteryStatus", {"remaining": 2.1}, "remaining: must be -1 to 2"),
+    ("BatteryStatus", {"remaining": -1.1}, "remaining: must be -1 to 2"),
+    ("VehicleAttitude", {"q": (1.05, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
+    ("VehicleAttitude", {"q": (1e-3, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
+    ("VehicleOdometry", {"q": (1.2, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
+]
+
+
+def is_valid(name: str, fields: dict[str, Any]) -> tuple[bool, str]:
+    """Return whether a message is valid for its model and for the check of columns, and the reason."""
+    definition = MESSAGES[name]
+    given, reason = {"timestamp": 10_000_000, **fields}, ""
+    array = arrays_of(definition).absent(MANY)
+    for field, value in given.items():
+        array[field] = value
+    masks = [arrays_of(definition).valid_mask(array[:count]) for count in (1, MANY)]
+    try:
+        definition.model(**given)
+    except ValidationError as exc:
+        [error] = exc.errors()
+        reason = f"{error['loc'][0]}: {error['msg']}"
+    assert {valid for mask in masks for valid in mask.tolist()} == {not reason}
+    return not reason, reason
+
+
+@pytest.mark.parametrize(("name", "fields"), PUBLISHED, ids=str)
+def test_values_of_sound_flights_are_valid(name: str, fields: dict[str, Any]) -> None:
+    """Values that PX4 publishes in a sound flight pass, also those that the unit of the field does not suggest."""
+    assert is_valid(name, fields) == (True, "")
+
+
+@pytest.mark.parametrize(("name", "fields", "reason"), WRONG, ids=str)
+def test_values_beyond_px4s_range_are_rejected(name: str, fields: dict[str, Any], reason: str) -> None:
+    """Values that no code of PX4 can publish are rejected with the reason."""
+    valid, why = is_valid(name, fields)
+    assert not valid
+    assert why.startswith(reason)
+
+
+def test_longitudes_are_wrapped_where_they_are_used() -> None:
+    """The field keeps PX4's value, and the property is comparable with that of a receiver, east and west."""
+    for longitude, wrapped in ((180.5, -179.5), (-180.5, 179.5), (180.0, 180.0), (-180.0, -180.0)):
+        estimate = VehicleGlobalPosition(
+            timestamp=1, lat=-17.0, lon=longitude, alt=1.0, lat_lon_valid=True, alt_valid=True
+        )
+        home = HomePosition(timestamp=1, lat=-17.0, lon=longitude, alt=1.0, valid_hpos=True, valid_alt=True)
+        gps = SensorGps(timestamp=1, latitude_deg=-17.0, longitude_deg=longitude, altitude_msl_m=1.0, fix_type=3)
+        assert (estimate.lon, home.lon, gps.longitude_deg) == (longitude,) * 3
+        positions = estimate.global_position, home.global_position, gps.global_position
+        assert {position and position.longitude for position in positions} == {wrapped}
+
+
+@pytest.mark.skipif(not (SHARED / "cases").is_dir(), reason="no ../shared/cases")
+def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path) -> None:
+    """A flight in Fiji with PX4 1.15 is read completely, without a rejection or a contradiction."""
+    path = SHARED / "cases/turn6/04_antimeridian_east.ulg"
+    result = run_command("convert", str(path), str(tmp_path / "a.mcap"))
+    assert (result.exit_code, "rejected" in result.out + result.err) == (0, False)
+    assert "no events" in run_command("events", str(path)).err
+
+
+@pytest.mark.slow
+@pytest.mark.logs
+@pytest.mark.parametrize("path", FLIGHTS, ids=lambda path: path.stem)
+def test_no_message_of_a_real_flight_is_rejected(tmp_path: Path, path: Path) -> None:
+    """All messages of a real flight are valid, on hardware and in simulation, from PX4 1.11 to main."""
+    result = run_command("convert", str(path), str(tmp_path / "a.mcap"), "--topics", "*")
+    assert (result.exit_code, "rejected" in result.out + result.err) == (0, False), result
