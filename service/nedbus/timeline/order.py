@@ -79,7 +79,7 @@ class _Track(Generic[M]):
     """
 
     def __init__(self, unordered: Counter[Address], on_part: Callable[[int, int], object]) -> None:
-        self.opening: list[_Item[M]] | None = []
+        self.is_open = False  # True from `begin` on
         self.unordered = unordered
         self.changes = 0  # of the vehicle's clock, while it was set to a Unix time
         self._on_part = on_part
@@ -96,7 +96,7 @@ class _Track(Generic[M]):
         self.base, self.newest = place - first.stamp, first.stamp
         self.lag = None if first.log is None else first.log - first.stamp
         self.log, self.is_unix = first.log, bool(is_unix_time(first.stamp))
-        self.opening = None
+        self.is_open = True
         self._on_part(place, first.stamp)
 
     def add(self, item: _Item[M]) -> _Placed[M]:
@@ -124,9 +124,9 @@ class _Track(Generic[M]):
         stream, stamp, log = item.stream, item.stamp, item.log
         before, distance = self.last.get(stream), stamp - self.newest
         is_back = before is not None and stamp < before
-        if is_back and self.is_unix and log is not None:
-            return None  # late, or set back
         agrees = log is not None and self.lag is not None and abs(log - stamp - self.lag) <= _NEAR
+        if is_back and log is not None and (self.is_unix or not agrees):
+            return None  # late, set back, or rebooted
         if agrees or -_NEAR <= distance <= _NEAR:
             if is_back and log is None:
                 self.unordered[item.message.address] += 1
@@ -136,12 +136,17 @@ class _Track(Generic[M]):
         if is_batched and (log is not None or not self.doubtful):
             self.last[stream] = stamp
             return self.base + stamp
-        previous = self._previous
-        if previous is not None and log is not None and previous.lag is not None:
-            if abs(log - stamp - previous.lag) <= _NEAR:
-                self.last[stream] = stamp
-                return previous.base + stamp
-        return None
+        return self._place_before_change(item)
+
+    def _place_before_change(self, item: _Item[M]) -> int | None:
+        """Return the place of a message from before the last change of the clock, as of a stream in a later batch."""
+        previous, log = self._previous, item.log
+        if previous is None or previous.lag is None or log is None:
+            return None
+        if abs(log - item.stamp - previous.lag) > _NEAR:
+            return None
+        self.last[item.stream] = item.stamp
+        return previous.base + item.stamp
 
     def _follow(self, item: _Item[M]) -> None:
         self.last[item.stream] = item.stamp
@@ -298,8 +303,7 @@ class Order(Generic[M]):
                 and stamp >= last.get(stream, 0)
             ):
                 last[stream] = track.newest = stamp
-                if track.base + stamp > place:
-                    place = track.base + stamp
+                place = max(place, track.base + stamp)
                 message.at = (place - zero) / 1e6
                 yield message
                 continue
@@ -312,7 +316,7 @@ class Order(Generic[M]):
             placed.message.at = (place - zero) / 1e6
             yield placed.message
 
-    def _sorted(self, messages: Iterable[M]) -> Iterator[M]:
+    def _sorted(self, messages: Iterable[M]) -> Iterator[M]:  # noqa: PLR0912 - the fast path stays in one loop
         """Yield the messages of a recording: several vehicles, and streams in batches."""
         waiting: list[tuple[int, int, M]] = []
         opening: list[_Item[M]] = []
@@ -342,15 +346,15 @@ class Order(Generic[M]):
                     yield emit(heappushpop(waiting, (placed, number, message)))
                 continue
             item = _Item(message, stream, stamp, log, number)
-            if track.opening is not None:
-                track.opening.append(item)
+            if track.is_open:
+                found = track.add(item)
+            else:
                 opening.append(item)
-                if len(opening) < (_OPENING if self._zero is None and not waiting else _OPENING_LATER):
+                enough = _OPENING if self._zero is None and not waiting else _OPENING_LATER
+                if len(opening) < enough:
                     continue
                 found = self._begin(opening)
                 opening = []
-            else:
-                found = track.add(item)
             self._watch(found)
             for placed, each in found:
                 heappush(waiting, (placed, each.number, each.message))
