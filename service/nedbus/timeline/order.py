@@ -27,6 +27,7 @@ _CONFIRM: Final = 20  # messages in a row that show that a clock has changed
 _OPENING: Final = 1000  # messages from which the start of a file is determined; PX4 first logs an old one of each topic
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
+_QUEUED: Final = "log_message"  # PX4 queues texts, so the first ones of a log may be from long before it
 _MAX_STEPS: Final = 1000  # changes of the recorder's clock that are kept, to place a vehicle that appears later
 
 
@@ -429,12 +430,14 @@ def _first_of(items: Sequence[_Item[M]], start: int) -> _Item[M]:
     `start`: when recording began, by the file's header. Old messages come first and once per stream, so streams that
     advance decide, and a header that contradicts them is on another clock.
     """
-    streams = defaultdict[Any, list[_Item[M]]](list)
+    streams: dict[Any, list[_Item[M]]] = defaultdict(list)
     for item in items:
         if item.stamp:
             streams[item.stream].append(item)
     if not streams:
         return items[0]
+    current = {stream: own for stream, own in streams.items() if own[0].message.address.topic != _QUEUED}
+    streams = current or streams
     for own in streams.values():
         if len(own) > 1 and _is_old(*own[:2], start):
             del own[0]
