@@ -41,6 +41,7 @@ class SequenceCounter:
 
     def __init__(self) -> None:
         self._last: int | None = None
+        self._other: int | None = None  # number in the last packet of another link to the same sender
         self._rate, self._time = PacketRate(), 0.0
 
     def add(self, sequence: int, now: float) -> int:
@@ -49,9 +50,17 @@ class SequenceCounter:
             self._last, self._rate = (sequence - 1) % _MODULUS, PacketRate()
         self._time = now
         step = (sequence - self._last) % _MODULUS
+        if step != 1 and self._other is not None and (sequence - self._other) % _MODULUS == 1:
+            self._other = sequence
+            return 0
+        if step > _MODULUS // 2:
+            self._other = sequence
         if step > _MODULUS // 2 or not step:  # late, or a duplicate
             return -1 if step else 0
+        is_explained = step == 1 or self._rate.explains(step - 1, now)
+        if not is_explained:
+            self._other = self._last
         self._last = sequence
-        lost = step - 1 if step == 1 or self._rate.explains(step - 1, now) else 0
+        lost = step - 1 if is_explained else 0
         self._rate.add(now)
         return lost

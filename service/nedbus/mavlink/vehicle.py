@@ -11,11 +11,12 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.log_event import about
 from nedbus.samples import Rejection, SourceMessage
+from nedbus.timeline import RecentTimes, TimeKind
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
-from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, FIRST_UNIX_TIME, TOPICS, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
-from .boot_clock import BootClock
+from .boot_time import new_clock, read_time
 from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
 
 _log = logging.getLogger(__name__)
@@ -32,6 +33,8 @@ _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the te
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
 _DEBUG: Final = 7
+_COPY_TIMEOUT: Final = 10.0  # s after a copy for which late messages are those of a second link
+_SENT_ONCE: Final = frozenset({"sensor_gps", "vehicle_odometry"})  # their messages have `time_usec`
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
 _POSITION, _STATUS, _QUATERNION = 32, 230, 31
@@ -92,6 +95,7 @@ class Vehicle:
     `topics`: those to deliver, None for all; `rate`: positions per second to request.
     `baud`: of a serial link; None for other links, whose bandwidth is unknown.
     `lost`, `rebooted`: losses and a reboot that were not reported yet.
+    `copies`: messages that came again or late over a second link, and were dropped.
     """
 
     def __init__(
@@ -102,11 +106,14 @@ class Vehicle:
         self._rates = request_rates(rate, baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
-        self.clock = BootClock()
+        self.clock = new_clock()
+        self.copies = 0
+        self._copied = -math.inf  # time at which the last copy arrived
         self._last_message = 0.0
         self._last_heartbeat = self._high_latency = -math.inf  # time of the last HEARTBEAT and HIGH_LATENCY2
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self.rebooted = False
+        self._is_wild = self._is_copy = False  # by the time of the last message
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
@@ -115,6 +122,7 @@ class Vehicle:
         """Discard all state and request everything again, after silence or a reboot."""
         self._stored: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
         self._last: dict[Address, int] = {}  # newest timestamps
+        self._delivered = RecentTimes()
         self._texts = _StatusTexts()
         self._started = now
         self._arrivals: dict[int, float] = {}  # last arrival of each requested message
@@ -194,6 +202,11 @@ class Vehicle:
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now)
+        if timestamp is not None and self._is_wild:
+            return self._rejected(topic, message, f"wild time ({timestamp // 1000} ms since boot)")
+        if self._is_copy:
+            self._count_copy(now)
+            return None
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
         is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
@@ -213,6 +226,16 @@ class Vehicle:
             return None
         return self._publish(address, fields_of(message), timestamp, now, log)  # a text is discarded only now
 
+    def _count_copy(self, now: float) -> None:
+        self.copies += 1
+        self._copied = now
+
+    def _rejected(self, topic: str, message: Any, reason: str) -> Rejection | None:
+        if topic not in self._topics:
+            return None
+        address = self._address(topic, message.id if message.get_type() == "BATTERY_STATUS" else 0)
+        return Rejection(str(address), reason, address)
+
     def _address(self, topic: str, instance: int = 0) -> Address:
         return Address(self._name, topic, instance if TOPICS[topic].instances else None)
 
@@ -223,13 +246,21 @@ class Vehicle:
         fields = {name: value for name, value in fields.items() if value is not None}
         if not fields or (log is not None and log.delivers(address)):
             return None
+        if self._delivered.contains(address, timestamp) and address.topic in _SENT_ONCE:
+            self._count_copy(now)
+            return None
         if timestamp < (last := self._last.get(address, 0)):
+            if now - self._copied <= _COPY_TIMEOUT:  # lost on the faster link
+                self._count_copy(now)
+                return None
+            self._copied = now  # further late ones are those of a second link, whose times need not be equal
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
+        self._delivered.add(address, timestamp)
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(address.topic, fields, timestamp, now)
-        return self.report(SourceMessage(now, address, fields), log)
+        return self.report(SourceMessage(0.0, address, fields, arrived=now), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
@@ -294,15 +325,21 @@ class Vehicle:
 
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
-        if self.clock.add(message, now):
+        reading = read_time(self.clock, message, now)
+        kind = None if reading is None else reading.kind
+        self._is_wild = kind is TimeKind.WILD
+        self._is_copy = kind is TimeKind.COPY
+        if kind is TimeKind.REBOOT:
             self.rebooted = True
             self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
             self._reset(now)
         microseconds: int = getattr(message, "time_usec", 0)
-        if 0 < microseconds < YEAR_2000:
+        if 0 < microseconds < FIRST_UNIX_TIME:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", None)
-        return self.clock.newest if ms is None else 1000 * ms
+        if reading is not None:
+            return reading.time
+        return self.clock.newest if ms is None else self.clock.unwrap(1000 * ms, now)
 
 
 def _is_origin(message: Any) -> bool:

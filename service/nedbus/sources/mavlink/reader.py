@@ -8,9 +8,20 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.mavlink import AUTOPILOT, BootClock, Chunk, Reassembly, Received, SequenceCounter, new_parser, parse
+from nedbus.mavlink import (
+    AUTOPILOT,
+    Chunk,
+    Reassembly,
+    Received,
+    SequenceCounter,
+    new_clock,
+    new_parser,
+    parse,
+    read_time,
+)
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import LinkLoad, Rejection
+from nedbus.timeline import TimeKind, VehicleClock
 
 from .link import Link, Peer, PeerChoice
 from .log_client import COMMANDS, Command, LogStreamClient
@@ -61,7 +72,7 @@ class _Vehicle:
     last: float
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     reassembly: Reassembly = field(default_factory=Reassembly)
-    clock: BootClock = field(default_factory=BootClock)
+    clock: VehicleClock = field(default_factory=new_clock)
     is_known: bool = False  # a heartbeat has arrived
     refusal: str = ""
 
@@ -158,7 +169,7 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
         elif kind == "TIMESYNC" and message.tc1:
             self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
-        elif vehicle.clock.add(message, now):
+        elif (reading := read_time(vehicle.clock, message, now)) and reading.kind is TimeKind.REBOOT:
             vehicle.client.on_reboot()
             vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received

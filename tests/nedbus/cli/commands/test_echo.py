@@ -122,7 +122,7 @@ def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
 
 
 def test_echo_and_record_select_several_vehicles_and_topics(bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
-    """`-v` several times and several topics select their product, in `echo` and `record`; other streams are left out."""
+    """`-v` several times and several topics select their product, in `echo` and `record`."""
     for vehicle in ("a", "b", "c"):
         bus.publisher(VLP, vehicle=vehicle).publish(message(1))
         bus.publisher("vehicle_attitude", vehicle=vehicle).publish({"q": (1.0, 0.0, 0.0, 0.0)})

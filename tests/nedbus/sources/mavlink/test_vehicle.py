@@ -145,7 +145,7 @@ def test_attitude_replaces_missing_attitude_quaternion() -> None:
 
 
 def test_order_is_checked_per_topic() -> None:
-    """Only a message older than the last one of the same topic is out of order."""
+    """Only a message older than the last one of the same topic is out of order; the same one again is a copy."""
     vehicle = new_vehicle("*")
     odometry = [1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [math.nan] * 21, [math.nan] * 21]
     assert estimate(vehicle, 2000, 100.0)
@@ -153,7 +153,9 @@ def test_order_is_checked_per_topic() -> None:
     late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
     assert isinstance(late, Rejection)
     assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order (1800 ms since boot, after 1900 ms)")
-    assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
+    assert vehicle.handle(position(2000), 100.0) is None
+    assert vehicle.copies == 1
+    assert estimate(vehicle, 2050, 100.1)["timestamp"] == 2_050_000
 
 
 def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
