@@ -439,7 +439,7 @@ def _first_of(items: Sequence[_Item[M]], start: int) -> _Item[M]:
     current = {stream: own for stream, own in streams.items() if own[0].message.address.topic != _QUEUED}
     streams = current or streams
     for own in streams.values():
-        if len(own) > 1 and _is_old(*own[:2], start):
+        if len(own) > 1 and _is_old(own[0], own[1], start):
             del own[0]
     advancing = [own for own in streams.values() if len(own) > 1 and own[0].stamp < own[-1].stamp]
     if not advancing:
