@@ -1,5 +1,7 @@
 """A vehicle's own time: what is a reboot, and what is a copy, a late message, a wrap, a wild time or a step."""
 
+from collections.abc import Sequence
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,15 +12,17 @@ MODULUS = 1000 << 32  # us until `time_boot_ms` is 0 again
 UNIX = 1_760_000_000_000_000
 
 
-def _run(clock, begin, count, now, *, streams=("a", "b"), step=0.05):
-    kinds = []
+def _run(
+    clock: VehicleClock, begin: int, count: int, now: float, *, streams: Sequence[str] = ("a", "b"), step: float = 0.05
+) -> list[TimeKind]:
+    kinds = list[TimeKind]()
     for number in range(count):
         time = begin + round(1e6 * step) * number
         kinds += [clock.add(stream, time, now + step * number).kind for stream in streams]
     return kinds
 
 
-def test_time_goes_on_after_32_bits():
+def test_time_goes_on_after_32_bits() -> None:
     """`time_boot_ms` starts from 0 again after 49.7 days: the vehicle did not reboot, and its time goes on."""
     clock = VehicleClock(MODULUS)
     for number in range(200):
@@ -27,7 +31,7 @@ def test_time_goes_on_after_32_bits():
         assert reading == (TimeKind.NEW, time, 0)
 
 
-def test_late_message_from_before_the_wrap_keeps_its_time():
+def test_late_message_from_before_the_wrap_keeps_its_time() -> None:
     """A slower link delivers a message from before the wrap after it."""
     clock = VehicleClock(MODULUS)
     clock.add("a", MODULUS - 100_000, 0.0)
@@ -36,9 +40,9 @@ def test_late_message_from_before_the_wrap_keeps_its_time():
 
 
 @pytest.mark.parametrize("late", [0.3, 0.5, 1.5, 3.0, 5.0])
-def test_second_link_delivers_copies(late):
+def test_second_link_delivers_copies(late: float) -> None:
     """A vehicle over two links does not reboot: each message of the slower one is a copy."""
-    clock, kinds = VehicleClock(MODULUS), []
+    clock, kinds = VehicleClock(MODULUS), list[TimeKind]()
     for number in range(200):
         now = 0.05 * number
         _run(clock, 100_000_000 + 50_000 * number, 1, now)
@@ -51,7 +55,7 @@ def test_second_link_delivers_copies(late):
 
 
 @pytest.mark.parametrize("wild", [0, 1, 2**64 - 5, 900_000_000])
-def test_one_wild_time_changes_nothing(wild):
+def test_one_wild_time_changes_nothing(wild: int) -> None:
     """One damaged time is neither a reboot nor the vehicle's time."""
     clock = VehicleClock()
     _run(clock, 100_000_000, 20, 0.0)
@@ -61,7 +65,7 @@ def test_one_wild_time_changes_nothing(wild):
 
 
 @pytest.mark.parametrize("back", [500_000, 2_000_000, 3_000_000, 3_600_000_000])
-def test_a_synchronised_clock_that_is_set_back_is_no_reboot(back):
+def test_a_synchronised_clock_that_is_set_back_is_no_reboot(back: int) -> None:
     """Unix timestamps follow the companion's clock: setting it back is a step."""
     clock = VehicleClock()
     _run(clock, UNIX, 20, 0.0)
@@ -71,7 +75,7 @@ def test_a_synchronised_clock_that_is_set_back_is_no_reboot(back):
     assert clock.newest == UNIX + 1_000_000 - back + 99 * 50_000
 
 
-def test_reboot_after_a_pause_that_explains_it():
+def test_reboot_after_a_pause_that_explains_it() -> None:
     """A vehicle that is up for 4 s, 5 s after its last message, has rebooted once."""
     clock = VehicleClock(MODULUS)
     _run(clock, 100_000_000, 20, 0.0)
@@ -80,7 +84,7 @@ def test_reboot_after_a_pause_that_explains_it():
     assert clock.newest == 4_950_000
 
 
-def test_another_clock_counts_once_it_lasts():
+def test_another_clock_counts_once_it_lasts() -> None:
     """A file may not show the pause before a reboot: times that go on for ten seconds are the vehicle's."""
     clock = VehicleClock()
     _run(clock, 500_000_000, 20, 0.0)
@@ -88,7 +92,7 @@ def test_another_clock_counts_once_it_lasts():
     assert kinds.count(TimeKind.REBOOT) == clock.boot == 1
 
 
-def test_nothing_runs_for_longer_than_it_exists():
+def test_nothing_runs_for_longer_than_it_exists() -> None:
     """The rule of a reboot."""
     assert is_boot_possible(6_000_000, 5.0)
     assert not is_boot_possible(98_500_000, 0.05)
