@@ -271,7 +271,8 @@ class Order(Generic[M]):
         def on_part(place: int, stamp: int) -> None:
             self.axis.add(vehicle, place, stamp)
 
-        self._tracks[vehicle] = track = _Track(self.unordered, on_part)
+        track = _Track[M](self.unordered, on_part)
+        self._tracks[vehicle] = track
         return track
 
     def _in_file_order(self, messages: Iterable[M]) -> Iterator[M]:
