@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import sys
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from typing import Any, Final
 import typer
 
 from nedbus.cli.app import make_app
+from nedbus.extras import EXTRAS
+from nedbus.sources import SOURCE_KINDS
 
 ROOT: Final = Path(__file__).parents[1]
 PAGES: Final = [
@@ -119,3 +122,43 @@ def shape_of(line: str) -> re.Pattern[str]:
         r"\s+" if part.isspace() else r"-?\d[\d.,:]*" if re.fullmatch(r"-?\d[\d.,:]*", part) else re.escape(part)
         for part in parts
     ))  # fmt: skip
+
+
+_CORE: Final = {"nedbus", "nedbus_msgs", "numpy", "pydantic", "msgpack", "zenoh", *sys.stdlib_module_names}
+_COMMAND_EXTRAS: Final = {
+    "web": "web", "foxglove": "foxglove", "plot": "plot", "record": "mcap", "convert": "mcap", "pki": "pki",
+    "export": "metrics",
+}  # fmt: skip
+_CALL_EXTRAS: Final = {"nedbus.plot(": "plot", "nedbus.convert(": "mcap", ".to_parquet(": "pyarrow"}
+_SUFFIX_EXTRAS: Final = {".mcap": "mcap", ".tlog": "mavlink"}
+_MADE_BY_README: Final = {"metrics"}  # by `make run`, in which all pages begin
+
+
+def needed_packages(page: Path) -> set[str]:
+    """Return the extras and packages that the commands and snippets of a page need."""
+    text = page.read_text()
+    needed = {extra for call, extra in _CALL_EXTRAS.items() if call in text}
+    needed |= set(re.findall(r"dataframe=\"(\w+)\"", text))
+    for block in blocks_of(page):
+        if block.language == "python":
+            imported = re.findall(r"^ *(?:import|from) (\w+)", block.text, re.MULTILINE)
+            needed |= set(imported) - _CORE
+        for command in nedbus_commands(block) if block.language in {"bash", "sh"} else ():
+            words = shlex.split(command)
+            needed |= {_COMMAND_EXTRAS[word] for word in words if word in _COMMAND_EXTRAS}
+            needed |= {extra for suffix, extra in _SUFFIX_EXTRAS.items() if suffix in command}
+            kinds = [SOURCE_KINDS.get(word.partition(":")[0]) for word in words if ":" in word]
+            needed |= {kind.extra for kind in kinds if kind is not None}
+            if "--http" in words:
+                needed.add("metrics")
+    return needed - {""} - _MADE_BY_README
+
+
+def installed_packages(page: Path) -> set[str]:
+    """Return the extras and packages that the install lines of a page name; "all" is every extra."""
+    installed: set[str] = set()
+    for line in re.findall(r"pip install ([^\n`;&#]*)", page.read_text()):
+        for word in re.sub(r"[\"',()]", " ", re.sub(r",(?=[\w,]*\])", "+", line)).split():
+            extras = re.search(r"\[([\w+]+)\]", word)
+            installed |= set(extras[1].split("+")) if extras else {word}
+    return installed | EXTRAS if "all" in installed else installed

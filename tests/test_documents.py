@@ -18,6 +18,7 @@ from typing import Final
 
 import pytest
 from benchmarks.compare.report import SHOWN
+from pymavlink.dialects.v20 import common as mavlink
 
 import nedbus
 from docs.generator import DOCS
@@ -26,13 +27,27 @@ from docs.generator.commands import commands, commands_page
 from docs.generator.metrics import metrics_page
 from docs.generator.tables import events_page, keys_page, limits_page, settings_page
 from nedbus.events import KINDS
+from nedbus.health import StreamHealth
 from nedbus.log_event import EVENTS
+from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.monitoring.metrics import METRICS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS, parse_source
+from nedbus.timings import TIMINGS
 from nedbus.transport import open_router
 from nedbus_msgs import MESSAGES, TOPICS, VehicleLocalPosition
-from tests.documents import BLOCKS, PAGES, ROOT, Block, check_options, nedbus_commands, parse_command, shape_of
+from tests.documents import (
+    BLOCKS,
+    PAGES,
+    ROOT,
+    Block,
+    check_options,
+    installed_packages,
+    nedbus_commands,
+    needed_packages,
+    parse_command,
+    shape_of,
+)
 from tests.flights.replays import convert_replay
 from tests.nedbus.cli.commands.test_events import write_flight
 from tests.peers.command_line import run_command
@@ -426,6 +441,61 @@ def test_reference_has_every_metric() -> None:
         f"| `{name}" in page for name in re.findall(r"\b(nedbus_[a-z_]+?)(?:_bucket|_sum|_count)?\b[{\[ )]", alerts)
     )
     assert "| `nedbus_stream_age_seconds` | gauge | `vehicle, topic, source` |" in page
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "pip install" in TEXTS[page]], ids=lambda page: page.stem)
+def test_install_line_of_a_page_covers_its_commands_and_snippets(page: Path) -> None:
+    """A page that installs extras or packages installs all that its commands, imports and data frames need."""
+    assert needed_packages(page) - installed_packages(page) == set()
+
+
+def test_needs_of_a_page_are_found(tmp_path: Path) -> None:
+    """Sources, suffixes, commands, imports, data frames and calls determine what a page needs."""
+    page = ROOT / "docs" / "recordings.md"
+    assert needed_packages(page) >= {"mcap", "plot", "foxglove", "pandas", "pyarrow"}
+    other = tmp_path / "needs.md"
+    other.write_text(
+        "```bash\nnedbus serve --source mavlink:udpin:0.0.0.0:14540\nnedbus web a.mcap\n```\n"
+        '```python\nimport scipy\n```\n`pip install -e ".[web,mcap]" scipy`\n'
+    )
+    assert needed_packages(other) == {"mavlink", "web", "mcap", "scipy"}
+    assert installed_packages(other) == {"-e", "web", "mcap", "scipy"}
+
+
+def test_alerts_of_the_page_are_those_of_the_rules() -> None:
+    """docs/operate.md lists the alerts with their severities and durations; a stale stream is that of nedbus.health."""
+    rules = (ROOT / "packaging" / "prometheus" / "alerts.yml").read_text()
+    page = TEXTS[ROOT / "docs" / "operate.md"]
+    rows = re.findall(r"^\| `(Nedbus\w+)` \| (\w+) \| (.*) \|$", page, re.MULTILINE)
+    alerts = rules.split("- alert: ")[1:]
+    assert [row[0] for row in rows] == [text.split()[0] for text in alerts]
+    for (name, severity, condition), text in zip(rows, alerts, strict=True):
+        assert f"severity: {severity}\n" in text, name
+        if waits := re.search(r"\bfor: (\d+)([sm])\n", text):
+            assert f"{waits[1]} {'min' if waits[2] == 'm' else 's'}" in condition, name
+    stale = re.search(r"age_seconds > (\d+) unless .*_age_seconds \* \w+usual_rate_hertz < (\d+)\n", rules)
+    stream = StreamHealth("vehicle_local_position")
+    for number in range(20):
+        stream.add({"timestamp": number * 10_000_000}, received=number * 10_000_000_000)
+    assert stale is not None
+    assert float(stale[1]) == TIMINGS.stale
+    assert float(stale[2]) == stream.stale_after / 10
+    assert float(stale[2]) == 3
+    assert "| no message for 3 s, or three usual intervals of a slower stream, plus 5 s |" in page
+
+
+def test_fields_converted_from_heartbeat_are_those_of_the_page() -> None:
+    """docs/live.md names fields of vehicle_status that HEARTBEAT provides, and those that it does not."""
+    row = next(
+        line for line in TEXTS[ROOT / "docs" / "live.md"].splitlines() if line.startswith("| `vehicle_status` | `HEAR")
+    )
+    named, _, absent = row.partition("; neither")
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, 128, 0, 4, 3)
+    heartbeat.pack(mavlink.MAVLink(None, 1, 1))
+    provided = CONVERSIONS["HEARTBEAT"][1](heartbeat)
+    assert {"arming_state", "system_type", "failsafe"} == set(re.findall(r"`([a-z_]+)`", named)) - {"vehicle_status"}
+    assert provided.keys() >= {"arming_state", "system_type", "failsafe"}
+    assert provided.keys().isdisjoint(re.findall(r"`([a-z_]+)`", absent))
 
 
 def test_contributing_names_files_that_exist() -> None:

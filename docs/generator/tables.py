@@ -99,7 +99,7 @@ def keys_page() -> str:
             code("nedbus/@schema/*/VehicleLocalPosition"),
             "queryable: JSON Schema and layouts of each definition with this name, or of the one with `?hash=`",
         ],
-        [code("nedbus/@service/*/status"), "queryable: status of each service, in JSON"],
+        [code("nedbus/@service/*/*/status"), "queryable: status of each service, in JSON"],
         [code(one.rejected_key()), "rejected messages, with the reason, in JSON"],
     ]
     messages = [

@@ -17,6 +17,7 @@ from .codecs.cdr import cdr_layout
 from .codecs.msgpack import codec_of
 from .definitions import DEFAULT, M, definition_of
 from .errors import InvalidMessageError
+from .frames import DERIVED, Functions, is_rotation
 from .model.declaration import Layout, cached_on_owner
 from .model.definition import MESSAGES, Definition
 from .model.message import Message
@@ -200,3 +201,14 @@ def mask_invalid(messages: MessageArray) -> MessageArray:
             for name in flags[flag]:
                 masked[name][~masked[flag]] = np.nan
     return masked
+
+
+def derive_column(messages: MessageArray, name: str) -> npt.NDArray[np.float64]:
+    """Return a quantity of `frames.DERIVED` of each message, shape (n,); NaN where it is invalid."""
+    derived = DERIVED[name]
+    values = [messages[field].astype(np.float64).T for field in derived.fields]
+    is_valid = messages[derived.flag] if derived.flag else is_rotation(values[0])
+    functions = Functions(np.sqrt, np.arctan2)
+    with np.errstate(invalid="ignore", over="ignore"):  # of invalid values, which are replaced
+        found: npt.NDArray[np.float64] = np.where(is_valid, derived.compute(functions, *values), np.nan)
+    return found

@@ -1,4 +1,4 @@
-"""Frame conversions as in PX4: NED and ENU, FRD and FLU, local and global positions.
+"""Frame conversions as in PX4: NED and ENU, FRD and FLU, local and global positions; height, speed and Euler angles.
 
 Angles are in radians, latitudes and longitudes in degrees, lengths in metres.
 Source: PX4's MapProjection (azimuthal equidistant, on a sphere); results agree with PX4's own
@@ -8,16 +8,17 @@ Source: PX4's MapProjection (azimuthal equidistant, on a sphere); results agree 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
     from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
 __all__ = [
-    "GlobalPosition", "MapProjection", "Ned", "Vector", "enu_to_ned", "euler_to_quaternion", "flu_to_frd", "frd_to_flu",
-    "ned_to_enu", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "quaternion_to_euler", "to_global", "to_local",
+    "DERIVED", "DerivedField", "GlobalPosition", "MapProjection", "Ned", "Vector", "derive", "derived_from",
+    "enu_to_ned", "euler_to_quaternion", "flu_to_frd", "frd_to_flu", "ned_to_enu",
+    "quaternion_enu_to_ned", "quaternion_ned_to_enu", "quaternion_to_euler", "to_global", "to_local",
     "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
@@ -91,12 +92,90 @@ def quaternion_to_euler(q: Sequence[float]) -> Vector:
     norm = math.hypot(*q)
     if not norm:
         return math.nan, math.nan, math.nan
-    w, x, y, z = (element / norm for element in q)
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(_clip(2 * (w * y - z * x))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
+    roll, pitch, yaw = _euler(_OF_NUMBERS, [element / norm for element in q])
+    return roll, pitch, yaw
+
+
+class Functions(NamedTuple):
+    """Functions of numbers, or of arrays."""
+
+    sqrt: Callable[[Any], Any]
+    atan2: Callable[[Any, Any], Any]
+
+
+_OF_NUMBERS: Final = Functions(math.sqrt, math.atan2)
+
+
+def _euler(functions: Functions, q: Any) -> tuple[Any, Any, Any]:
+    """Return roll, pitch and yaw [rad] of the elements of q, numbers or arrays."""
+    w, x, y, z = q
+    sine_roll, cosine_roll = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # both times the cosine of pitch
+    cosine_pitch = functions.sqrt(sine_roll * sine_roll + cosine_roll * cosine_roll)
+    roll = functions.atan2(sine_roll, cosine_roll)
+    pitch = functions.atan2(2 * (w * y - z * x), cosine_pitch)
+    yaw = functions.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return roll, pitch, yaw
+
+
+class DerivedField(NamedTuple):
+    """A quantity computed from fields of a message; NaN while the flag is false, or q is not a rotation.
+
+    `meaning`: with unit and frame. `fields`: on which it depends. `flag`: the field that declares these valid, or "".
+    `compute`: the quantity, given functions of numbers or of arrays, and the values of `fields`.
+    """
+
+    meaning: str
+    fields: tuple[str, ...]
+    flag: str
+    compute: Callable[..., Any]
+
+
+def _angle(index: int, scale: float) -> Callable[..., Any]:
+    return lambda functions, q: scale * _euler(functions, q)[index]
+
+
+_DEGREES: Final = 180.0 / math.pi
+_ROLL: Final = "roll about the forward axis, the last of the rotations yaw, pitch, roll from NED to body FRD"
+_PITCH: Final = "pitch, positive nose up, within a quarter turn; after yaw and before roll"
+_YAW: Final = "yaw, clockwise from north; the first of the rotations from NED to body FRD"
+
+DERIVED: Final[Mapping[str, DerivedField]] = {
+    "height": DerivedField("-z, height above the origin of the local frame [m]", ("z",), "z_valid", lambda _, z: -z),
+    "speed": DerivedField(
+        "horizontal speed, the norm of vx and vy [m/s]", ("vx", "vy"), "v_xy_valid",
+        lambda functions, vx, vy: functions.sqrt(vx * vx + vy * vy),
+    ),
+    "roll": DerivedField(f"{_ROLL} [rad]", ("q",), "", _angle(0, 1.0)),
+    "pitch": DerivedField(f"{_PITCH} [rad]", ("q",), "", _angle(1, 1.0)),
+    "yaw": DerivedField(f"{_YAW} [rad]", ("q",), "", _angle(2, 1.0)),
+    "roll_deg": DerivedField("roll [deg]", ("q",), "", _angle(0, _DEGREES)),
+    "pitch_deg": DerivedField("pitch [deg]", ("q",), "", _angle(1, _DEGREES)),
+    "yaw_deg": DerivedField("yaw [deg]", ("q",), "", _angle(2, _DEGREES)),
+}  # fmt: skip
+"""Quantities that tables and commands offer by name for each message with their fields."""
+
+
+def derived_from(fields: Iterable[str]) -> list[str]:
+    """Return the names in DERIVED of the quantities that a message with these fields has, except its own fields."""
+    own = set(fields)
+    return [
+        name for name, each in DERIVED.items() if name not in own and own.issuperset({*each.fields, each.flag} - {""})
+    ]
+
+
+def derive(message: object, name: str) -> float:
+    """Return a quantity of DERIVED of a message or row; NaN while it is invalid."""
+    derived = DERIVED[name]
+    values = [getattr(message, field) for field in derived.fields]
+    is_valid = getattr(message, derived.flag) is True if derived.flag else is_rotation(values[0])
+    return float(derived.compute(_OF_NUMBERS, *values)) if is_valid else math.nan
+
+
+def is_rotation(q: Any) -> Any:
+    """Return whether q has norm 1 within 0.001, as a valid message has; false for zeros and NaN."""
+    w, x, y, z = q
+    squared = w * w + x * x + y * y + z * z
+    return (squared >= 0.999**2) & (squared <= 1.001**2)
 
 
 @dataclass(frozen=True, slots=True)

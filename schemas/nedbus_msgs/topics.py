@@ -209,9 +209,31 @@ def schema_key(message: str, *, vehicle: str = ANY, prefix: str = DEFAULT_PREFIX
     return f"{prefix}/@schema/{vehicle}/{message}"
 
 
-def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key to query for the status of one service; "*" matches all services."""
-    return f"{prefix}/@service/{service}/status"
+def status_key(service: str, *, vehicle: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key to query for what a service reports about a vehicle; "*" matches all of either.
+
+    The key names the vehicle, so that access rules can bind reports about a vehicle to its certificate.
+    """
+    return f"{prefix}/@service/{vehicle}/{service}/status"
+
+
+def all_status_keys(*, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key expression of all status keys, including those of older services, which name no vehicle."""
+    return f"{prefix}/@service/**/status"
+
+
+def parse_status_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> tuple[str | None, str]:
+    """Return vehicle and service of a status key; the vehicle is None for an older service, whose key names none.
+
+    Raises AddressError for any other key.
+    """
+    chunks = key.removeprefix(f"{prefix}/@service/").removesuffix("/status").split("/")
+    if len(chunks) == 1:
+        return None, chunks[0]
+    if len(chunks) != 2:
+        raise AddressError("key", key, f"{prefix}/@service/<vehicle>/<id>/status")
+    vehicle, service = chunks
+    return check_vehicle(vehicle), service
 
 
 def ack_key(key_expr: str) -> str:

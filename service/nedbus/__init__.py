@@ -29,11 +29,22 @@ if TYPE_CHECKING:
         define_msg,
     )
     from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, mask_invalid, to_array, to_message
-    from nedbus_msgs.messages import *  # noqa: F403 - one class per PX4 message
+    from nedbus_msgs.messages import (  # `as`: without it, pyright counts the names as private
+        BatteryStatus as BatteryStatus,
+        EstimatorStatusFlags as EstimatorStatusFlags,
+        FailsafeFlags as FailsafeFlags,
+        HomePosition as HomePosition,
+        LogMessage as LogMessage,
+        SensorGps as SensorGps,
+        TimesyncStatus as TimesyncStatus,
+        VehicleAttitude as VehicleAttitude,
+        VehicleGlobalPosition as VehicleGlobalPosition,
+        VehicleLandDetected as VehicleLandDetected,
+        VehicleOdometry as VehicleOdometry,
+        VehicleStatus as VehicleStatus,
+    )
 
-    from . import errors as errors
-    from . import frames as frames
-    from . import health as health
+    from . import errors as errors, frames as frames, health as health
     from .client import (
         AsyncBus,
         AsyncNewest,
@@ -58,8 +69,13 @@ if TYPE_CHECKING:
         ReceiveError,
         SourceError,
     )
-    from .flights import Flight, FlightSamples, UtcOffset, utc_of
-    from .flights import open_flight as open  # noqa: A004 - as in nedbus.open(path)
+    from .flights import (
+        Flight,
+        FlightSamples,
+        UtcOffset,
+        open_flight as open,  # noqa: A004 - as in nedbus.open(path)
+        utc_of,
+    )
     from .samples import Batch, Counts, Mode, Sample
     from .tables import addresses_of, align, missing_of, read
     from .transport import Session, Tls

@@ -15,6 +15,7 @@
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            cannot listen on the endpoint: port in use, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
+    │   ├── RefusedError (PermissionError)   the router's access rules drop what this process publishes
     │   ├── ClosedError (RuntimeError)       the bus, subscription or publisher is closed
     │   ├── ReceiveError (RuntimeError)      a subscription whose session or thread failed
     │   └── ForkError (RuntimeError)         this process was forked from a connected one
@@ -47,7 +48,7 @@ from nedbus_msgs import (
 __all__ = [
     "AddressError", "AddressInUseError", "ArgumentError", "ClosedError", "ConfigError", "ConnectError", "DecodeError",
     "EncodeError", "ForkError", "InvalidMessageError", "LayoutError", "ListenError", "NedbusError", "NoDataError",
-    "OutputError", "PkiError", "ReceiveError", "SourceError", "UnknownLayoutError",
+    "OutputError", "PkiError", "ReceiveError", "RefusedError", "SourceError", "UnknownLayoutError",
 ]  # fmt: skip
 
 
@@ -79,13 +80,15 @@ class ConfigError(NedbusError, ValueError):
 
 
 class ConnectError(NedbusError, ConnectionError):
-    """Raised when no endpoint answers in time."""
+    """Raised when no endpoint answers in time; `advice`: the remedy, if the cause is known."""
 
-    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
+    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "", *, advice: str = "") -> None:
         self.endpoints = tuple(endpoints)
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
         where = " or ".join(endpoints)
-        if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
+        if advice:
+            super().__init__(f"no Zenoh session at {where} ({tried}): {advice}; run 'nedbus doctor' to check it")
+        elif any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
             advice = reason or (
                 "check that tls_ca signed the router's certificate and tls_certificate, that none of them has expired,"
                 " and that the router's certificate names the host of the endpoint"
@@ -143,6 +146,20 @@ class ClosedError(NedbusError, RuntimeError):
 
     def __init__(self) -> None:
         super().__init__("the bus, subscription or publisher is closed: open a new one")
+
+
+class RefusedError(NedbusError, PermissionError):
+    """Raised when the access rules of the router drop what this process publishes for a vehicle; Zenoh reports nothing.
+
+    `vehicle`: the refused vehicle. `certificate`: the file of the certificate that may not publish it.
+    """
+
+    def __init__(self, vehicle: str, certificate: object) -> None:
+        super().__init__(
+            f"the router refuses messages of vehicle {vehicle}, so they reach no reader: its access rules must allow"
+            f" them for the certificate {certificate} ('nedbus pki rules', docs/security.md)"
+        )
+        self.vehicle, self.certificate = vehicle, certificate
 
 
 class ReceiveError(NedbusError, RuntimeError):

@@ -54,6 +54,7 @@ class Timings:
     min_listen: float = 1.0  # after all queries, to measure message latency
     doctor_open: float = 1.5  # to open a session
     handshake: float = 1.5  # TLS handshake
+    tls_hint: float = 0.5  # TLS handshake that tells why a connection without TLS failed
     tls_alert: float = 0.5  # for the TLS alert of a router that rejects our certificate
     list_timeout: float = 10.0  # for a router to list all streams
     first_sample: float = 2.0  # without a sample until a notice is printed to stderr

@@ -22,15 +22,15 @@ from nedbus_msgs import (
     decode_with,
     definition_of,
     definition_text,
+    describe as _describe,
     encode_with,
+    encoding_of as _encoding_of,
     hash_of,
     message_of_type_hash,
+    provenance_of as _provenance_of,
     ros2_type,
     upgrade_with,
 )
-from nedbus_msgs import describe as _describe
-from nedbus_msgs import encoding_of as _encoding_of
-from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.codecs.msgpack import NewerLayouts
 from nedbus_msgs.model.px4_types import Float32, field

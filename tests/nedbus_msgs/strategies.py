@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from hypothesis import settings
-from hypothesis import strategies as st
+from hypothesis import settings, strategies as st
 
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.local_position import FIELD_TYPES, encode

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from nedbus_msgs import DEFAULT, DecodeError, VehicleLocalPosition, codec_of
 from nedbus_msgs.arrays import DTYPE, arrays_of, mask_invalid, to_array

@@ -7,14 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given
-from hypothesis import strategies as st
+from hypothesis import assume, example, given, strategies as st
 from pyulog import ULog
 
-from nedbus_msgs import VehicleLocalPosition
+import nedbus
+from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
+from nedbus_msgs.arrays import derive_column, to_array, to_message
 from nedbus_msgs.frames import (
+    DERIVED,
     GlobalPosition,
     MapProjection,
+    derive,
+    derived_from,
     enu_to_ned,
     euler_to_quaternion,
     flu_to_frd,
@@ -31,6 +35,7 @@ from nedbus_msgs.frames import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
+from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.local_position import row_of
 from tests.flights.ulogs import LOGS
 
@@ -210,3 +215,63 @@ def test_reprojected_longitude_is_wrapped(east: float, expected: float) -> None:
     projection = MapProjection(0.0, 180.5)
     assert projection.reproject(0.0, east)[1] == pytest.approx(expected, abs=1e-3)
     assert projection.project(0.0, -179.5) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def _matrix_angles(q: Sequence[float]) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw [rad] from the rotation matrix of q, whose columns are the rotated body axes."""
+    w, x, y, z = np.asarray(q, float) / np.linalg.norm(q)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    forward, right, down = matrix.T
+    return math.atan2(right[2], down[2]), math.asin(-forward[2]), math.atan2(forward[1], forward[0])
+
+
+def test_derived_angles_follow_the_documented_order() -> None:
+    """From NED, the body is turned by yaw about down, then pitch about right, then roll about forward."""
+    for roll, pitch, yaw in [(0.3, -0.4, 2.0), (-3.0, 1.5, -3.1), (0.0, 0.0, 0.0)]:
+        message = VehicleAttitude(timestamp=1, q=euler_to_quaternion(roll, pitch, yaw))
+        found = [derive(message, name) for name in ("roll", "pitch", "yaw")]
+        assert found == pytest.approx([roll, pitch, yaw], abs=1e-6)
+        degrees = [derive(message, name) for name in ("roll_deg", "pitch_deg", "yaw_deg")]
+        assert degrees == pytest.approx(np.degrees([roll, pitch, yaw]).tolist(), abs=1e-4)
+
+
+def test_derived_values_of_invalid_fields_are_nan() -> None:
+    """A false or missing flag, and a q of zeros or NaN, result in NaN, in messages as in arrays."""
+    local = [
+        VehicleLocalPosition(timestamp=1, z=-5.0, vx=3.0, vy=4.0, z_valid=True, v_xy_valid=True),
+        VehicleLocalPosition(timestamp=1, z=-5.0, vx=3.0, vy=4.0),
+    ]
+    for name, value in (("height", 5.0), ("speed", 5.0)):
+        assert [derive(each, name) for each in local] == pytest.approx([value, math.nan], nan_ok=True)
+        assert derive_column(to_array(local), name) == pytest.approx([value, math.nan], nan_ok=True)
+    unknown = to_array([VehicleAttitude(timestamp=1, q=(math.nan, 0.0, 0.0, 0.0))] * 2)
+    unknown["q"][1] = 0.0
+    assert np.isnan(derive_column(unknown, "roll")).all()
+    assert math.isnan(derive(VehicleAttitude(timestamp=1, q=(math.nan, 0.0, 0.0, 0.0)), "yaw"))
+    assert derived_from(VehicleLocalPosition.model_fields) == ["height", "speed"]
+    assert derived_from(("timestamp", "height")) == []
+
+
+@pytest.mark.logs
+@pytest.mark.parametrize("topic", ["vehicle_attitude", "vehicle_local_position"])
+def test_derived_columns_equal_messages_and_matrices_in_a_real_log(topic: str) -> None:
+    """In a real log, arrays and messages have the same values, and angles are those of the rotation matrices."""
+    path = LOGS / "sitl_1.15_events.ulg"
+    if not path.exists():
+        pytest.skip(f"real logs not found: {LOGS}")
+    messages = nedbus.read(path, topic)
+    names = derived_from(messages.dtype.names or ())
+    assert len(names) == (6 if topic == "vehicle_attitude" else 2)
+    columns = {name: derive_column(messages, name) for name in names}
+    model = BY_TOPIC[topic].model
+    rows = range(0, len(messages), max(1, len(messages) // 200))
+    for row in rows:
+        message = to_message(messages[row], model)
+        assert [derive(message, name) for name in names] == pytest.approx(
+            [columns[name][row] for name in names], rel=1e-12, abs=1e-12, nan_ok=True
+        )
+        if topic == "vehicle_attitude":
+            angles = [columns[name][row] for name in ("roll", "pitch", "yaw")]
+            assert angles == pytest.approx(_matrix_angles(messages["q"][row]), abs=1e-6)
+    assert all(np.isfinite(columns[name]).any() for name in DERIVED if name in columns)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from nedbus_msgs import MESSAGES, ArgumentError, Provenance, identity_of, short_hash
-from nedbus_msgs import encoding_of as encoding_with
+from nedbus_msgs import MESSAGES, ArgumentError, Provenance, encoding_of as encoding_with, identity_of, short_hash
 from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, next_release, provenance_of
 
 

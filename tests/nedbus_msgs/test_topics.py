@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 import zenoh
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from nedbus_msgs import (
     ANY,
@@ -59,7 +58,7 @@ def test_keys_match_the_documentation() -> None:
     assert Selection("estimator_local_position", vehicle="7").key_exprs()[0] == "nedbus/7/estimator_local_position/*"
     assert schema_key("VehicleLocalPosition") == "nedbus/@schema/*/VehicleLocalPosition"
     assert schema_key("VehicleStatus", vehicle="7", prefix="a/b") == "a/b/@schema/7/VehicleStatus"
-    assert status_key("a-1") == "nedbus/@service/a-1/status"
+    assert status_key("a-1", vehicle="7") == "nedbus/@service/7/a-1/status"
     assert ack_key(Selection("vehicle_local_position").key_exprs()[0]) == "nedbus/*/vehicle_local_position/@ack"
 
 

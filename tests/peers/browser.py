@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 import pytest
-from playwright.sync_api import Browser, Error, Page, sync_playwright
+from playwright.sync_api import Browser, Error, Page, ViewportSize, sync_playwright
 
 from tests.waits import wait_for
 
@@ -246,8 +246,9 @@ def open_tabs(browser: Browser, *, allow_console_errors: bool = False) -> Iterat
     tabs: list[Tab] = []
     contexts = []
 
-    def make(*, width: int = 800, height: int = 560) -> Tab:
-        context = browser.new_context(viewport={"width": width, "height": height})  # small: less to draw
+    def make(*, width: int = 800, height: int = 560, is_mobile: bool = False) -> Tab:
+        size: ViewportSize = {"width": width, "height": height}  # small: less to draw
+        context = browser.new_context(viewport=size, is_mobile=is_mobile)
         contexts.append(context)
         tabs.append(Tab(context.new_page()))
         return tabs[-1]

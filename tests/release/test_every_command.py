@@ -17,7 +17,7 @@ MAKE_RUN = re.findall(r'--editable "\.\[(\w+)\]"', (ROOT / "Makefile").read_text
 def test_commands_run_without_optional_packages(start: Start, extras: list[str]) -> None:
     """Help needs no extra; a command whose extra is missing ends with one line that names it, and exit code 2."""
     process = start(str(ROOT / "tests/release/every_command.py"), *extras, "--block", fresh=True)
-    assert process.wait() == 0, process.err
+    assert process.wait(90) == 0, process.err  # 40 runs: six seconds on an idle machine
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ class VehicleOdometry(Message):
     arbitrary origin and heading; z points down in both. The body frame is also FRD: x forward, y right.
     An array is unknown if its first element is NaN; q also if it is all zeros. There are variances, but no covariances.
     reset_counter counts resets of all kinds; no field holds their deltas.
-    q of vision or motion capture is as its sender wrote it: PX4 normalises it when it is fused, and ignores zeros.
+    q of vision or motion capture is as its sender wrote it. EKF2 fuses the attitude only if its norm is 1 within 1e-5,
+    and otherwise position and velocity alone; EKF2 of 1.13 fuses any finite q.
     timestamp_sample may be from another computer's clock, and later than timestamp.
 
     Layout 1.13 lacks quality; its covariance matrices and q_offset are dropped on upgrade, and NaN on downgrade.

@@ -13,6 +13,10 @@ RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 """The PX4 releases with known layouts, oldest first."""
 ALL: Final = "all"
 """Name of the layout with every field of the model, if no release of PX4 has them all."""
+_HISTORY: Final = 20.0  # s of messages at the nominal rate in a history cache
+_MIN_KEPT: Final = 400  # messages of a topic with a nominal rate, because sources may be faster
+_KEPT_WITHOUT_RATE: Final = 50  # messages of a source's topic
+_KEPT_BYTES: Final = 2**18  # of such a topic
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -39,8 +43,18 @@ class Topic:
 
     @property
     def kept(self) -> int:
-        """Number of messages in a publisher's retransmission cache: 20 s at the nominal rate, at least 400."""
-        return max(400, round(20.0 * self.rate))
+        """Number of messages in a publisher's history cache: 20 s at the nominal rate, at least 400."""
+        return max(_MIN_KEPT, round(_HISTORY * self.rate))
+
+    def kept_for_source(self, size: int) -> int:
+        """Return the same for a stream of a source; `size`: bytes of a message.
+
+        A topic without a nominal rate, or published on change, keeps 50 messages, fewer if they exceed 256 KiB: PX4's
+        log has about ninety such topics, most of them at up to 2.5 Hz.
+        """
+        if self.rate and not self.on_change:
+            return self.kept
+        return max(1, min(_KEPT_WITHOUT_RATE, _KEPT_BYTES // size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

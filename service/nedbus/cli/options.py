@@ -16,7 +16,8 @@ import typer
 from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Selection
+from nedbus_msgs.frames import derived_from
 
 from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
 
@@ -211,6 +212,10 @@ def allow_one(flags: Mapping[str, bool]) -> None:
         raise ConfigError(given[1], f"cannot be combined with {given[0]}: remove one of the two")
 
 
+def _columns_of(definition: Definition[Any]) -> list[str]:
+    return [*definition.types, *derived_from(definition.types)]
+
+
 def parse_fields(text: str | None, selection: Selection) -> list[str]:
     """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
@@ -218,7 +223,7 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     known = list(MESSAGES.values()) if topics == (ANY,) else [BY_TOPIC.get(topic) for topic in topics]
     for name in names:
         first = known[0]
-        if first is not None and None not in known and not any(each and name in each.types for each in known):
+        if first is not None and None not in known and not any(each and name in _columns_of(each) for each in known):
             raise ConfigError("--field", first.explain_unknown_field(name))
     return names
 

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -17,6 +17,9 @@ _MEANT: Final[Mapping[str, str]] = {
 """The option meant by a name that no command has: other tools call it so."""
 
 
+_UsageError = cast("type[Exception]", typer.BadParameter.__mro__[1])  # Click's, which newer releases of Typer contain
+
+
 class _StrictParsing:
     """Reject a repeated option that takes one value: the parser would silently use the last one."""
 
@@ -29,11 +32,11 @@ class _StrictParsing:
                 if times > 1 and option.param_type_name == "option" and not (option.multiple or option.is_flag):
                     raise typer.BadParameter(f"given {times} times, but it takes one value", ctx=ctx, param=option)
             parsed_args: list[str] = super().parse_args(ctx, args)  # type: ignore[misc] # of the command
-        except Exception as exc:
-            if (meant := _MEANT.get(getattr(exc, "option_name", ""))) is not None:
-                known = {name for option in command.get_params(ctx) for name in option.opts}
-                if meant in known:
-                    exc.possibilities = [meant]  # type: ignore[attr-defined] # of an unknown option
+        except _UsageError as exc:
+            meant = _MEANT.get(getattr(exc, "option_name", ""))
+            known = {name for option in command.get_params(ctx) for name in option.opts}
+            if meant in known:
+                exc.possibilities = [meant]  # type: ignore[attr-defined] # of an unknown option
             raise
         return parsed_args
 

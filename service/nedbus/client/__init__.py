@@ -17,6 +17,7 @@ from .discovery import (
     StreamStatus,
     Vehicles,
     find_services,
+    prefix_of,
     reply_parts,
 )
 from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state

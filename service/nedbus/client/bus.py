@@ -39,6 +39,7 @@ from .closing import Finalizer
 from .discovery import Rejections, ServiceStatus, Vehicles, find_reports, find_services
 from .link import LinkCallback, LinkWatch
 from .newest import Newest
+from .publishing.publish_permission import PublishPermission
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
@@ -65,7 +66,10 @@ class Bus(AbstractContextManager["Bus"]):
         self._tls, prefix = tls or settings.tls, settings.prefix
         self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
-        self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
+        permission = PublishPermission.of(session, self.routers, tls=self._tls, prefix=prefix)
+        self._publishers = PublisherRegistry(
+            session, self._queries, prefix=prefix, is_client=True, permission=permission
+        )
         self._reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
         self._directory = VehicleDirectory.of_fleet(self._reopen, Selection(), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
@@ -121,7 +125,7 @@ class Bus(AbstractContextManager["Bus"]):
         `vehicle`: one or several; each pair of a vehicle and a topic is a subscription of Zenoh.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which caches
-        about 20 s of messages.
+        about 20 s of topics with a nominal rate, and of others 50 messages (services) or 400 (scripts).
         `limit`: unread samples kept for a slow reader, by default 65,536, or in mode "latest" the newest of 10,000
         keys, in both cases up to 64 MiB of payload; beyond that the oldest are dropped.
         In both modes `counts` reports lost, dropped and invalid samples. A slow reader delays lossless publishers only.
@@ -242,10 +246,13 @@ class Bus(AbstractContextManager["Bus"]):
         `source`: the origin of the messages, shown in `sample.source`; 1 to 32 of the characters a-z 0-9 _ -.
         `definition`: the definition of a custom message, from `define_msg`; readers query it from the publisher.
 
-        Raises AddressInUseError if this bus already has a publisher for the address.
+        Raises AddressInUseError if this bus already has a publisher for the address, RefusedError if the access rules
+        of the router do not allow this client's certificate to publish the vehicle.
         """
         self._require_open()
         address = Address(vehicle_name(vehicle), topic_of(message, topic), instance)
+        if self._publishers.permission is not None:
+            self._publishers.permission.require(address.vehicle)
         if definition is None and not isinstance(message, str):
             definition = message.DEFINITION
         publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)

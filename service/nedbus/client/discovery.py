@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
@@ -21,7 +21,7 @@ from nedbus.errors import AddressError
 from nedbus.log_event import about
 from nedbus.samples import LogStreamStatus, UntrustedReply
 from nedbus.transport import MAX_REPLY_BYTES, RawSample, Session, query, translate_zenoh_errors
-from nedbus_msgs import ANY, REJECTED, Address, status_key
+from nedbus_msgs import REJECTED, Address, all_status_keys, parse_status_key
 
 if TYPE_CHECKING:
     from nedbus.events import AccountReport
@@ -93,6 +93,27 @@ class SourceStatus(UntrustedReply):
     log_streams: tuple[LogStreamStatus, ...] = ()
 
     @property
+    def vehicles(self) -> set[str]:
+        """The vehicles that this status names."""
+        addresses = (*self.addresses, *self.stale, *self.silent, *(each.address for each in self.streams))
+        return {each.partition("/")[0] for each in addresses} | {each.vehicle for each in self.log_streams}
+
+    def about(self, vehicles: Collection[str]) -> SourceStatus:
+        """Return this status without what it says about other vehicles than these."""
+
+        def is_about(address: str) -> bool:
+            return address.partition("/")[0] in vehicles
+
+        return replace(
+            self,
+            addresses=tuple(filter(is_about, self.addresses)),
+            stale=tuple(filter(is_about, self.stale)),
+            silent=tuple(filter(is_about, self.silent)),
+            streams=tuple(each for each in self.streams if is_about(each.address)),
+            log_streams=tuple(each for each in self.log_streams if each.vehicle in vehicles),
+        )
+
+    @property
     def ended(self) -> bool:
         """True if the source will not publish again."""
         return self.state in {"done", "failed"}
@@ -103,6 +124,9 @@ class ServiceStatus(UntrustedReply):
     """The status of a service, from `bus.services()`.
 
     `service`: its id. `host`: the name of its host or container. `role`: "router" or "client".
+    `vehicle`: the vehicle whose key this status has; it contains nothing about other vehicles. A service has one
+    status for each of its vehicles. Empty for an older service, whose key names no vehicle: only its id, host and
+    version are shown, because any vehicle's certificate could have written the rest.
     `started`, `now`: seconds since the epoch by its clock.
     `refused`: vehicles whose messages the access rules of its router drop.
     Services may have any version: absent and invalid fields get their defaults.
@@ -117,6 +141,23 @@ class ServiceStatus(UntrustedReply):
     endpoints: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     sources: tuple[SourceStatus, ...] = ()
+    vehicle: str = ""
+
+    @property
+    def is_outdated(self) -> bool:
+        """True for an older service, whose reports are not used because its key names no vehicle."""
+        return not self.vehicle
+
+    def about(self, vehicle: str) -> ServiceStatus:
+        """Return what this status says about one vehicle, and about sources without a vehicle.
+
+        Addresses of vehicles that the router refuses are kept, because no other key can name them.
+        """
+        kept = {vehicle, *self.refused}
+        sources = (each.about(kept) for each in self.sources if not each.vehicles or vehicle in each.vehicles)
+        refused = (each.about(kept) for each in self.sources if each.vehicles and vehicle not in each.vehicles)
+        shown = (*sources, *(each for each in refused if each.vehicles))
+        return replace(self, vehicle=vehicle, sources=shown)
 
     def split(self, _: int) -> list[ServiceStatus]:
         """Split into one status per source, or omit the stream health of the only one; return [] if neither applies."""
@@ -132,25 +173,62 @@ def _status_type() -> TypeAdapter[ServiceStatus]:
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
-    """Query the status of all nedbus services; ignore oversized replies."""
-    found: dict[str, ServiceStatus] = {}
-    for key, content in parse_replies(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
-        if isinstance(content, dict):
-            part = replace(_status_type().validate_python(content), service=key.split("/")[-2])
-            found[key] = replace(part, sources=(*found[key].sources, *part.sources)) if key in found else part
+    """Query the status of all nedbus services; ignore oversized replies, and statements about other vehicles."""
+    found: dict[tuple[str | None, str], ServiceStatus] = {}
+    for vehicle, service, content in _find(session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout):
+        if not isinstance(content, dict):
+            continue
+        given = _status_type().validate_python(content)
+        if vehicle is None:
+            found[vehicle, service] = ServiceStatus(service=service, host=given.host, version=given.version)
+            continue
+        part = replace(given.about(vehicle), service=service)
+        known = found.get((vehicle, service))
+        sources = part.sources if known is None else (*known.sources, *part.sources)
+        found[vehicle, service] = replace(part, sources=sources)
     return list(found.values())
 
 
+def prefix_of(key: str) -> str:
+    """Return the prefix of the key of a message or of a publisher's token; "" if it has none, as in plain ROS 2."""
+    vehicle, alive, _ = key.partition("/@alive/")
+    before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
+    is_ros2_domain = bool(before) and before[0].isdecimal()  # `<domain>/fmu/out/vehicle_local_position`
+    return "" if is_ros2_domain else "/".join(before)
+
+
 def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
-    """Query all services for their event reports of the last `within` seconds; ignore invalid or oversized replies."""
+    """Query all services for their event reports of the last `within` seconds, one report per vehicle and service.
+
+    Ignores invalid and oversized replies, and statements about other vehicles than that of the key.
+    """
     from nedbus.events import ACCOUNT_PARAMETER, from_json, joined
 
-    selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
-    found: dict[str, list[AccountReport]] = {}
-    for key, content in parse_replies(query(session, selector, timeout=timeout)):
-        if (part := from_json(content)) is not None:
-            found.setdefault(key, []).append(part)
+    selector = f"{all_status_keys(prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
+    found: dict[tuple[str, str], list[AccountReport]] = {}
+    for vehicle, service, content in _find(session, selector, prefix=prefix, timeout=timeout):
+        part = from_json(content)
+        if vehicle is not None and part is not None:
+            found.setdefault((vehicle, service), []).append(replace(part.about(vehicle), service=service))
     return list(map(joined, found.values()))
+
+
+def _find(session: Session, selector: str, *, prefix: str, timeout: float) -> Iterator[tuple[str | None, str, object]]:
+    """Yield vehicle, service and content of each reply on a status key.
+
+    Beyond the limits of a query, the vehicle with the most replies loses some of them; no other vehicle does.
+    """
+
+    def vehicle_of(key: str) -> str:
+        return key.removeprefix(f"{prefix}/@service/").partition("/")[0]
+
+    for key, content in parse_replies(query(session, selector, timeout=timeout, group_of=vehicle_of)):
+        try:
+            vehicle, service = parse_status_key(key, prefix=prefix)
+        except AddressError:
+            _log.debug("%r: ignored a status with an invalid key", key[:_MAX_TEXT])
+        else:
+            yield vehicle, service, content
 
 
 def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:

@@ -40,6 +40,8 @@ _MAX_MEASURED: Final = 1000  # latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 _BATCH: Final = 32  # messages that wait to be measured together, which takes half the time of one after the other
 _MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
+_MAX_IRREGULAR: Final = 0.2  # share of intervals over three times or under a third of the usual one; more: on change
+_RECENT: Final = 60.0  # s after a reboot until a description no longer mentions it
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
 _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
@@ -61,7 +63,9 @@ class Health:
     `age`: seconds since the last message.
     `usual_rate`: smoothed rate so far [Hz]; a `rate` far below it means that the stream has become slow.
     `usual_interval`: median of the latest 15 arrival intervals [s], None before the fifth.
-    `on_change`: published on change only, so pauses and bursts are normal.
+    `on_change`: published on change only, so pauses and bursts are normal: by the topic's declaration or, if it has no
+    nominal rate, because over a fifth of the latest 15 intervals differ from the usual one more than threefold.
+    `reboot_age`: seconds since the last reboot, None before the first.
     For messages other than positions, `resets` is empty and flags are None.
     """
 
@@ -82,6 +86,7 @@ class Health:
     resets: dict[Quantity, int] = field(default_factory=dict)
     on_change: bool = False
     usual_interval: float | None = None
+    reboot_age: float | None = None
 
     @property
     def stale_after(self) -> float:
@@ -157,6 +162,8 @@ class StreamHealth:
         self._earlier = 0  # PX4's time before the last one
         self._steps = deque[int](maxlen=_USUAL)  # us between two messages
         self._usual_step = 0.0  # their median, updated every _USUAL messages and at a gap
+        self._is_regular = True  # by these steps, updated with their median
+        self._rebooted: int | None = None  # when the first message after the last reboot arrived
         self._intervals = deque[float](maxlen=_USUAL)  # s between arrivals
         self._usual_rate: float | None = None
         self._flags: _FlagCounts = Counter()
@@ -215,8 +222,8 @@ class StreamHealth:
             if latency is not None:
                 window.latencies.append(latency)
                 self._latencies.add(latency)
-        for each, absent in zip(values, missing, strict=True):
-            rebooted = self._add_time(int(each[0]))
+        for each, absent, arrived in zip(values, missing, received, strict=True):
+            rebooted = self._add_time(int(each[0]), arrived)
             if self._is_position:
                 self._add_position(each[1:_COUNTERS], each[_COUNTERS:], absent, rebooted=rebooted)
 
@@ -254,8 +261,12 @@ class StreamHealth:
     @property
     def stale_after(self) -> float:
         """As in Health."""
-        interval, topic = self.usual_interval, self._topic
-        return _stale_after(topic.rate, self._usual_rate, interval, on_change=topic.on_change)
+        interval = self.usual_interval
+        return _stale_after(self._topic.rate, self._usual_rate, interval, on_change=self._is_on_change)
+
+    @property
+    def _is_on_change(self) -> bool:
+        return self._topic.on_change or (not self._topic.rate and not self._is_regular)
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
@@ -281,8 +292,9 @@ class StreamHealth:
             flags_ever=_flag_shares(self._flags) if self._is_position and self._messages else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
-            on_change=self._topic.on_change,
+            on_change=self._is_on_change,
             usual_interval=self.usual_interval,
+            reboot_age=None if self._rebooted is None else (now - self._rebooted) / 1e9,
         )
 
     def _add_counters(self, counters: tuple[int | None, ...], missing: Collection[str], *, rebooted: bool) -> None:
@@ -293,33 +305,45 @@ class StreamHealth:
                 known[quantity] = count
         self._counters = known
 
-    def _add_time(self, timestamp: int) -> bool:
-        """Track PX4's time; return True for the first timestamp, and for one so far back that it means a reboot."""
+    def _add_time(self, timestamp: int, received: int) -> bool:
+        """Track PX4's time of a message that arrived at `received` [ns]; return whether its time restarts.
+
+        It does with the first timestamp, and with one so far back that it means a reboot.
+        """
         self._messages += 1
         last, steps = self._time, self._steps
         if last is None or timestamp < last:
-            return self._step_back(timestamp, last)
+            return self._step_back(timestamp, last, received)
         self._earlier, self._time, step = last, timestamp, timestamp - last
         is_gap = step > _FACTOR * self._usual_step > 0 and len(steps) >= _MIN_STEPS
-        self._gaps += is_gap and not self._topic.on_change
+        self._gaps += is_gap and not self._is_on_change
         steps.append(step)
         if is_gap or len(steps) < _USUAL or self._messages % _USUAL == 0:
             self._usual_step = median(steps)
+            if not self._topic.rate:
+                self._is_regular = _is_regular(steps, self._usual_step)
         return False
 
-    def _step_back(self, timestamp: int, last: int | None) -> bool:
+    def _step_back(self, timestamp: int, last: int | None, received: int) -> bool:
         step = None if last is None else timestamp - last
         if step is not None and step < -_REBOOT_STEP and 0 < timestamp - self._earlier <= _REBOOT_STEP:
             self._out_of_order, self._time = self._out_of_order + 1, timestamp  # only the time of the last was wild
             return False
         self._earlier = last or 0
         if step is None or step < -_REBOOT_STEP:
-            self._reboots += step is not None and self._topic.name != _QUEUED
+            if step is not None and self._topic.name != _QUEUED:
+                self._reboots, self._rebooted = self._reboots + 1, received
             self._time, self._usual_step = timestamp, 0.0
             self._steps.clear()
             return True
         self._out_of_order += 1
         return False
+
+
+def _is_regular(steps: Collection[int], usual: float) -> bool:
+    """Return whether these intervals are those of a periodic stream; `usual`: their median."""
+    outliers = sum(not usual / _FACTOR <= step <= usual * _FACTOR for step in steps)
+    return usual > 0 and outliers <= _MAX_IRREGULAR * len(steps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,23 +395,41 @@ def stream_state(health: Health, *, publishers: int | None = None, connected: bo
     usual = None if health.on_change else health.usual_rate
     if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
         reasons.append(f"{health.rate:.1f} Hz, usually {usual:.0f}")
-    if health.latency is not None and health.latency > _LATE:
+    is_current = health.age is None or health.age < TIMINGS.stale  # else it is the latency of an old message
+    if health.latency is not None and health.latency > _LATE and is_current:
         reasons.append(f"{format_duration(health.latency)} late, or clocks differ")
     return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")
 
 
 def describe_stream(health: Health, state: StreamState) -> str:
-    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
+    """Describe the faults of a stream (state, flags, gaps, order, recent reboots) in one line; "ok" if there are none.
+
+    A reboot is mentioned for 60 s.
+    """
     doubts = "ok" if health.flags is None else describe_flags(health.flags)
-    counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
+    is_recent = health.reboot_age is not None and health.reboot_age < _RECENT
+    reboots = health.reboots if is_recent else 0
+    counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (reboots, "reboots")
     events = [f"{n} {name.removesuffix('s' * (n == 1))}" for n, name in counts if n and state.name != "duplicate"]
     return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
 
 
-def health_of_last(sample: Sample[Message], *, age: float | None = None) -> Health:
-    """Return the health of a stream from its last message alone; its age is by default measured by the wall clock."""
+def health_of_last(sample: Sample[Message], *, age: float | None = None, measured: Health | None = None) -> Health:
+    """Return the health of a stream from its last message; its age is by default measured by the wall clock.
+
+    `measured`: its health as measured by the service that publishes it, from which the usual rate and interval are
+    taken; without it, a topic that has no nominal rate is never stale.
+    """
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
     if age is None:
         age = 0.0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent) / 1e9
-    return replace(stream.snapshot(0), age=age)
+    last = replace(stream.snapshot(0), age=age)
+    if measured is None:
+        return last
+    return replace(
+        last,
+        usual_rate=measured.usual_rate,
+        usual_interval=measured.usual_interval,
+        on_change=measured.on_change,
+    )

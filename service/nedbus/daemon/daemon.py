@@ -5,20 +5,19 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from nedbus import clock
-from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus, reply_parts
+from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
 from nedbus.errors import ConfigError, ConnectError
-from nedbus.events import ACCOUNT_PARAMETER, AccountReport, EventLog, report_of
+from nedbus.events import AccountReport, EventLog, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting, locate_source
 from nedbus.sources import ReplaySource, Source, parse_source
 from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
-from nedbus_msgs import status_key
 
+from .status_replies import StatusReplies
 from .worker import PlannedSource, SourceMeasures, Worker, stop_workers
 from .write_permission import WritePermission, watch_permission
 
@@ -85,6 +84,7 @@ class Daemon:
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
+        self._refused_at_end: list[str] = []  # vehicles of finite sources whose messages reached no reader
         self.event_log = EventLog(reader="service")
         # Random, because services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
@@ -164,12 +164,6 @@ class Daemon:
         event_log, host = self.update_events(), socket.gethostname()
         return report_of(event_log, self.id, host, clock.steady(), within=within, to_utc=clock.to_utc())
 
-    def _status_reply(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
-        within, seconds = parameter(ACCOUNT_PARAMETER), 0.0
-        with suppress(ValueError):
-            seconds = float(within or 0.0)
-        return reply_parts(self.status if within is None else self.report(within=seconds))
-
     def stop(self) -> None:
         """Stop `run`; safe to call from any thread and from signal handlers."""
         self._stop.set()
@@ -194,20 +188,32 @@ class Daemon:
         return f"{len(plan) - unchanged} started, {before - unchanged} stopped, {unchanged} unchanged"
 
     def run(self) -> bool:
-        """Publish until done or stopped; return False if a source failed; raise ListenError or ConfigError."""
+        """Publish until done or stopped; return False if a source failed, or the router refused what was published.
+
+        Raises ListenError or ConfigError.
+        """
         session = self._session = self._open()
         if session is None:
             return True
         settings, queries, is_client = self._settings, QueryServer(session), self.role == "client"
-        registry = PublisherRegistry(session, queries, prefix=settings.prefix, is_client=is_client)
+        replies = StatusReplies(
+            queries,
+            self.id,
+            prefix=settings.prefix,
+            status=lambda: self.status,
+            report=lambda within: self.report(within=within),
+        )
+        registry = PublisherRegistry(
+            session, queries, prefix=settings.prefix, is_client=is_client, on_vehicle=replies.add
+        )
         try:
-            queries.answer_json(status_key(self.id, prefix=settings.prefix), self._status_reply)
+            replies.add(settings.vehicle)  # reports sources that have not published a vehicle yet
             with self._workers_lock:
                 self._registry = registry
                 self._apply_plan(registry)
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
-            self._wait(registry, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
+            self._wait(registry, replies, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
         finally:
             self._stop.set()
             stop_workers(self._workers, _GRACE)
@@ -217,7 +223,7 @@ class Daemon:
             session.close()
             if self._permission is not None:
                 self._permission.close()
-        return not any(source.state == "failed" for source in self.sources)
+        return not self._refused_at_end and not any(source.state == "failed" for source in self.sources)
 
     def _apply_plan(self, registry: PublisherRegistry) -> int:
         """Stop removed sources and start new ones, in the order of the plan; return the number of unchanged sources."""
@@ -275,7 +281,7 @@ class Daemon:
                 logged = True
         return None
 
-    def _wait(self, registry: PublisherRegistry, uplinks: Uplinks) -> None:
+    def _wait(self, registry: PublisherRegistry, replies: StatusReplies, uplinks: Uplinks) -> None:
         """Wait for `stop`, or until all finite sources have ended and their messages are acknowledged."""
         while not self._stop.is_set():
             if self._settings.until_done:
@@ -285,8 +291,11 @@ class Daemon:
                     speeds = [each.source.options.speed for each in finite if isinstance(each.source, ReplaySource)]
                     self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
                     registry.flush(tuple(registry.publishers.values()), stop=self._stop)
+                    if self._permission is not None:
+                        self._refused_at_end = self._permission.decide()
                     return
             self._changed.wait(_POLL)
             self._changed.clear()
-            self.update_events()
+            for vehicle in list(self.update_events().vehicles):
+                replies.add(vehicle)
             uplinks.check()

@@ -118,7 +118,9 @@ class SourceOutput:
                 return stream
             stream.publisher.close()  # another layout, for example of new firmware
             stream.publisher = None
-        stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
+        stream.publisher = self._registry.publisher(
+            address, definition, lossless=lossless, short_history=True, source=self._kind
+        )
         return stream
 
     def release(self, *, keep: Container[Address] = ()) -> None:

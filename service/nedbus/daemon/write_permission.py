@@ -11,27 +11,25 @@ import random
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from typing import Final
 
 from nedbus.client import PublisherRegistry
-from nedbus.errors import ConnectError, NedbusError
+from nedbus.errors import NedbusError
 from nedbus.log_event import UnexpectedErrors, about
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, translate_zenoh_errors
+from nedbus.transport import CONFIRMED, Session, Tls, Verdict, probe_at_router, routers_of, secure_endpoints
 
 _log = logging.getLogger(__name__)
 
-_CONFIRMED: Final = 3  # consecutive denials that count as a refusal; a slow or restarting router causes fewer
 _GRACE: Final = 5.0  # s for the thread to end
 _MAX_NAMED: Final = 20  # vehicles named in a log line
 
 
 def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
     """Start the checks if the service uses a client certificate, else return None."""
-    endpoints = [endpoint for endpoint in settings.connect if endpoint.startswith(("tls/", "quic/"))]
-    if settings.tls is None or settings.tls.certificate is None or not endpoints:
+    endpoints = secure_endpoints(settings.connect, settings.tls)
+    if settings.tls is None or not endpoints:
         return None
 
     def vehicles() -> set[str]:
@@ -57,6 +55,7 @@ class WritePermission:
         self._prefix = prefix
         self._vehicles = vehicles
         self._stop = threading.Event()
+        self._checking = threading.Lock()
         self._denials: dict[str, int] = {}  # consecutive denials by vehicle; 0 if allowed, no entry if unknown
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
         self.start = self._thread.start
@@ -65,7 +64,14 @@ class WritePermission:
     def refused(self) -> dict[str, bool]:
         """Whether access rules deny each vehicle; vehicles whose permission is unknown are omitted."""
         known = self._denials.copy().items()
-        return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _CONFIRMED}
+        return {vehicle: number > 0 for vehicle, number in known if not 0 < number < CONFIRMED}
+
+    def decide(self) -> list[str]:
+        """Check until each vehicle is known to be accepted or refused, or cannot be told; return the refused ones."""
+        for _ in range(CONFIRMED):
+            if self.check() != TIMINGS.probe_confirm:
+                break
+        return sorted(vehicle for vehicle, refused in self.refused.items() if refused)
 
     def close(self) -> None:
         """Stop the thread; close the session first to abort a running check."""
@@ -73,14 +79,14 @@ class WritePermission:
         self._thread.join(_GRACE)
 
     def _run(self) -> None:
-        due, routers, vehicles = 0.0, set[str](), set[str]()
+        due, routers, vehicles = 0.0, frozenset[str](), set[str]()
         errors = UnexpectedErrors(_log, "unexpected error while probing the write permission (logged once)")
         while not self._stop.wait(TIMINGS.probe_poll):
             now, last_routers, last_vehicles = time.monotonic(), routers, vehicles
             with errors:
-                routers, vehicles = _routers_of(self._session), self._vehicles()
+                routers, vehicles = routers_of(self._session), self._vehicles()
                 if routers != last_routers:
-                    self._denials = {vehicle: _CONFIRMED * refused for vehicle, refused in self.refused.items()}
+                    self._denials = {vehicle: CONFIRMED * refused for vehicle, refused in self.refused.items()}
                     due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
                 elif vehicles - last_vehicles:
                     due = min(due, now + TIMINGS.probe_first[0])
@@ -90,6 +96,10 @@ class WritePermission:
 
     def check(self) -> float:
         """Check once, and return the time until the next check [s]."""
+        with self._checking:
+            return self._check()
+
+    def _check(self) -> float:
         vehicles = self._vehicles()
         verdicts: Mapping[str, Verdict] = {}
         try:
@@ -115,31 +125,15 @@ class WritePermission:
             _log.warning(text, _list_vehicles(new), self._tls.certificate, extra=about("access_denied"))
         if accepted := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
             _log.info("the router now accepts messages of %s", _list_vehicles(accepted), extra=about("access_granted"))
-        if any(verdict == "denied" and self._denials[vehicle] < _CONFIRMED for vehicle, verdict in verdicts.items()):
+        if any(verdict == "denied" and self._denials[vehicle] < CONFIRMED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
         return TIMINGS.probe_pause if set(verdicts.values()) == {"allowed"} else TIMINGS.probe_unsure
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
         """Return the verdict for each vehicle, or no verdicts if the two sessions share no router."""
-        routers = _routers_of(self._session)
-        for endpoint in self._endpoints if vehicles else ():
-            try:
-                reader = open_client([endpoint], timeout=TIMINGS.probe_open, tls=self._tls, stop=self._stop)
-            except ConnectError:
-                continue
-            with reader:
-                if not (shared := _routers_of(reader)) or not shared <= routers:
-                    continue
-                verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
-                # A missing probe message means a denial only if no link was lost during the check.
-                return verdicts if _routers_of(reader) == shared and _routers_of(self._session) == routers else {}
-        return {}
-
-
-def _routers_of(session: Session) -> set[str]:
-    with suppress(NedbusError), translate_zenoh_errors():
-        return {str(zid) for zid in session.info.routers_zid()}
-    return set()
+        return probe_at_router(
+            self._session, self._endpoints, vehicles, tls=self._tls, prefix=self._prefix, stop=self._stop
+        )
 
 
 def _list_vehicles(vehicles: Sequence[str]) -> str:

@@ -1,7 +1,7 @@
 """Finding of a check: its subject, the subject's state, the observation and advice."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
 State = Literal["ok", "unknown", "warning", "wrong"]
@@ -21,7 +21,8 @@ class Finding:
     """The result of a check on one subject.
 
     `check`: name of the check in docs/doctor.md, such as `endpoint`.
-    `subject`: an endpoint, address or file; "" for the whole network.
+    `subject`: an endpoint, address or file, or several with equal findings, of which the first five are listed;
+    "" for the whole network.
     `seen`: the observation; `advice`: the remedy, "" if none is needed.
     Both may contain text from peers: escape them before printing.
     """
@@ -44,13 +45,21 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def limit_findings(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the worst findings of a check, preceded by a finding that states the number of the others."""
-    ordered = sort_findings(findings)
+    """Merge equal findings of a check, and return the worst, preceded by one that states the number of the others."""
+    ordered = sort_findings(_merge_equal(findings))
     rest, kept = ordered[:-_MAX_FINDINGS], ordered[-_MAX_FINDINGS:]
     if rest:
         text = f"{len(rest)} more finding{'s' * (len(rest) > 1)} of this check"
         kept.insert(0, Finding(kept[0].check, "", worst_state(rest), text))
     return kept
+
+
+def _merge_equal(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings that differ only in their subjects as one, which lists the subjects."""
+    subjects: dict[Finding, list[str]] = {}
+    for finding in findings:
+        subjects.setdefault(replace(finding, subject=""), []).append(finding.subject)
+    return [replace(finding, subject=list_names(names)) for finding, names in subjects.items()]
 
 
 def brief(value: object) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import SourceStatus
+from nedbus.client import ServiceStatus, SourceStatus, prefix_of
 from nedbus.events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
@@ -70,10 +70,23 @@ def _check_reading(seen: Observation) -> Finding:
 
 
 def check_services(seen: Observation) -> Iterator[Finding]:
-    """Yield findings on the version and the sources of each service."""
+    """Yield findings on the version and the sources of each service; it has a status for each of its vehicles."""
+    known: list[Finding] = []
+    for finding in _check_statuses(seen):
+        if finding not in known:
+            known.append(finding)
+            yield finding
+
+
+def _check_statuses(seen: Observation) -> Iterator[Finding]:
     for service in seen.services:
         name = brief(service.service)
         version = brief(service.version or "unknown")
+        if service.is_outdated:
+            where = brief(service.host or "an unknown host")
+            text = f"nedbus {version} on {where}: its status does not name its vehicle, and is not used"
+            yield Finding("service", name, "wrong", text, "update nedbus on its host")
+            continue
         if version.split(".")[:2] != seen.version.split(".")[:2]:
             advice = "install the same version on both sides; CHANGELOG.md lists changes of the wire format"
             text = f"the service runs nedbus {version}, this client {seen.version}"
@@ -156,16 +169,43 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission
         advice = "check that the router's access rules allow that service to write this vehicle (docs/security.md)"
-        yield Finding("vehicle", each, "wrong", "reported as published by a service, but no message arrives", advice)
+        text = f"reported as published by {list_names(_publishers_of(seen, each))}, but no message arrives"
+        yield Finding("vehicle", each, "wrong", text, advice)
     if flowing := [address for address in known if address in arrived]:
         vehicles = {address.vehicle for address in flowing}
         yield Finding("vehicle", "", "ok", f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}")
     if not known and not hidden:
-        advice = "see the findings on sources" if seen.services else "start its source: 'nedbus serve --source ...'"
-        if others := sorted({each.vehicle for each in {*seen.alive, *arrived}}):
-            advice += f"; published: {', '.join(others[:20])}"
-        text = f"{'no vehicle' if vehicle is None else 'not'} found under {seen.prefix}/"
-        yield Finding("vehicle", vehicle or "", "warning" if vehicle is None else "wrong", text, advice)
+        yield _missing_vehicle(seen)
+
+
+def _missing_vehicle(seen: Observation) -> Finding:
+    """Return the finding that the selected vehicle, or any, is not published."""
+    vehicle = seen.vehicle
+    advice = "start its source: 'nedbus serve --source ...'"
+    if any(finding.state != "ok" for source in seen.sources for finding in _check_source(source)):
+        advice = "see the findings on sources"
+    elif seen.services:
+        names = list_names(map(_name_of, seen.services))
+        advice = f"no source of {names} receives it: check the name, or start its source there"
+    if others := sorted({each.vehicle for each in {*seen.alive, *seen.delays}}):
+        advice += f"; published: {', '.join(others[:20])}"
+    if vehicle is None:
+        return Finding("vehicle", "", "warning", f"no vehicle found under {seen.prefix}/", advice)
+    return Finding("vehicle", vehicle, "wrong", f"not found under {seen.prefix}/", advice)
+
+
+def _name_of(service: ServiceStatus) -> str:
+    return f"service {brief(service.service)} on {brief(service.host or 'an unknown host')}"
+
+
+def _publishers_of(seen: Observation, address: str) -> list[str]:
+    """Return the services that report this address as published, with their hosts and sources."""
+    return [
+        f"{_name_of(service)} ({brief(source.source)})"
+        for service in seen.services
+        for source in service.sources
+        if address in source.addresses
+    ]
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
@@ -183,7 +223,12 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
         yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {error[:_MAX_TEXT]}", advice)
     if (publishers := seen.alive[address]) > 1:
         advice = "readers receive a mixture of their messages: stop all but one, or give each its own --vehicle"
-        yield Finding("vehicle", name, "wrong", f"{publishers} publishers of this address", advice)
+        text = f"{publishers} publishers of this address"
+        if services := _publishers_of(seen, name):
+            text = f"{text}: {list_names(services)}"
+            if publishers > len(services):
+                text = f"{text}, and {publishers - len(services)} that no service reports, such as a script"
+        yield Finding("vehicle", name, "wrong", text, advice)
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:
@@ -219,12 +264,7 @@ def _clock_finding(name: str, clock: str, offset: float, reference: str, advice:
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
     """Yield other prefixes and ROS 2 topics, which readers of this prefix do not receive."""
-    prefixes = set()
-    for key in seen.elsewhere:
-        vehicle, alive, _ = key.partition("/@alive/")
-        before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
-        if before and not before[0].isdecimal():  # `<domain>/fmu/out/vehicle_local_position` is a ROS 2 topic
-            prefixes.add("/".join(before))
+    prefixes = {prefix_of(key) for key in seen.elsewhere}
     for prefix in sorted(prefixes - {""})[:5]:
         advice = f"use --prefix {prefix} or NEDBUS_PREFIX={prefix} to read them, or correct the publisher's prefix"
         text = f"messages are published under {prefix}/, but the prefix here is {seen.prefix}/"

@@ -12,7 +12,7 @@ from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import UNKNOWN_CA, Tls, check_pem, open_client, split_endpoint
+from nedbus.transport import UNKNOWN_CA, Tls, check_pem, open_client, read_certificate, split_endpoint
 
 from .finding import Finding, brief, worst_state
 
@@ -43,7 +43,7 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
     try:
         open_client([endpoint], timeout=TIMINGS.doctor_open, tls=tls).close()
     except NedbusError:
-        if protocol == "tcp" and _read_certificate(host, port):
+        if protocol == "tcp" and read_certificate(host, port, TIMINGS.handshake):
             seen, advice = "it speaks TLS", "use tls/ instead of tcp/, with --tls-ca and a client certificate if needed"
         else:
             seen = "cannot open a Zenoh session"
@@ -81,7 +81,7 @@ def reach_endpoint(endpoint: str) -> Finding | None:
 
 def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | None) -> Iterator[Finding]:
     """Yield the validity of the router's certificate, and a finding if either side rejects the other's."""
-    pem = _read_certificate(host, port)
+    pem = read_certificate(host, port, TIMINGS.handshake)
     if not pem:
         seen, advice = "it does not speak TLS", "use tcp/ instead of tls/, or the endpoint of a Zenoh router with TLS"
         yield Finding("endpoint", endpoint, "wrong", seen, advice)
@@ -117,13 +117,6 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
         seen = next(text for name, text in _ALERTS.items() if name in (exc.reason or ""))
         advice = "use --tls-certificate and --tls-key with a certificate signed by the router's CA"
         yield Finding("tls", endpoint, "wrong", f"the router refuses this client: {seen}", advice)
-
-
-def _read_certificate(host: str, port: int) -> str:
-    """Return a server's certificate in PEM, without verifying it; "" if the server does not speak TLS."""
-    with suppress(OSError):  # also catches SSLError
-        return ssl.get_server_certificate((host, port), timeout=TIMINGS.handshake)
-    return ""
 
 
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:

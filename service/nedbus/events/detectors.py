@@ -189,31 +189,39 @@ class AidDetector(ChangeDetector):
 
 
 class VisionDetector(ChangeDetector):
-    """Detector for positions sent into the vehicle that its EKF does not fuse at all.
+    """Detector for positions sent into the vehicle that its EKF does not fuse at all, by PX4's timestamps alone.
 
-    `is_fused`: returns whether the EKF fuses any vision, None if unknown, and since when it says so [us].
+    `is_fused`: returns whether the EKF fuses any vision, None if unknown, and PX4's time of this state [us].
     """
 
     def __init__(self, is_fused: Callable[[], tuple[bool | None, int]]) -> None:
         super().__init__((), (), detect_nothing)
         self._is_fused = is_fused
-        self.since = 0  # first message that was not fused [us]
         self.is_unused = False
+        self._arriving = 0  # first message after a pause [us]
+        self._refused = 0  # first flags that say that no vision is fused [us]
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         super().reset()
-        self.since, self.is_unused = 0, False
+        self.is_unused = False
+        self._arriving = self._refused = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding]:
         """Return the findings in a message."""
         super().add(message, missing)
+        if not self._arriving or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
+            self._arriving = self.stamp
         is_fused, stamp = self._is_fused()
-        if is_fused is not False:
-            return self._end("the EKF fuses vision", age=max(0, self.stamp - stamp) / 1e6)
-        if not self.since or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
-            self.since = self.stamp
-        return self._begin((self.stamp - self.since) / 1e6)
+        if is_fused is None:
+            return self._end("unknown whether the EKF fuses vision")
+        if is_fused and stamp <= self.stamp:  # otherwise the flags are ahead of the vision
+            return self._end("the EKF fuses vision", age=(self.stamp - stamp) / 1e6)
+        if not is_fused and not self._refused:
+            self._refused = stamp
+        if not self._refused:
+            return iter(())
+        return self._begin((self.stamp - max(self._arriving, self._refused)) / 1e6)
 
     def stop(self) -> Iterator[Finding]:
         """Return the end of the condition when messages no longer arrive."""
@@ -225,7 +233,7 @@ class VisionDetector(ChangeDetector):
             yield Finding("vision_unused", "begin", "vision arrives, but the EKF does not fuse it", age=age)
 
     def _end(self, text: str, *, age: float = 0.0) -> Iterator[Finding]:
-        self.since = 0
+        self._refused = 0
         if self.is_unused:
             self.is_unused = False
             yield Finding("vision_unused", "end", text, age=age)

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import TOPICS, check_vehicle
 
-from .event import Condition, Event, Seconds
+from .event import ALL, Condition, Event, Seconds
 from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .kinds import KINDS, rank_vehicle
 
@@ -30,7 +30,7 @@ class VehicleReport:
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
     `unknown`: flags that its position does not provide. `kinds`: kinds of all active conditions.
-    `first`: time of the first message that the service received, None if unknown.
+    `first`: time of the first position that the service received, else of the first message; None if unknown.
     """
 
     severity: Literal["bad", "watch", "info"]
@@ -63,6 +63,13 @@ class AccountReport:
     now: Seconds
     vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=MAX_VEHICLES)]
     events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
+
+    def about(self, vehicle: str) -> AccountReport:
+        """Return what this report says about one vehicle; events of the link and the reader become its events."""
+        vehicles = {name: each for name, each in self.vehicles.items() if name == vehicle}
+        events = (each for each in self.events if each.vehicle in (vehicle, ALL))
+        own = tuple(each if each.vehicle == vehicle else replace(each, vehicle=vehicle) for each in events)
+        return replace(self, vehicles=vehicles, events=own)
 
     def split(self, number: int) -> list[AccountReport]:
         """Split the report into `number` parts; [] if it has at most one vehicle and one event."""

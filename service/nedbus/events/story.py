@@ -36,8 +36,13 @@ class Span(Condition):
 
     def holds(self, time: float) -> bool:
         """Return True if the condition is active at `time`, or the single event is recent."""
-        until = math.inf if self.until is None else self.until + RECENT * (self.until == self.since)
-        return self.since <= time < until
+        if self.until is not None and self.until == self.since:
+            return self.since <= time < self.until + RECENT
+        return self.is_active(time)
+
+    def is_active(self, time: float) -> bool:
+        """Return True if the condition is active at `time`; a single event never is."""
+        return self.since <= time and (self.until is None or time < self.until)
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,11 +275,7 @@ def _text_of(group: Sequence[Span]) -> str:
 
 def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> list[Event]:
     """Return the possible causes of a condition; without any, all other starts of the ten seconds before it."""
-    held = [
-        other
-        for other in spans
-        if (other.initial or not span.initial) and other.since <= span.since < (other.until or math.inf)
-    ]
+    held = [other for other in spans if (other.initial or not span.initial) and other.is_active(span.since)]
     if span.initial:
         return explain(span.begin, (), held)
     recovered = {

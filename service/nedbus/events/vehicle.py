@@ -39,7 +39,7 @@ _GROUPS: Final = (rules.POSITIONS, rules.EVIDENCE["GPS"])
 _EVIDENCE_OF: Final = {topic: name for name, topics in rules.EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = FieldReader(_SAMPLE)
-_read_vision: Final = FieldReader(("cs_ev_pos", "cs_ev_vel", "cs_ev_hgt", "cs_ev_yaw"))
+_VISION_FLAGS: Final = ("cs_ev_pos", "cs_ev_vel", "cs_ev_hgt", "cs_ev_yaw")
 _NEW: Final = ChangeDetector((), (), detectors.detect_nothing)  # in place of the detector of a new stream
 
 
@@ -51,7 +51,7 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
     `usual`: those of `usual` kinds, active since the first messages; they belong to the flight and affect no state.
     `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
-    `first`: time of the first message on the event log's clock [s].
+    `first`: time of the first position, or without one of the first message, on the event log's clock [s].
     `last_seen`: time of the last message on the event log's clock [s], or of the last update with a live publisher.
     `time`: time of the last message with a detector [s]. `boot`: the time since boot in it [s].
     `recent`: recent events, searched for evidence.
@@ -85,6 +85,7 @@ class Vehicle:
         self._suppressed: Counter[tuple[str, object]] = Counter()  # number of suppressed events, by the same keys
         self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
         self._ekf = 0  # instance of the primary EKF
+        self._vision: tuple[bool | None, int] = (None, 0)  # whether it fuses vision, None if unknown; since when [us]
         self._position: PositionDetector | None = None  # of `main`
         self._comparison = Comparison()
         self._supplies: dict[str, _Supply] = {}  # by key of EVIDENCE
@@ -118,6 +119,8 @@ class Vehicle:
         elapsed = time - self.time
         self._set_boot(stamp / 1e6, time, is_queued=is_queued)
         if type(detector) is PositionDetector:  # of `main`
+            if math.isinf(self._main_time):
+                self.first = time
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
@@ -152,15 +155,18 @@ class Vehicle:
             if time - burst.end <= rules.PAUSE and (kind != "lost" or time - burst.begin <= rules.MAX_BURST):
                 continue
             del self._bursts[kind]
-            messages, numbers = f"{burst.count} message{'s' * (burst.count > 1)}", {"messages": burst.count}
+            messages = f"{burst.count} message{'s' * (burst.count > 1)}"
+            numbers: dict[str, float] = {"messages": burst.count}
             if kind == "lost":
                 names = tuple(sorted(burst.topics - {""}))
                 streams = ", ".join(names)
                 if "" in burst.topics:
                     messages = f"about {messages}"
                     streams = f"{streams} and the ULog stream" if streams else "the ULog stream"
-                text = f"{messages} lost ({streams})"
-                self.emit(Finding(kind, "once", text, names, numbers), "", burst.begin)
+                duration = burst.end - burst.begin
+                within = f" in {format_duration(duration)}" if duration >= 1 else ""
+                text = f"{messages} lost{within} ({streams})"
+                self.emit(Finding(kind, "once", text, names, numbers | {"duration": duration}), "", burst.begin)
             elif kind == "rejected":
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
             else:
@@ -234,12 +240,8 @@ class Vehicle:
                         self.emit(found, address.topic, self._main_time - silence)
 
     def _is_vision_fused(self) -> tuple[bool | None, int]:
-        """Return whether the primary EKF fuses any vision, None if unknown, and the time of this state [us]."""
-        detector = self._detectors.get(Address(self.name, _EKF, self._ekf))
-        if detector is None or detector.last is None:
-            return None, 0
-        flags = [flag for flag in _read_vision(detector.last) if flag is not None]
-        return any(flags) if flags else None, detector.stamp
+        """Return whether the primary EKF fuses any vision, None if unknown, and since when [us]."""
+        return self._vision
 
     def state(self, time: float) -> State:
         """Return the current state, set by active and flapping conditions and single events of the last minute."""
@@ -420,8 +422,16 @@ class Vehicle:
             own = *own[:2], partial(self._detect_flags, instance, own[2])
         return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
 
-    def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
-        return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
+    def _detect_flags(
+        self, instance: int, detect: detectors.Detect, before: Fields, after: Fields
+    ) -> Iterator[Finding]:
+        if instance != self._ekf:
+            return detectors.detect_unused(instance, before, after)
+        flags = [after[name] for name in _VISION_FLAGS if after[name] is not None]
+        is_fused = any(flags) if flags else None
+        if is_fused != self._vision[0]:
+            self._vision = is_fused, after["timestamp"]
+        return detect(before, after)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
         """Without EKF_SELECTOR: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
@@ -438,6 +448,7 @@ class Vehicle:
         old, self._ekf = self._ekf, instance
         if old == instance:
             return
+        self._vision = None, 0
         stream, message = Address(self.name, _EKF, instance), BY_TOPIC[_EKF].name
         self._end(stream, lambda kind, flag: KINDS[kind].message == message or flag.startswith(f"{instance}:"))
         for each in (old, instance):
@@ -500,11 +511,12 @@ class Vehicle:
             detector.reset()
         self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
         self.armed = None
+        self._vision = None, 0
         self.usual.clear()
         self._invalid = -math.inf
         last, self._rebooted = self._rebooted, time
         if time - last >= rules.PAUSE and ("duplicate", "") not in self.conditions:
-            text = f"reboot: time since boot is {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
+            text = f"reboot (up for {self.boot or 0.0:.1f} s, before it for {before / 1e6:.1f} s)"
             self.emit(Finding("reboot", "once", text, numbers={"before": before / 1e6}), "", time)
 
     def _report(self, event: Event) -> None:

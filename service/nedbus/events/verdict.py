@@ -131,7 +131,7 @@ def verdict_of(
     `events`: events in chronological order; only those of this vehicle and of ALL are used. `held`: conditions active
     after the last event. `topics`: published topics. `unknown`: flags that its position does not provide.
     `end`: now, or the end of the file, on the event log's clock [s]. `at`: the time in question, None for all.
-    `since`: time of the first message, if it is not the start of a file.
+    `since`: time of the first position in live data, None if unknown.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     held = list(held)
@@ -146,7 +146,8 @@ def verdict_of(
     worst = ranked[0]
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and worst not in past and is_then else known
-    head = _head(worst, stories, times, since, is_past=worst in past, usable=usable)
+    valid_since = _valid_since(events, since)
+    head = _head(worst, stories, times, valid_since, is_past=worst in past, usable=usable)
     if not is_then:
         head = "no fault at that time; nearest: "
     cause, ordered = _evidence(worst, stories, events)
@@ -172,22 +173,35 @@ def _without_faults(held: Iterable[Condition], times: Times, end: float, since: 
     return text
 
 
+def _valid_since(events: Iterable[Event], first: float | None) -> float | None:
+    """Return since when the position is valid: from the first one on, or the end of an initial invalid estimate."""
+    if first is None:
+        return None
+    ends = [event.time for event in events if KINDS[event.kind].validity and event.change == "end"]
+    return max([first, *ends])
+
+
 def _head(
     worst: Story, stories: Iterable[Story], times: Times, since: float | None, *, is_past: bool, usable: bool | None
 ) -> str:
-    """Return the words before the worst fault: whether the position is valid, and since when."""
+    """Return the words before the worst fault: whether the position is valid, and `since` when, None if unknown."""
     of_estimate = [story for story in stories if story.is_bad and story.spans[0].is_of_estimate]
     if worst.is_bad and worst in of_estimate:
         return "was not usable: " if is_past else "not usable: "
     if worst.is_bad or not usable:
         return ""
-    if any(story.in_flight for story in of_estimate):
-        return "position valid now, but "
-    if of_estimate:
-        return "position valid in flight, but "
-    if times.is_live and since is not None:
-        return f"position valid since {times.text_at(since)} UTC, but "
-    return "position valid throughout, but "
+    return f"position valid {_when_valid(of_estimate, times, since)}, but "
+
+
+def _when_valid(faults: Sequence[Story], times: Times, since: float | None) -> str:
+    """Return when the position is valid; `faults`: the bad ones of the estimate."""
+    if any(story.in_flight for story in faults):
+        return "now"
+    if faults:
+        return "in flight"
+    if not times.is_live:
+        return "throughout"
+    return "now" if since is None else f"since {times.text_at(since)} UTC"
 
 
 def _evidence(worst: Story, stories: Sequence[Story], events: Sequence[Event]) -> tuple[tuple[Event, ...], list[Event]]:

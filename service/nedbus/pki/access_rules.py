@@ -36,7 +36,8 @@ _KEYS: Final = (
     "{p}/{v}/@doctor/*",
     "{p}/@schema/{v}/*",
     "{p}/@rejected/{v}/**",
-    "{p}/@service/*/status",
+    "{p}/@service/{v}/*/status",
+    "{p}/@service/*/status",  # of older services: readers use only its id, host and version
 )
 
 

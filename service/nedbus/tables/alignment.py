@@ -11,7 +11,8 @@ import numpy.typing as npt
 from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.flights import UtcOffset, utc_of
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion, is_unix_time
-from nedbus_msgs.arrays import MessageArray
+from nedbus_msgs.arrays import MessageArray, derive_column
+from nedbus_msgs.frames import DERIVED, derived_from
 
 from .arrays import Library, Pandas, Polars, Streams, missing_of, to_dataframe
 from .reading import FlightPath, read_streams
@@ -63,7 +64,8 @@ def align(
     """Return several streams of one or more files, or arrays from `read`, as one table, aligned in time.
 
     `topics`, `layout`: as in `read`; by default all topics known to nedbus.
-    `fields`: the columns in addition to `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".
+    `fields`: the columns in addition to `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age";
+    also quantities of `nedbus.frames.DERIVED`, such as "height" or "roll", which are NaN while they are invalid.
     `on`: the rows of the table: the messages of a stream, a rate [Hz], or times on the clock of PX4's `timestamp` [us].
     Columns are `timestamp` [us], and for each stream `<stream>.<field>` and `<stream>.age` [s], the time since the
     message with these values. Before the first message the age is NaN, floats are NaN, and other values 0 or false.
@@ -93,11 +95,10 @@ def align(
         wanted = names if topics else None
         streams, start, offset = read_streams(flight, wanted, vehicle=vehicle, layout=layout, utc=utc)
     if isinstance(on, str):
-        found = [name for name in streams if f"/{name}".endswith(f"/{on}")]
-        if not found:
-            expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
-            raise ArgumentError("on", on, expected, problem="is not in this flight")
-        on, *_ = reference = found[:1]  # the first vehicle with this stream
+        if not _streams_named(on, streams) and not isinstance(flight, Mapping):  # not a topic known to nedbus
+            streams |= read_streams(flight, [on], vehicle=vehicle, layout=layout).streams
+        on = _first_named(on, streams)
+        reference = [on]
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
@@ -107,6 +108,7 @@ def align(
             offset = utc_of({name: messages for name, (messages, _) in streams.items()})
         columns["utc"] = _to_utc(times, offset)
     absent: dict[str, npt.NDArray[np.bool_]] = {}
+    requested = {field.rpartition(".")[2] for field in fields or ()}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
         values, is_absent = _pick(messages, rows), rows < 0
@@ -116,6 +118,9 @@ def align(
         for field in messages.dtype.names or ():
             columns[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else is_absent
+        for field in requested.intersection(derived_from(messages.dtype.names or ())):
+            columns[f"{name}.{field}"] = derive_column(values, field)  # from interpolated values
+            absent[f"{name}.{field}"] = is_absent
     columns = columns if fields is None else _choose(columns, fields)
     lacked = {f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages)}
     missing = tuple(each for each in columns if each in lacked)
@@ -124,6 +129,19 @@ def align(
     for name, column in columns.items():
         table[name] = column
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
+
+
+def _streams_named(name: str, streams: Streams) -> list[str]:
+    return [each for each in streams if f"/{each}".endswith(f"/{name}")]
+
+
+def _first_named(name: str, streams: Streams) -> str:
+    """Return the stream of the first vehicle that has one of this name; raise ArgumentError if none has."""
+    named = _streams_named(name, streams)
+    if not named:
+        expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
+        raise ArgumentError("on", name, expected, problem="is not in this flight")
+    return named[0]
 
 
 def _choose_streams(arrays: Mapping[str, MessageArray], topics: Sequence[str] | None, names: Sequence[str]) -> Streams:
@@ -141,7 +159,9 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
     """Return the time columns and those that `fields` selects; raise ArgumentError for an unknown field."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):
-        raise ArgumentError("fields", sorted(unknown), f"any of {', '.join(columns)}", problem="are in no stream")
+        raise ArgumentError(
+            "fields", sorted(unknown), f"any of {', '.join([*columns, *DERIVED])}", problem="are in no stream"
+        )
     return {name: column for name, column in columns.items() if name in {"timestamp", "utc"} or known[name] & {*fields}}
 
 
@@ -189,7 +209,10 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
         unit = definition.meaning(name) if definition else ""
         period = next((each for text, each in _PERIODS.items() if text in unit), np.inf)
         find = _slerp if name in quaternions else _linear
-        values[name][between] = np.where(first == second, first, find(first, second, parts, period))
+        is_same = first == second
+        if name in quaternions:  # one equal element does not keep its value on the arc
+            is_same = is_same.all(axis=1, keepdims=True)
+        values[name][between] = np.where(is_same, first, find(first, second, parts, period))
 
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:

@@ -34,8 +34,11 @@ def missing_of(messages: MessageArray) -> frozenset[str]:
 
 
 def addresses_of(path: str | Path) -> list[Address]:
-    """Return the addresses in a .ulg log, an .mcap recording or a .tlog; raises the errors of `read`."""
-    with open_reader(Path(path).expanduser()) as reader:
+    """Return the addresses of all streams in a .ulg log, an .mcap recording or a .tlog; raises the errors of `read`.
+
+    It includes messages that only the file defines.
+    """
+    with open_reader(Path(path).expanduser(), ReadOptions(topics=None)) as reader:
         for _ in reader.runs():
             pass
         return sorted(reader.definitions)
@@ -116,7 +119,10 @@ class FlightArrays:
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
-    """Convert a structured array to a data frame with nulls for absent fields; without a library, return the array."""
+    """Convert a structured array to a data frame with nulls for absent fields; without a library, return the array.
+
+    uint64 becomes int64, because the difference of two times may be negative; see `_to_signed`.
+    """
     if library is None:
         return messages
     if library not in ("pandas", "polars"):
@@ -127,8 +133,10 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
         values = messages[name]
         parts = [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
         for part, each in zip(parts, values.reshape(len(values), len(parts)).T, strict=True):
-            is_text = each.dtype.kind == "S"
-            column = package.Series(list(map(decode_text, each.tolist())) if is_text else np.ascontiguousarray(each))
+            if each.dtype.kind == "S":
+                column = package.Series(list(map(decode_text, each.tolist())))
+            else:
+                column = package.Series(np.ascontiguousarray(_to_signed(each)))
             if each.dtype.kind == "M":
                 zoned = column.dt.tz_localize if library == "pandas" else column.dt.replace_time_zone
                 column = zoned("UTC")
@@ -142,3 +150,11 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
     if library == "pandas":
         data.attrs["missing"] = sorted(missing_of(messages))
     return data
+
+
+def _to_signed(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Convert uint64 to int64, larger values to 2^63 - 1: a negative difference of uint64 wraps to about 2^64."""
+    if values.dtype != np.uint64:
+        return values
+    signed: npt.NDArray[np.int64] = np.minimum(values, np.uint64(2**63 - 1)).astype(np.int64)
+    return signed

@@ -1,4 +1,4 @@
-"""Plot of a log or recording: track, altitude, speed, flags over time, resets, and events."""
+"""Plot of a log or recording: track, height, speed, flags over time, resets, and events."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ _MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
     "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
 }  # fmt: skip
 _LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
+_LEGEND_TOP: Final = -0.1  # in heights of the track, below its axis label
 _STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21_600)  # s between ticks
 _TICKS: Final = 6  # on a time axis
 _BOOT: Final = Times()
@@ -79,7 +80,7 @@ def draw(streams: _Arrays, path: Path, *, title: str, events: Iterable[Event] = 
 
     Each stream must have at least one message.
     The time axis shows UTC if `times` has it for all vehicles, else seconds since boot.
-    Positions are local NED in metres; altitude is -z.
+    Positions are local NED in metres; height is -z.
     Fields named by `missing_of` are not plotted; a note lists them.
     `events`: events of severity bad or watch, mode changes, arming and landing of plotted vehicles are marked.
 
@@ -117,7 +118,8 @@ def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), t
     _draw_flags(axes["flags"], rows)
     by_time = sorted((mark for own in marks.values() for mark in own), key=lambda mark: mark.begin)
     _mark_events(axes, drawn, by_time)
-    axes["track"].legend(fontsize="small", loc="best")
+    # Below the label of the axis; inside the axes it would cover the track.
+    axes["track"].legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, _LEGEND_TOP))
     seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in by_time)])
     margin = 0.02 * (np.ptp(seconds) or 1.0)
     axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
@@ -165,8 +167,8 @@ def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None
     axes["track"].set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
     axes["track"].locator_params(axis="x", nbins=6)  # more labels may overlap
     axes["track"].set_title("track; circle: start, square: end, thin: xy invalid")
-    title = "altitude; thin: z invalid, dashed: z or vz reset"
-    axes["altitude"].set(ylabel="altitude above origin, -z [m]", title=title)
+    title = "height; thin: z invalid, dashed: z or vz reset"
+    axes["altitude"].set(ylabel="height above origin, -z [m]", title=title)
     axes["speed"].set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
     for name in ("track", "altitude", "speed"):
         axes[name].grid(alpha=0.3)

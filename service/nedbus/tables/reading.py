@@ -78,7 +78,8 @@ def read(
     Fields that a layout or source lacks are NaN, false or 0; `nedbus.missing_of` names them.
     Invalid messages and damaged parts of the file are skipped and logged.
     `dataframe`: return a pandas or polars data frame, with array fields as columns `delta_xy[0]`, `delta_xy[1]` and
-    nulls for missing fields; a pandas data frame names these in `attrs["missing"]`.
+    nulls for missing fields; a pandas data frame names these in `attrs["missing"]`. Its uint64 fields, such as
+    `timestamp`, are int64, so that differences may be negative; values above 2^63 - 1 become 2^63 - 1.
     A list of topics, or of streams such as "sensor_gps/1", returns a dict by stream, for one vehicle. "*" selects all
     streams of the file, including messages that only the file defines.
     `layout`: the PX4 release, such as "1.15", whose layouts a recording has, if its definitions are of another one.
@@ -195,9 +196,8 @@ def _read_one(
     try:
         flight = FlightArrays(path, options, lambda each: any(one.matches(each) for one in selections))
         chosen = dict.fromkeys(each for one in selections for each in select(path, flight.addresses, one))
-    except (AddressError, SourceError):
-        _explain_absent(path, options, selections, select)
-        raise
+    except (AddressError, SourceError) as exc:
+        raise _explain_absent(path, options, selections, select) or exc from None
     require_one_vehicle(path, chosen, selections[0].vehicles[0])
     streams = {address.stream: flight.read(address) for address in chosen}
     _log_warnings(flight)
@@ -233,17 +233,24 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
 def _open_for_merge(path: Path, options: ReadOptions, wanted: Set[str] | None) -> FlightArrays:
     try:
         return FlightArrays(path, options, lambda each: wanted is None or each.topic in wanted)
-    except SourceError:
-        _explain_absent(path, options, [Selection(topic) for topic in sorted(wanted or ())], matching)
-        raise
+    except SourceError as exc:
+        selections = [Selection(topic) for topic in sorted(wanted or ())]
+        raise _explain_absent(path, options, selections, matching) or exc from None
 
 
-def _explain_absent(path: Path, options: ReadOptions, selections: Sequence[Selection], select: _Select) -> None:
-    """Raise AddressError with the streams of a file if it has none of the selected ones."""
-    if options.topics is not None and not TOPICS.keys() <= {*options.topics}:
-        known = FlightArrays(path, replace(options, topics={*options.topics, *TOPICS}), lambda _: False).addresses
-        for one in selections:
+def _explain_absent(
+    path: Path, options: ReadOptions, selections: Sequence[Selection], select: _Select
+) -> AddressError | None:
+    """Return an error with the streams of a file if it lacks a selected one; None if that was not the fault."""
+    if options.topics is None or TOPICS.keys() <= {*options.topics}:
+        return None
+    known = FlightArrays(path, replace(options, topics={*options.topics, *TOPICS}), lambda _: False).addresses
+    for one in selections:
+        try:
             select(path, known, one)
+        except AddressError as exc:
+            return exc
+    return None
 
 
 def _log_warnings(flight: FlightArrays) -> None:

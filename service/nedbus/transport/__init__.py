@@ -29,7 +29,7 @@ from .session import (
     translate_error,
     translate_zenoh_errors,
 )
-from .tls import UNKNOWN_CA, Tls, check_pem
+from .tls import UNKNOWN_CA, Tls, check_pem, read_certificate
 from .vehicle_directory import Publishers, VehicleDirectory
-from .write_probe import Verdict, probe_writes
+from .write_probe import CONFIRMED, Verdict, is_refused, probe_at_router, probe_writes, routers_of, secure_endpoints
 from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload

@@ -15,11 +15,11 @@ from typing import Final
 
 import zenoh
 
-from nedbus.endpoints import check_endpoints, resolution_error
+from nedbus.endpoints import check_endpoints, resolution_error, split_endpoint
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 from nedbus.timings import TIMINGS
 
-from .tls import Tls
+from .tls import Tls, read_certificate
 
 Session = zenoh.Session
 RawSample = zenoh.Sample
@@ -128,7 +128,20 @@ def open_client(
     cause = resolution_error(endpoints) or (tls.explain() if tls is not None else None)
     if not cause and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
         cause = "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
-    raise ConnectError(endpoints, timeout, cause or ("" if "Unable to connect" in reason else reason))
+    secure = [] if cause or stop.is_set() else _tls_ports(endpoints)
+    advice = f"{' and '.join(secure)} speaks TLS: use tls/ instead of tcp/" if secure else ""
+    reason = cause or ("" if "Unable to connect" in reason else reason)
+    raise ConnectError(endpoints, timeout, reason, advice=advice)
+
+
+def _tls_ports(endpoints: Sequence[str]) -> list[str]:
+    """Return the tcp/ endpoints at which a server speaks TLS; Zenoh reports only that it cannot connect."""
+    parts = {endpoint: split_endpoint(endpoint) for endpoint in endpoints}
+    return [
+        endpoint
+        for endpoint, found in parts.items()
+        if found is not None and found[0] == "tcp" and read_certificate(found[1], found[2], TIMINGS.tls_hint)
+    ]
 
 
 def random_backoff() -> dict[str, float]:

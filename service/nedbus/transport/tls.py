@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -104,6 +105,15 @@ class Tls:
             except ssl.SSLError:
                 break
         return None
+
+
+def read_certificate(host: str, port: int, timeout: float) -> str:
+    """Return a server's certificate in PEM, without verifying it; "" if none is presented within `timeout` seconds."""
+    import ssl
+
+    with suppress(OSError):  # also catches SSLError
+        return ssl.get_server_certificate((host, port), timeout=timeout)
+    return ""
 
 
 def check_pem(path: str | Path, kind: str) -> None:

@@ -5,18 +5,26 @@ arrives although the router has announced the subscriber to the publisher, the r
 """
 
 import secrets
+import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from itertools import islice
 from typing import Final, Literal, cast
 
 import zenoh
 
+from nedbus.errors import ConnectError, NedbusError
+from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY
 
-from .session import Session, translate_zenoh_errors
+from .session import Session, open_client, translate_zenoh_errors
+from .tls import Tls
 
 Verdict = Literal["allowed", "denied", "unknown"]
+
+CONFIRMED: Final = 3
+"""Consecutive denials that count as a refusal; a slow or restarting router causes fewer."""
 
 _POLL: Final = 0.02  # s
 _RETRY: Final = 0.2  # s before a probe is sent again, because declarations may still be in flight
@@ -59,6 +67,58 @@ def probe_writes(
                 break
     refused: Verdict = "denied" if matched else "unknown"
     return {vehicle: refused if key in missing else "allowed" for key, vehicle in keys.items()}
+
+
+def probe_at_router(
+    session: Session,
+    endpoints: Sequence[str],
+    vehicles: Collection[str],
+    *,
+    tls: Tls,
+    prefix: str,
+    stop: threading.Event | None = None,
+) -> Mapping[str, Verdict]:
+    """Probe with a second session to one of these endpoints; no verdicts if the two sessions share no router."""
+    routers = routers_of(session)
+    for endpoint in endpoints if vehicles else ():
+        try:
+            reader = open_client([endpoint], timeout=TIMINGS.probe_open, tls=tls, stop=stop)
+        except ConnectError:
+            continue
+        with reader:
+            shared = routers_of(reader)
+            if not shared or not shared <= routers:
+                continue
+            verdicts = probe_writes(reader, session, vehicles, prefix=prefix, timeout=TIMINGS.probe)
+            # A missing probe message means a denial only if no link was lost during the check.
+            is_unchanged = routers_of(reader) == shared and routers_of(session) == routers
+            return verdicts if is_unchanged else {}
+    return {}
+
+
+def is_refused(probe: Callable[[], Verdict | None]) -> bool | None:
+    """Return True after CONFIRMED denials by `probe`, False after an acceptance, None if it cannot be told."""
+    for _ in range(CONFIRMED):
+        verdict = probe()
+        if verdict == "allowed":
+            return False
+        if verdict != "denied":
+            return None
+    return True
+
+
+def secure_endpoints(endpoints: Sequence[str], tls: Tls | None) -> list[str]:
+    """Return the endpoints at which access rules apply to a certificate; none without a client certificate."""
+    if tls is None or tls.certificate is None:
+        return []
+    return [endpoint for endpoint in endpoints if endpoint.startswith(("tls/", "quic/"))]
+
+
+def routers_of(session: Session) -> frozenset[str]:
+    """Return the Zenoh ids of the routers to which a session is connected."""
+    with suppress(NedbusError), translate_zenoh_errors():
+        return frozenset(str(zid) for zid in session.info.routers_zid())
+    return frozenset()
 
 
 def _wait(condition: Callable[[], bool], seconds: float) -> bool:

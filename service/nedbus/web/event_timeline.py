@@ -94,7 +94,9 @@ class EventTimeline:
         if verdict is None or end - computed >= 1.0:
             events, (topics, held) = self._by_vehicle.get(vehicle, [])[-_MAX_EVENTS:], self._evidence(vehicle)
             events = [event for event in events if event.time > end - PAST or not self.times.is_live]
-            verdict = verdict_of(vehicle, events, held, topics=topics, times=self.times, end=end, at=at)
+            known = self.event_log.vehicles.get(vehicle)
+            since = max(known.first, end - PAST) if known is not None else None
+            verdict = verdict_of(vehicle, events, held, topics=topics, times=self.times, end=end, at=at, since=since)
             self._verdicts[vehicle, at] = end, verdict
             if len(self._verdicts) > _MAX_CACHED:
                 del self._verdicts[next(iter(self._verdicts))]

@@ -74,6 +74,12 @@ class VehicleView:
         return "ok" if self.state.severity == "info" else self.state.severity
 
     @property
+    def lost(self) -> int:
+        """Messages lost so far: between its service and this page, and about those of its ULog stream."""
+        after_service = sum(stream.health.lost for stream in self.streams)
+        return after_service if self.log is None else after_service + self.log.lost_messages
+
+    @property
     def brief(self) -> str:
         """The state without details."""
         return _DETAIL.split(self.state.text, maxsplit=1)[0]
@@ -85,7 +91,8 @@ class VehicleView:
         if position is None:
             return "none yet"
         text = f"{position.north:z.1f} m north, {position.east:z.1f} m east"
-        text += f", altitude {position.altitude:z.1f} m" if math.isfinite(position.altitude) else ""
+        name = "altitude" if position.is_altitude_global else "height"
+        text += f", {name} {position.altitude:z.1f} m" if math.isfinite(position.altitude) else ""
         if not position.common or projection is None:
             return text
         latitude, longitude = projection.reproject(position.north, position.east)
@@ -110,6 +117,13 @@ class FleetSnapshot:
     rejected: int = 0
     left_out: int = 0
     alarms: Sequence[str] = ()
+
+    @property
+    def lost(self) -> str:
+        """Number of messages lost so far, of all vehicles; "about" if it includes those of a ULog stream."""
+        total = sum(view.lost for view in self.vehicles)
+        is_estimate = any(view.log is not None and view.log.lost_messages for view in self.vehicles)
+        return f"about {total:,}" if is_estimate else f"{total:,}"
 
     def vehicle(self, name: str | None) -> VehicleView | None:
         """Return the vehicle of this name, or None."""

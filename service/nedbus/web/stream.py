@@ -40,13 +40,14 @@ class Position(NamedTuple):
     """A position [m].
 
     `common`: True if relative to the common origin, False if relative to the vehicle's own origin.
-    `altitude`: above mean sea level if known, else above the vehicle's own origin.
+    `altitude`: above mean sea level if `is_altitude_global`, else above the vehicle's own origin.
     """
 
     east: float
     north: float
     altitude: float
     common: bool
+    is_altitude_global: bool
 
 
 class History:
@@ -83,7 +84,7 @@ class Origin(CommonOrigin):
             north = east = math.nan
         altitude = (message.ref_alt if message.z_global else 0.0) - message.z
         has_height = message.z_valid or "z_valid" in missing
-        return Position(east, north, altitude if has_height else math.nan, bool(position))
+        return Position(east, north, altitude if has_height else math.nan, bool(position), message.z_global)
 
 
 class PageStream:
@@ -143,7 +144,10 @@ class PageStream:
         points = points[points[:, 0].argsort(kind="stable")]
         numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
         found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
-        return [None if position is None else Position(position[0], position[1], math.nan, True) for position in found]
+        return [
+            None if point is None else Position(point[0], point[1], math.nan, common=True, is_altitude_global=False)
+            for point in found
+        ]
 
 
 def _distance(position: Position, message: VehicleLocalPosition, truth: PageStream | None) -> float:

@@ -4,7 +4,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from bokeh.models import BasicTicker, ColumnDataSource, DatetimeTicker, FixedTicker, HoverTool, Range1d, TapTool
+from bokeh.models import (
+    BasicTicker,
+    ColumnDataSource,
+    DatetimeTicker,
+    FixedTicker,
+    HoverTool,
+    Range1d,
+    TapTool,
+)
+from bokeh.models.annotations import Legend, LegendItem
 from bokeh.plotting import figure
 
 from nedbus.events import ALL, KINDS, Event, Span
@@ -16,11 +25,11 @@ from .style import MARKERS, SHAPES, Style
 _MAX_ROWS: Final = 7  # vehicles; if there are more, the last row counts the hidden ones
 _MAX_MARKS: Final = 2000
 _MIN_ROWS: Final = 4  # minimum height in rows; fewer rows would have thick bars
-_PLOTS: Final = {
-    "height above own origin [m]": ("height",),
-    "horizontal speed [m/s]": ("speed",),
-    "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
-}
+_PLOTS: Final = (  # the title of each column of each plot
+    {"height": "height above own origin [m]"},
+    {"speed": "horizontal speed [m/s]"},
+    {"eph": "eph", "epv": "epv", "error": "error to ground truth [m]"},
+)
 _LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} flight phase  ▬ duration  ┊ now"
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _TRUTH_COLUMNS: Final = {"height", "speed"}
@@ -115,7 +124,7 @@ class Plots:
 
     def draw(self) -> Iterator[figure]:
         """Yield new plots one by one, because each takes a browser as long to draw as the map."""
-        return (self._draw(title, names) for title, names in _PLOTS.items())
+        return (self._draw(titles) for titles in _PLOTS)
 
     def update(self, chosen: History | None, truth: History | None) -> None:
         """Add the new points of the selected stream and of its ground truth."""
@@ -141,15 +150,19 @@ class Plots:
         ]  # fmt: skip
         replace(self._spans, held)
 
-    def _draw(self, title: str, names: tuple[str, ...]) -> figure:
+    def _draw(self, titles: Mapping[str, str]) -> figure:
+        title = next(iter(titles.values())) if len(titles) == 1 else None  # otherwise the legend
         plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
         plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
-        for name, colour in zip(names, self._style.vehicles, strict=False):
-            legend: dict[str, Any] = {"legend_label": name} if len(names) > 1 else {}
-            plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
+        entries: list[Any] = []
+        for (name, label), colour in zip(titles.items(), self._style.vehicles, strict=False):
+            line: Any = plot.line("time", name, source=self.chosen, color=colour, line_width=1.5)
+            entries.append(LegendItem(label=label, renderers=[line]))
             if name in _TRUTH_COLUMNS:
                 truth = self._style.colours["truth"]
                 plot.line("time", name, source=self._truth, color=truth, line_dash="dotted", line_width=1.5)
+        if title is None:
+            plot.add_layout(Legend(items=entries), "above")  # inside the frame it would cover the lines
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
         plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)

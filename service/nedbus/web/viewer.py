@@ -92,6 +92,7 @@ class Viewer:
         self._on_tap(self._timeline_plot.marks, lambda: self._timeline_plot.shown, self._show)
         theme = Template(read_asset("theme.json")).substitute(self._style.colours)
         document.title, document.theme = title, Theme(json=json.loads(theme))
+        document.template = read_asset("page.html")  # type: ignore[assignment] # Bokeh compiles a string
         document.config.update(reconnect_session=False, notify_connection_status=False)
         document.js_on_event(ConnectionLost, CustomJS(code=read_asset("lost.js")))
         args = {"message": self._message, "map": self._map.figure, "search": self._search}

@@ -273,7 +273,7 @@ def test_latest_prefers_a_live_message_to_a_stored_one(
 
 def reply_with_statuses(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
     """Return a handler that replies to each query for services with all payloads in `answers`, keyed by service id."""
-    return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
+    return reply_with({f"nedbus/@service/1/{name}/status": payload for name, payload in answers.items()})
 
 
 def test_malformed_status_is_ignored(
@@ -281,7 +281,7 @@ def test_malformed_status_is_ignored(
 ) -> None:
     """Replies that are not JSON, or too deeply nested, are ignored and logged in one line."""
     junk = {"evil": b"[" * 2000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
-    with answer_queries(zenoh_session, "nedbus/@service/*/status", reply_with_statuses(junk)):
+    with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with_statuses(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
@@ -294,7 +294,7 @@ def test_memory_for_parsed_status_is_bounded(
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
-    with answer_queries(zenoh_session, "nedbus/@service/*/status", reply_with_statuses(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with_statuses(many)):
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
@@ -313,11 +313,16 @@ def test_status_of_hostile_or_newer_service_is_sanitized(client: nedbus.Bus, zen
         "shape": {"of": "it"},
     }
     with answer_queries(
-        zenoh_session, "nedbus/@service/*/status", reply_with_statuses({"a": json.dumps(content).encode(), "b": b"[5]"})
+        zenoh_session,
+        "nedbus/@service/**/status",
+        reply_with_statuses({"a": json.dumps(content).encode(), "b": b"[5]"}),
     ):
         [status] = client.services()
     assert status == nedbus.health.ServiceStatus(
-        service="a", host="here", sources=(nedbus.health.SourceStatus(source="sim:", state="new", addresses=("1/x",)),)
+        service="a",
+        vehicle="1",
+        host="here",
+        sources=(nedbus.health.SourceStatus(source="sim:", state="new", addresses=("1/x",)),),
     )
 
 
@@ -328,10 +333,10 @@ def test_bytes_of_replies_are_bounded(
     monkeypatch.setattr("nedbus.transport.queries.MAX_QUERY_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
-    with answer_queries(zenoh_session, "nedbus/@service/*/status", reply_with_statuses(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with_statuses(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
     text = "dropped 40 of 50 replies beyond the limits of a query, so the result is incomplete"
-    assert f"nedbus/@service/*/status: {text}" in caplog.messages
+    assert f"nedbus/@service/**/status: {text}" in caplog.messages
 
 
 def test_vehicle_with_many_streams_hides_no_other(

@@ -5,16 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+import nedbus
 from nedbus.client import describe_stream, stream_state
 from nedbus.health import Health, StreamHealth
 from nedbus_msgs import DOUBT_FLAGS
 from tests.flights.messages import VALID, VLP, message
 
 SECOND = 1_000_000_000
+FLIGHT = Path(__file__).parents[4] / "shared" / "data" / "px4" / "multi_ekf_switch.ulg"
 Fields = Mapping[str, object]
 
 
@@ -269,6 +272,70 @@ def test_rare_topic_without_nominal_rate_is_never_stale() -> None:
             stream.add(message(round(index * period * 1e6)), received=round(index * period * SECOND))
         assert stream.snapshot(0).stale_after == expected
     assert StreamHealth("vehicle_command").snapshot(0).stale_after == math.inf
+
+
+def custom_stream(*times: float) -> StreamHealth:
+    """Return a stream of a topic without a nominal rate, with these times [s]."""
+    stream = StreamHealth("vehicle_command_ack")
+    for seconds in times:
+        stream.add({"timestamp": round(seconds * 1e6)}, received=round(seconds * SECOND))
+    return stream
+
+
+def test_topic_sent_on_change_is_neither_stale_nor_has_gaps() -> None:
+    """Without a nominal rate, irregular intervals mean publishing on change, whatever the mean rate is."""
+    bursts = [burst * 10.0 + index * step for burst in range(5) for index, step in enumerate((0.0, 0.06, 0.25, 0.5))]
+    health = custom_stream(*sorted(bursts)).snapshot(100 * SECOND)
+    assert health.on_change
+    assert health.stale_after == math.inf
+    assert health.gaps == 0
+    assert stream_state(health, publishers=1).name == "ok"
+
+
+def test_periodic_topic_without_nominal_rate_is_stale_despite_a_few_gaps() -> None:
+    """At 5 Hz, silence of 20 s is stale, also if two of the last intervals were gaps, which are counted."""
+    times = [index * 0.2 for index in range(50)]
+    times = [seconds for seconds in times if seconds not in {times[index] for index in (40, 41, 42, 45, 46, 47)}]
+    health = custom_stream(*times).snapshot(round((times[-1] + 20) * SECOND))
+    assert (health.on_change, health.gaps) == (False, 2)
+    assert str(stream_state(health, publishers=1)) == "stale: nothing for 20.0 s"
+
+
+def test_latency_of_an_old_message_is_not_a_state() -> None:
+    """A message that was late when it was sent again, as home_position after a restart, is "slow" for 3 s, then ok."""
+    stream = StreamHealth("home_position")
+    stream.add({"timestamp": 1}, received=0, latency=1.2)
+    assert str(stream_state(stream.snapshot(SECOND))) == "slow: 1.2 s late, or clocks differ"
+    assert str(stream_state(stream.snapshot(4 * SECOND))) == "ok"
+
+
+def test_description_mentions_a_reboot_for_a_minute() -> None:
+    """A reboot is in the description for a minute; the count and the time since it remain in the health."""
+    stream = stream_at(*(index / 100 for index in range(300)), boot=100.0)
+    for index in range(7000):
+        seconds = 3 + index / 100
+        stream.add(message(round((1 + index / 100) * 1e6), **VALID), received=round(seconds * SECOND))
+        if index == 1000:
+            early = stream.snapshot(round(seconds * SECOND))
+    later = stream.snapshot(73 * SECOND)
+    assert describe_stream(early, stream_state(early)) == "1 reboot"
+    assert describe_stream(later, stream_state(later)) == "ok"
+    assert later.reboots == 1
+    assert later.reboot_age == pytest.approx(70.0)
+
+
+@pytest.mark.skipif(not FLIGHT.exists(), reason=f"no log of a PX4 in {FLIGHT.parent}")
+def test_on_change_topics_of_a_real_flight_are_never_stale() -> None:
+    """In a flight of PX4 main, acknowledgements and events come in bursts, with a usual rate above 1 Hz."""
+    streams: dict[str, StreamHealth] = {}
+    end = 0
+    with nedbus.open(FLIGHT) as flight:
+        for sample in flight("event", "vehicle_command_ack", "vehicle_magnetometer"):
+            stream = streams.setdefault(sample.topic, StreamHealth(sample.topic))
+            end = sample.message.timestamp * 1000
+            stream.add(sample.message, received=end)
+    states = {topic: stream_state(stream.snapshot(end + 30 * SECOND)).name for topic, stream in streams.items()}
+    assert states == {"event": "ok", "vehicle_command_ack": "ok", "vehicle_magnetometer": "stale"}
 
 
 def test_stream_has_the_worst_state_that_applies() -> None:

@@ -51,9 +51,11 @@ def serve(run_nedbus: Start) -> Iterator[Serve]:
 
 
 def source_of(bus: nedbus.Bus, number: int = 0) -> nedbus.health.SourceStatus:
-    """Return the status of a source; an empty status if the service does not reply."""
-    sources = [status.sources for status in bus.services()]
-    return sources[0][number] if sources and sources[0] else nedbus.health.SourceStatus()
+    """Return the status of a source, in the order of their vehicles; an empty status if it is not known yet."""
+    # A source without a vehicle is in the status of each vehicle of its service; it comes last.
+    found = {source.source: source for status in bus.services() for source in status.sources}
+    sources = sorted(found.values(), key=lambda each: (not each.addresses, each.addresses))
+    return sources[number] if number < len(sources) else nedbus.health.SourceStatus()
 
 
 def has_state(bus: nedbus.Bus, state: str, number: int = 0) -> Callable[[], bool]:
@@ -461,13 +463,14 @@ def query_json(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
 def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, zenoh_session: Session, endpoint: str) -> None:
     """A plain Zenoh client can query service status, schemas, and the last message of each key, with timestamp."""
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?topics=VehicleLocalPosition")
-    status_key = "nedbus/@service/*/status"
+    status_key = "nedbus/@service/*/*/status"
     wait_for(
         lambda: [s for each in query_json(zenoh_session, status_key) for s in each["sources"] if s["published"]],
         what="messages",
     )
     [status] = query_json(zenoh_session, status_key)
-    assert {"service", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"} == set(status)
+    names = {"service", "vehicle", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"}
+    assert set(status) == names
     assert (status["role"], status["endpoints"]) == ("client", [endpoint])
     [source] = status["sources"]
     assert (source["source"], source["state"], source["rejected"], source["total"]) == (

@@ -88,10 +88,10 @@ def test_sensor_failure_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """PX4's text about a failed sensor is a fault, and evidence for the missing messages that follow; so in the log."""
     service = Service(PX4 / "baro_failure_mavlink.bin.gz", monkeypatch).run(until=21)
     assert service.verdict().text.startswith(
-        'position valid throughout, but PX4: "Baro sensor #0 failure: Timeout" at 07:24:54.0 UTC.'
+        'position valid now, but PX4: "Baro sensor #0 failure: Timeout" at 07:24:54.0 UTC.'
     )
     found = service.run().verdict()
-    assert found.text.startswith("position valid throughout, but no barometer message")
+    assert found.text.startswith("position valid now, but no barometer message")
     assert 'PX4: "Baro sensor #0 failure: Timeout"' in found.text
     read = read_file_events(PX4 / "baro_failure.ulg")
     report = report_of(read.event_log, "", "", read.end, within=1e9).vehicles["4"]

@@ -58,8 +58,15 @@ class FakeRegistry:
     readers_at: float = 0.0
 
     def publisher(
-        self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool, source: str
+        self,
+        address: Address,
+        definition: Definition[Any] | None = None,
+        *,
+        lossless: bool,
+        source: str,
+        short_history: bool = True,
     ) -> SimpleNamespace:
+        assert short_history
         if address in self.publishers:
             raise AddressInUseError(address)
 

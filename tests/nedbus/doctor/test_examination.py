@@ -24,11 +24,12 @@ from pymavlink.dialects.v20 import common as mavlink
 import nedbus
 from nedbus.client import QueryServer
 from nedbus.doctor import Finding, State, examine
+from nedbus.errors import ConnectError
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import NO_HASH, Session, TopicKey, fleet_tokens, open_client, open_router
-from nedbus_msgs import dds_type, status_key
+from nedbus_msgs import TOPICS, dds_type, status_key
 from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
@@ -100,7 +101,7 @@ def service_status(session: Session, name: str = "fake", *, offset: float = 0.0,
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
     server.answer_json(
-        status_key(name), lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()]
+        status_key(name, vehicle="1"), lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()]
     )
     with closing(server):
         yield
@@ -173,6 +174,33 @@ def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str
     assert [each.advice for each in missing] == [
         "start its source: 'nedbus serve --source ...'; published: asleep, mute"
     ]
+
+
+@pytest.mark.parametrize(
+    ("state", "advice"),
+    [
+        ("running", "no source of service fake on elsewhere receives it: check the name, or start its source there"),
+        ("waiting", "see the findings on sources"),
+    ],
+)
+def test_missing_vehicle_refers_to_findings_on_sources_only_if_there_are_some(
+    zenoh_session: Session, endpoint: str, state: str, advice: str
+) -> None:
+    """The advice for a vehicle that is not published names the services, or refers to findings on their sources."""
+    with service_status(zenoh_session, sources=[source(state=state)]):
+        findings = diagnose(endpoint, vehicle="8")
+    assert find(findings, "vehicle", "wrong", "8: not found").advice == advice
+    assert any(each.check == "source" for each in findings) == (state == "waiting")
+
+
+def test_publishers_of_one_address_are_named(zenoh_session: Session, endpoint: str, bus: nedbus.Bus) -> None:
+    """Of several publishers of an address, the services are named with host and source, others are counted."""
+    address = f"1/{VLP}"
+    status = service_status(zenoh_session, "a", sources=[source(addresses=[address])])
+    with nedbus.connect(endpoint) as other, publishing(bus), publishing(other), status:
+        findings = diagnose_until(endpoint, "2 publishers of this address: service")
+    text = "service a on elsewhere .mavlink:x., and 1 that no service reports"
+    find(findings, "vehicle", "wrong", f"{address}: 2 publishers of this address: {text}")
 
 
 def test_two_publishers_of_one_address_are_reported(bus: nedbus.Bus, endpoint: str) -> None:
@@ -262,10 +290,23 @@ def test_service_status_produces_findings(zenoh_session: Session, endpoint: str)
     find(findings, "source", "warning", "no more messages of 9/x")
     find(findings, "source", "warning", r"messages rejected: 7 \(xy_valid\)")
     find(findings, "version", "warning", r"the service runs nedbus 99\.1\.0")
-    with service_status(zenoh_session, sources=[*sources, *50 * [source(state="waiting")]]):
+    waiting = [source(source=f"mavlink:{number}", state="retrying", error=str(number)) for number in range(50)]
+    with service_status(zenoh_session, sources=[*sources, *waiting]):
         findings = diagnose(endpoint)
-    find(findings, "source", "warning", "more findings of this check")
-    find(findings, "source", "wrong", "the disk is gone")
+    find(findings, "source", "wrong", "more findings of this check")
+    find(findings, "source", "wrong", "retrying: 49")
+
+
+def test_equal_findings_are_one_with_all_subjects(zenoh_session: Session, endpoint: str, bus: nedbus.Bus) -> None:
+    """A fault of all streams of a vehicle is one finding, which lists streams and names service and host."""
+    addresses = [f"8/{topic}" for topic in TOPICS][:12]
+    with publishing(bus, "1"), service_status(zenoh_session, sources=[source(addresses=addresses)]):
+        findings = diagnose_until(endpoint, "reported as published", "messages arrive")
+    found = [each for each in findings if "reported as published" in each.seen]
+    assert len(found) == 1, found
+    assert "service fake on elsewhere (mavlink:x)" in found[0].seen
+    assert found[0].subject.endswith("and 7 more")
+    assert not any("more finding" in each.seen for each in findings)
 
 
 @contextmanager
@@ -273,7 +314,9 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
     """Reply to event queries with a report of these vehicles."""
     server = QueryServer(session)
     report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
-    server.answer_json(status_key(name), lambda get: [json.dumps(report if get("events") else {}).encode()])
+    for vehicle in vehicles:
+        key = status_key(name, vehicle=vehicle)
+        server.answer_json(key, lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server):
         yield
 
@@ -325,7 +368,7 @@ def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, 
     """An invalid event report from a peer produces no finding and does not break a check."""
     server = QueryServer(zenoh_session)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **invalid}
-    server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
+    server.answer_json(status_key("x", vehicle="1"), lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server), service_status(zenoh_session, sources=[source(state="failed", error="the disk is gone")]):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "the disk is gone")
@@ -406,9 +449,8 @@ def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
 def test_text_from_peers_is_escaped_and_truncated(zenoh_session: Session, endpoint: str) -> None:
     """Text from peers cannot control the terminal, add lines or flood the output."""
     evil = "\x1b[2J\nok all is well " + 1_000 * "x"
-    with service_status(
-        zenoh_session, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil
-    ):
+    failed = [source(source=f"{number}{evil}", state="failed", error=f"{number}{evil}") for number in range(50)]
+    with service_status(zenoh_session, sources=failed, host=evil, version=evil):
         doctor = run_command("doctor", "-c", endpoint)
     assert doctor.exit_code == 1
     assert "\x1b" not in doctor.out
@@ -484,6 +526,9 @@ def test_wrong_protocol_and_wrong_tls_files_are_reported(
     findings = diagnose(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
     find(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
     find(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
+    plain = secure.replace("tls/", "tcp/")
+    with pytest.raises(ConnectError, match=f"{plain} speaks TLS: use tls/ instead of tcp/"):
+        nedbus.connect(plain, timeout=0.1)
     find(findings, "tls", "wrong", f"{secure}: .*no CA is given")
     for files, reason in (
         ({**tls_settings(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
@@ -508,7 +553,7 @@ def test_wrong_protocol_and_wrong_tls_files_are_reported(
         ("vehicle-1", "2", "", "write", "warning", "the router silently drops"),
         ("reader", "1", "1", "write", "ok", "fine for a reader"),
         ("older", "1", "", "write", "unknown", "does not let this client read"),
-        ("reader", None, "12", "vehicle", "wrong", f"2/{VLP}: reported as published by a service, but no message"),
+        ("reader", None, "12", "vehicle", "wrong", f"2/{VLP}: reported as published by service .*, but no message"),
         ("vehicle-1", None, "12", "read", "wrong", "no message arrives here"),
         ("vehicle-1", "1", "12", "read", "warning", "no message arrives here.*only permits writing"),
     ],

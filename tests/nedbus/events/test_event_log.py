@@ -78,7 +78,7 @@ def test_reboot_is_reported_once(flight: Flight) -> None:
     assert flight.wait(1.0).send() == []
     reported = flight.wait(0.1).send()
     assert brief(reported) == [("reboot", "once", "bad")]
-    assert reported[0].text == "reboot: time since boot is 1.1 s, was 10.1 s"
+    assert reported[0].text == "reboot (up for 1.1 s, before it for 10.1 s)"
     assert flight.kinds == ["reboot"]
     assert flight.wait(1.0).gps() == []  # neither a second reboot nor the end of few_satellites
     flight.fly(20)
@@ -155,7 +155,7 @@ def test_burst_of_losses_is_one_event(flight: Flight) -> None:
     assert flight.update() == []
     reported = flight.wait(6.0).update()
     assert [(event.text, event.severity, event.time) for event in reported] == [
-        ("5 messages lost (vehicle_gps_position, vehicle_local_position)", "watch", first)
+        ("5 messages lost in 2.0 s (vehicle_gps_position, vehicle_local_position)", "watch", first)
     ]
     assert flight.wait(6.0).update() == []
 

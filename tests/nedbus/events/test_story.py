@@ -51,6 +51,19 @@ def test_story_ends_with_last_flag() -> None:
     ]  # fmt: skip
 
 
+def test_text_at_the_start_of_a_file_is_evidence_for_ten_seconds() -> None:
+    """A text in the first message of a file, at time 0, is evidence for faults of the next ten seconds only."""
+    flight = Flight()
+    flight.now, flight.booted = 0.0, -10.0
+    flight.send("log_message", severity=4, text="Failsafe warning")
+    for start in (5.0, 30.0):
+        flight.now = start
+        flight.send()
+        flight.wait(0.1).send(xy_valid=False)
+        flight.wait(1.0).send()
+    assert [[each.kind for each in story.before] for story in why(flight)] == [["text"], []]
+
+
 def test_estimate_fault_that_outlasts_another_is_a_story() -> None:
     """A fault of the estimate that begins during another one and outlasts it is a separate story."""
     flight = Flight()

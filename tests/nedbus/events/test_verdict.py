@@ -143,10 +143,10 @@ def test_sensor_failures_and_critical_texts_in_flight_are_faults(
     flight.status(state)
     flight.send("log_message", severity=level, text=text)
     flight.fly(1)
-    for times in Times(), LIVE:
+    for times, since in (Times(), "throughout"), (LIVE, "now"):
         found = verdict(flight, times=times)
         assert found.usable
-        assert found.text.startswith(f'position valid throughout, but PX4: "{text}" at ') == is_fault
+        assert found.text.startswith(f'position valid {since}, but PX4: "{text}" at ') == is_fault
         assert ("Evidence" in found.text, found.text.startswith("no faults")) == (False, not is_fault)
 
 
@@ -517,7 +517,8 @@ def test_what_changed_the_estimate_leads(before: list[Event], times: Times) -> N
     """A reset leads, with the change of the EKF as evidence, beside an ended fault and a lasting minor condition."""
     topics = ("vehicle_local_position", "estimator_selector_status", "vehicle_gps_position")
     found = verdict_of("1", reset_and_switch(*before), topics=topics, times=times, end=110.0)
-    assert found.text.startswith("position valid throughout, but reset of xy by 31.9 m ")
+    since = "now" if times.is_live else "throughout"
+    assert found.text.startswith(f"position valid {since}, but reset of xy by 31.9 m ")
     assert has_words(found.text, "Evidence", "primary EKF changed from 0 to 1")
     assert len(found.stories) == 1 + bool(before)
 
@@ -601,7 +602,7 @@ def test_evidence_is_nearest_in_kind_before_nearest_in_time() -> None:
     flight.wait(0.1).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=False)
     flight.wait(0.1).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True)
     found = verdict(flight, times=LIVE)
-    assert found.text.startswith("position valid throughout, but EKF fault: magnetometer")
+    assert found.text.startswith("position valid now, but EKF fault: magnetometer")
     evidence = found.text.partition("Evidence")[2].partition("Also")[0]
     assert has_words(evidence, "Compass 0 inconsistent", "Wind high")
     assert "Airspeed" not in evidence
@@ -618,3 +619,19 @@ def test_live_verdict_tells_since_when() -> None:
     assert sound.text == "no faults since 00:01:40.1 UTC (29.9 s)"
     found = verdict_of("1", reset_and_switch(), topics=known.topics, times=LIVE, end=flight.now, since=known.first)
     assert found.text.startswith("position valid since 00:01:40.1 UTC, but reset of xy by 31.9 m ")
+
+
+def test_live_verdict_excludes_the_time_without_a_position() -> None:
+    """The position is valid since its first message, or since an estimate that was invalid at first became valid."""
+    flight = Flight()
+    flight.battery(0)
+    flight.wait(10.0).send(xy_valid=False)
+    flight.wait(5.0).send(xy_valid=True)
+    flight.status(ARMED)
+    flight.fly(5)
+    px4_text(flight, "Baro sensor #0 failure: Timeout")
+    (known,) = report_of(flight.event_log, "s", "h", flight.now, within=60).vehicles.values()
+    assert known.first == 110.0
+    events = flight.event_log.events
+    found = verdict_of("1", events, topics=known.topics, times=LIVE, end=flight.now, since=known.first)
+    assert found.text.startswith('position valid since 00:01:55.0 UTC, but PX4: "Baro sensor #0 failure: Timeout" at ')

@@ -228,10 +228,10 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
             {"25s": False, "1m0s": False, "1m10s": True},
         ),
         ("NedbusStreamStale", "nedbus_stream_age_seconds 0+1x20", {"3s": False, "9s": True}),
-        (  # 0.2 Hz: two intervals are 10 s
+        (  # 0.2 Hz: three intervals are 15 s
             "NedbusStreamStale",
             "nedbus_stream_age_seconds 0+1x30; nedbus_stream_usual_rate_hertz 0.2x30",
-            {"9s": False, "16s": True},
+            {"14s": False, "21s": True},
         ),
         (  # a count by rule first appears as 1, which increase() misses; the source's count was 0 before
             "NedbusMessagesRejected",

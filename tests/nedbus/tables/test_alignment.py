@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import pytest
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.flights import RecordingWriter, find_utc
-from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
+from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, define_msg, definition_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
@@ -53,6 +54,27 @@ def write(path: Path, streams: dict[str, MessageArray], vehicle: str = "1") -> P
 
 POSITIONS = array_of(VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": float(number)} for number in range(5)))
 HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0})
+
+
+def test_derived_columns_are_offered_by_name() -> None:
+    """`align` computes height, speed and angles if `fields` names them: NaN while invalid and before the first message.
+
+    Angles follow from the interpolated quaternion, so they do not jump at a half turn.
+    """
+    flown = array_of(VLP, {"timestamp": 1_000_000, "z": -4.0, "z_valid": True}, {"timestamp": 1_100_000, "z": -9.0})
+    first, second = math.radians(179.0), math.radians(-179.0)
+    turned = array_of(
+        "vehicle_attitude", {"timestamp": 1_050_000, "q": yaw(first)}, {"timestamp": 1_150_000, "q": yaw(second)}
+    )
+    streams = {VLP: flown, "vehicle_attitude": turned}
+    table = nedbus.align(streams, fields=["height", "vehicle_attitude.yaw_deg"], method="linear")
+    assert table.dtype.names == ("timestamp", f"{VLP}.height", "vehicle_attitude.yaw_deg")
+    assert table[f"{VLP}.height"] == pytest.approx([4.0, math.nan], nan_ok=True)
+    assert math.isnan(table["vehicle_attitude.yaw_deg"][0])
+    assert abs(table["vehicle_attitude.yaw_deg"][1]) == pytest.approx(180.0, abs=1e-3)
+    assert f"{VLP}.height" not in (nedbus.align(streams).dtype.names or ())
+    with pytest.raises(ArgumentError, match="height, speed, roll"):
+        nedbus.align(streams, fields=["altitud"])
 
 
 def test_method_last_never_uses_future_messages() -> None:
@@ -266,6 +288,31 @@ def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
         nedbus.read(tmp_path / "two.mcap", ["*"])
     with pytest.raises(AddressError, match=r"vehicle '\*' is not valid"):
         nedbus.utc_of(tmp_path / "two.mcap")
+
+
+@pytest.mark.parametrize("wrong", [{"topics": [VLP, "nope"]}, {"on": "nope"}, {"topics": ["nope"]}])
+def test_unknown_stream_is_one_error_with_the_streams_of_the_file(tmp_path: Path, wrong: Any) -> None:
+    """An unknown stream raises one error without a chained one; it lists all known streams of the file."""
+    path = write(tmp_path / "a.mcap", {VLP: POSITIONS, "home_position": HOME})
+    with pytest.raises(AddressError, match=r"topic '.*nope' is not in .*: expected one of .*") as raised:
+        nedbus.align(path, **wrong)
+    assert f"1/home_position, 1/{VLP}" in str(raised.value)
+    assert raised.value.__cause__ is None
+    assert raised.value.__suppress_context__ or raised.value.__context__ is None
+
+
+def test_rows_may_be_those_of_a_message_that_only_the_file_defines(tmp_path: Path) -> None:
+    """`on` accepts each stream of a file, without `topics` too."""
+    definition = define_msg("Gripper", "uint64 timestamp\nfloat32 width\n")
+    grips = arrays_of(definition).of([definition.model.model_validate({"timestamp": 1_150_000, "width": 0.5})])
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for topic, kind, array in ((VLP, definition_of(VLP), POSITIONS), ("gripper", definition, grips)):
+            addresses = repeat((Address("1", topic), Provenance()))
+            writer.write(array, kind, addresses, logged=[1] * len(array), published=repeat(1))
+    table = nedbus.align(path, on="gripper")
+    assert table["gripper.width"].tolist() == [0.5]
+    assert table[f"{VLP}.x"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize("wild", [10**11, 9 * 10**18])

@@ -164,6 +164,11 @@ def test_events_are_marked_by_severity() -> None:
     assert len({parts[name].get_xlim() for name in ("altitude", "speed", "flags", "events")}) == 1
     labels = [text.get_text() for text in parts["track"].get_legend().get_texts()]
     assert labels == [f"7/{VLP}", "watch event", "bad event"]
+    figure = parts["track"].get_figure()
+    figure.draw_without_rendering()
+    legend = parts["track"].get_legend().get_window_extent()
+    assert not legend.overlaps(parts["track"].get_window_extent()), "it would cover the track"
+    assert not legend.overlaps(parts["track"].xaxis.label.get_window_extent())
     others = drawn([flight_of(vehicle="8")], events)
     assert "events" not in others, "events of a vehicle that is not plotted"
     assert not marks_of(others["track"], "x")

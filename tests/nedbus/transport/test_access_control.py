@@ -17,14 +17,17 @@ import zenoh
 
 import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
+from nedbus.client.publishing.publish_permission import PublishPermission
 from nedbus.daemon.write_permission import WritePermission
+from nedbus.errors import RefusedError
 from nedbus.pki import write_access_rules
 from nedbus.timings import Timings
-from nedbus.transport import Session, open_client, open_router, query
+from nedbus.transport import Session, Verdict, open_client, open_router, query
 from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
 from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
+from tests.flights.ulogs import write_log
 from tests.nedbus.client.downsampling import Clock, clock, publish, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import receive_timestamps
 from tests.nedbus.sources.px4.test_source import Px4
@@ -163,14 +166,64 @@ def test_other_certificates_cannot_publish_a_vehicle(join: Join, intruder: str) 
     reader = join("reader")
     with reader.subscribe("*", mode="every") as subscription:
         assert receive_timestamps(subscription, 1) == [1]
-        other = join(intruder)
-        other.publisher(VLP, vehicle="1").publish(message(666))
-        other.publisher(VLP, vehicle="3").publish(message(667))
+        other = join(intruder)._publishers  # the bus itself refuses to make these publishers
+        other.publisher(Address("1", VLP)).publish(message(666))
+        other.publisher(Address("3", VLP)).publish(message(667))
         for timestamp in (2, 3):
             genuine.publish(message(timestamp))
             assert receive_timestamps(subscription, 1) == [timestamp]
         assert [sample.message.timestamp for sample in reader.latest("*")] == [3]
         assert list(reader.vehicles()) == ["1"]
+
+
+@pytest.mark.parametrize("certificate", ["reader", "vehicle-2"])
+def test_script_learns_that_it_may_not_publish(join: Join, certificate: str) -> None:
+    """A script whose certificate may not publish a vehicle gets a typed error, at the publisher and at `flush`.
+
+    `latest` shows it what others see: its own message, which the router dropped, is not among them.
+    """
+    bus = join(certificate)
+    with pytest.raises(RefusedError, match=f"vehicle 1, .* certificate .*{certificate}.crt") as caught:
+        bus.publisher(VLP, vehicle="1")
+    assert caught.value.vehicle == "1"
+    with bus._publishers.publisher(Address("1", VLP)) as publisher:  # as one that was made before the rules changed
+        for number in range(3000):
+            publisher.publish(message(number))
+        with pytest.raises(RefusedError):
+            publisher.flush()
+        assert bus.latest(VLP, vehicle="1") == []
+
+
+def test_allowed_publisher_is_probed_once(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The permission of a vehicle is asked for once per link, not at each publisher or flush."""
+    asked: list[str] = []
+    probe = PublishPermission._probe
+
+    def count(permission: PublishPermission, vehicle: str) -> Verdict | None:
+        asked.append(vehicle)
+        return probe(permission, vehicle)
+
+    monkeypatch.setattr(PublishPermission, "_probe", count)
+    bus = join("vehicle-1")
+    publisher = bus.publisher(VLP, vehicle="1")
+    bus.publisher("vehicle_attitude", vehicle="1")
+    publisher.publish(message(1))
+    assert publisher.flush()
+    assert asked == ["1"]
+
+
+def test_refused_service_fails_at_the_end_of_its_sources(
+    configured: tuple[Path, str], pki: Path, start: Start, *, tmp_path: Path
+) -> None:
+    """`serve --until-done` exits with 1 and the reason if the router refused what it published, else with 0."""
+    file, endpoint = configured
+    start_zenohd(start, "-c", str(file))
+    path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 10_000))
+    source = ("-s", f"ulog:{path}?vehicle=1&speed=max", "--until-done", "-c", endpoint)
+    refused = run_command("serve", *source, *tls_options(pki, "vehicle-2"))
+    assert refused.exit_code == 1
+    assert "the router refuses messages of vehicle 1, so they reach no reader" in refused.err
+    assert run_command("serve", *source, *tls_options(pki, "vehicle-1")).exit_code == 0
 
 
 def test_vehicle_answers_schema_queries_for_itself_only(join: Join, open_as: Open) -> None:
@@ -248,9 +301,13 @@ def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Pa
     info = run_command("info", **environment)
     assert info.exit_code == 0
     assert "sim:" in info.out
-    refused = run_command("health", "-v", "2", **environment)
-    assert refused.exit_code == 1
-    assert "vehicle 2 is not published, although its service reports it as published" in refused.err
+
+    def is_refused() -> bool:
+        refused = run_command("health", "-v", "2", **environment)
+        assert refused.exit_code == 1
+        return "vehicle 2 is not published, although its service reports it as published" in refused.err
+
+    wait_for(is_refused, what="the service to learn and report the refusal, under its own vehicle")
 
 
 def test_px4_without_tls_is_bridged_to_the_secure_router(
@@ -477,7 +534,7 @@ def test_vehicle_is_refused_after_three_consecutive_denials(
 ) -> None:
     """A vehicle counts as refused after three consecutive denials, until the router accepts a probe."""
     verdicts = iter(history)
-    monkeypatch.setattr(f"{PERMISSION}probe_writes", lambda *_, **__: {"1": next(verdicts)})
+    monkeypatch.setattr("nedbus.transport.write_probe.probe_writes", lambda *_, **__: {"1": next(verdicts)})
     permission = permission_of(zenoh_session, endpoint, pki, "1")
     refused, pause = outcome
     assert [permission.check() for _ in history][-1] == pause
@@ -496,7 +553,7 @@ def test_probes_continue_after_a_panic(
             raise BaseException(verdict)  # noqa: TRY002 - like pyo3's PanicException, it is not an Exception
         return {"1": verdict}
 
-    monkeypatch.setattr(f"{PERMISSION}probe_writes", probe)
+    monkeypatch.setattr("nedbus.transport.write_probe.probe_writes", probe)
     permission = permission_of(zenoh_session, endpoint, pki, "1")
     permission.start()
     wait_for(lambda: permission.refused == {"1": False}, what="the next probe")
@@ -517,7 +574,7 @@ def test_unreachable_or_open_router_is_not_reported_as_refusing(
 ) -> None:
     """A router does not count as refusing if it has older rules or no access control, or if it is stopped or frozen."""
     timings.probe_open, timings.probe = 0.1, 0.5
-    monkeypatch.setattr(f"{PERMISSION}_CONFIRMED", 1)
+    monkeypatch.setattr(f"{PERMISSION}CONFIRMED", 1)
     file, endpoint = configured
     shipped = file.read_text()
     file.write_text(shipped.replace("@doctor", "@probe"))

@@ -2,8 +2,7 @@
 
 import pytest
 import zenoh
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 import nedbus
 from nedbus.timings import Timings

@@ -27,8 +27,7 @@ from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import RouterState, Session, open_client, open_router, query_routers, read_router_config, router
 from nedbus.transport.router import parse_state, raise_file_limit
-from tests.peers.certificates import CONFIG
-from tests.peers.certificates import write_config as write_shipped
+from tests.peers.certificates import CONFIG, write_config as write_shipped
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.peers.zenohd import start_zenohd

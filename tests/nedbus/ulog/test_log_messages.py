@@ -126,6 +126,7 @@ CHECKS = {
     "No connection to the ground control station", "Offboard requires local position", "Home position not set",
     "No valid attitude estimate", "Attitude failure detected", "Horizontal position unstable",
     "No valid global position estimate", "No valid local position estimate", "No valid data from barometer 0",
+    "No valid data from Compass 0",
 }  # fmt: skip
 
 

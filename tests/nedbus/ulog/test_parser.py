@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from pyulog import ULog
 
 from nedbus.ulog import Damage, Data, Dropout, LoggedText, Record, Subscription, UlogError, UlogParser

@@ -175,6 +175,18 @@ def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: st
     assert [each for each in texts if each[2] < 4.5] == []
 
 
+def test_phone_shows_a_single_column(url: str, tab: Open, fly: Fly) -> None:
+    """A phone, which lays pages without a viewport out as on a desktop, shows the parts below each other."""
+    fly("wing")
+    page = tab(width=390, height=844, is_mobile=True)
+    page.open(url)
+    until(lambda: list(page.states) == ["wing"], "the vehicle")
+    assert page.page.evaluate("innerWidth") == 390
+    wait_for_none(page.layout_problems, "phone")
+    lefts = [page.page.locator(f"div.{name}").first.bounding_box() for name in ("list", "map", "nums", "plots")]
+    assert all(box is not None and box["x"] < 20 for box in lefts), lefts
+
+
 def test_cut_off_text_has_a_visible_hint(web: Web, tab: Open, tmp_path: Path) -> None:
     """Modes and the table of streams are not cut off; a scrollable card has a bright bottom edge."""
     others = "vehicle_attitude", "home_position", "vehicle_land_detected", "vehicle_global_position"

@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 
 from nedbus import Sample
+from nedbus.client import LogStreamStatus
 from nedbus.events import EventLog, Times
 from nedbus.monitoring import Snapshot
 from nedbus.web.event_timeline import EventTimeline
 from nedbus.web.fleet import TRUTH
-from nedbus.web.stream import COLUMNS, POINTS, PageStream
+from nedbus.web.stream import COLUMNS, POINTS, PageStream, Position
 from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection
 from tests.flights.messages import VALID, VLP, message
@@ -148,6 +149,15 @@ def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:
     assert sim.fleet.snapshot.alarms == ["no link to tcp/ground:7447"]
 
 
+def test_losses_on_the_link_of_a_vehicle_are_in_the_count_of_the_page(sim: SimulatedFleet) -> None:
+    """The page has one count of lost messages: those lost after publishing, and about those of the ULog stream."""
+    sim.fly(1)
+    assert sim.poll().lost == "0"
+    log = LogStreamStatus("wing", "streaming", lost=740, lost_messages=5731, gaps=1)
+    assert sim.poll(logs={"wing": log}).lost == "about 5,731"
+    assert sim.vehicle(logs={"wing": log}).lost == 5731
+
+
 def test_vehicles_are_sorted_by_severity_then_name(sim: SimulatedFleet) -> None:
     """Vehicles are sorted by severity, then by name in natural order: uav-2 before uav-10."""
     flags: dict[str, dict[str, object]] = {
@@ -252,7 +262,7 @@ def test_last_position_is_the_last_valid_position(sim: SimulatedFleet) -> None:
     assert sim.vehicle().last_position == "none yet"
     sim.fly(1, x=3.0, y=-4.0, z=-5.0)
     sim.fly(1, xy_valid=False, x=77.0, y=77.0)
-    assert sim.vehicle().last_position == "3.0 m north, -4.0 m east, altitude 5.0 m"
+    assert sim.vehicle().last_position == "3.0 m north, -4.0 m east, height 5.0 m"
     sim.fly(1, **ZURICH, x=10.0, z=-12.0)
     sim.fly(1, **ZURICH, xy_valid=False, x=77.0)
     assert sim.vehicle().last_position == "10.0 m north, 0.0 m east, altitude 500.0 m (47.397832, 8.545594)"
@@ -270,9 +280,9 @@ def test_vehicles_with_global_origins_share_one_origin(sim: SimulatedFleet) -> N
     sim.fly(1, lost, x=1.0, y=2.0)
     places = {row.vehicle: row.main.stream.valid for row in sim.poll().vehicles}
     assert all(places.values())
-    assert places["wing"] == pytest.approx((2.0, 1.0, 488.0, True), abs=1e-3)
-    assert places["quad"] == pytest.approx((52.0, 101.0, 488.0, True), abs=0.05)
-    assert places["lost"] == (2.0, 1.0, 0.0, False)
+    assert places["wing"] == pytest.approx((2.0, 1.0, 488.0, True, True), abs=1e-3)
+    assert places["quad"] == pytest.approx((52.0, 101.0, 488.0, True, True), abs=0.05)
+    assert places["lost"] == Position(2.0, 1.0, 0.0, common=False, is_altitude_global=False)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])

@@ -26,7 +26,7 @@ from websockets.sync.client import ClientConnection, connect
 from nedbus.monitoring import Page
 from nedbus.timings import Timings
 from nedbus.web.server import PageOptions, WebServer, _log_once
-from tests.nedbus.web.page import in_thread
+from tests.nedbus.web.page import in_thread, serving_live
 from tests.peers.ports import free_port
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
@@ -90,6 +90,12 @@ def test_pages_of_other_origins_get_no_websocket(url: str) -> None:
         assert not is_answered(url, origin)
     assert is_answered(url, url)
     assert is_answered(url, "http://ground.example:8420")
+
+
+def test_page_has_the_viewport_of_a_phone(endpoint: str) -> None:
+    """Without a viewport, a phone lays the page out as on a desktop instead of in a single column."""
+    with serving_live(endpoint) as url, urllib.request.urlopen(url, timeout=DEADLINE) as page:  # noqa: S310 - our own
+        assert '<meta name="viewport" content="width=device-width' in page.read().decode()
 
 
 def test_write_methods_and_large_bodies_are_refused(url: str) -> None:

@@ -16,9 +16,9 @@ import pytest
 from bokeh.document import Document
 from bokeh.document.events import ColumnsPatchedEvent
 from bokeh.models import ColumnDataSource
+from bokeh.models.annotations import Legend
 from bokeh.plotting import figure
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import nedbus
 from nedbus.client import LogStreamStatus, RejectionReport
@@ -332,7 +332,7 @@ def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
     page = Page(sim)
     (badge,), (verdict,) = page.texts("why", "badge"), page.texts("why", "verdict")
     assert badge.split(maxsplit=1)[1] == page.states["wing"] == "dead reckoning"
-    assert verdict.removeprefix("position valid throughout, but ").startswith("dead reckoning from")
+    assert re.match(r"position valid since \d\d:\d\d:\d\d\.\d UTC, but dead reckoning from", verdict)
 
 
 def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> None:
@@ -430,6 +430,17 @@ def test_plots_are_added_one_by_one(sim: SimulatedFleet) -> None:
         other._drawn.value = drawn
         other.update()
         assert len(other._grid.children) == count
+
+
+def test_legend_does_not_cover_the_lines(sim: SimulatedFleet) -> None:
+    """A plot with several lines names them above its frame, not inside, where the lines are."""
+    sim.fly(3, WING)
+    plots: list[Any] = Page(sim, query="?vehicle=wing").viewer._grid.children
+    legends = [(plot, legend) for plot in plots for legend in plot.select({"type": Legend})]
+    assert [[item.label.value for item in legend.items] for _, legend in legends] == [
+        ["eph", "epv", "error to ground truth [m]"]
+    ]
+    assert all(legend in plot.above and legend not in plot.center for plot, legend in legends)
 
 
 def test_px4_texts_are_quoted_and_escaped(sim: SimulatedFleet) -> None:

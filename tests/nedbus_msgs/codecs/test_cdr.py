@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from nedbus_msgs import DecodeError, EncodeError, VehicleLocalPosition

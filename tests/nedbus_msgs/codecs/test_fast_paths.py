@@ -11,8 +11,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 from pydantic import ValidationError, field_validator
 
 from nedbus_msgs import DEFAULT, DecodeError, EncodeError, InvalidMessageError, Row, VehicleLocalPosition

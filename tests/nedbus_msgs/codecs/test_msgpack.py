@@ -7,8 +7,7 @@ import struct
 
 import msgpack
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 from nedbus_msgs import PAYLOAD_LIMIT, DecodeError, EncodeError, UnknownLayoutError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_message

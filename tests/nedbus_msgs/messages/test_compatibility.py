@@ -18,6 +18,7 @@ from nedbus_msgs import NedbusError, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE
 from tests.flights.local_position import (
     LAYOUTS,
+    decode as decode_payload,
     decode_row,
     describe,
     encode_fields,
@@ -26,7 +27,6 @@ from tests.flights.local_position import (
     message_definition,
     type_hash,
 )
-from tests.flights.local_position import decode as decode_payload
 from tests.nedbus_msgs.strategies import DATA, FLIGHTS, REAL
 
 SNAPSHOT: Final = DATA / "vehicle_local_position.json"

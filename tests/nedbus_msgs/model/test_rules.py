@@ -34,8 +34,8 @@ PUBLISHED: Final[list[tuple[str, dict[str, Any]]]] = [
     ("BatteryStatus", {"remaining": 1.0001}),  # a current sensor that reads below 0 on a full battery
     ("BatteryStatus", {"remaining": -0.01}),  # a MAVLink battery with an unknown charge
     ("VehicleAttitude", {"q": NAN4}),
-    ("VehicleOdometry", {"q": ZEROS}),  # vision without attitude
-    ("VehicleOdometry", {"q": (1.05, 0.0, 0.0, 0.0)}),  # vision that is not normalised
+    ("VehicleOdometry", {"q": ZEROS}),  # vision without attitude, as ODOMETRY is copied
+    ("VehicleOdometry", {"q": (1.05, 0.0, 0.0, 0.0)}),  # copied from ODOMETRY; EKF2 ignores its attitude
 ]
 WRONG: Final[list[tuple[str, dict[str, Any], str]]] = [
     ("VehicleGlobalPosition", {"lon": 360.1}, "lon: must be within +-360"),

@@ -9,8 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from nedbus import __version__, bridges, monitoring
-from nedbus import web as page
+from nedbus import __version__, bridges, monitoring, web as page
 from nedbus.bridges import FOXGLOVE_PORT
 from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicsOption, VehiclesOption, command
 from nedbus.cli.output.streams import write_stderr

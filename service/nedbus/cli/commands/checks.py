@@ -3,8 +3,8 @@
 import json
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -62,6 +62,9 @@ def health(
         raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
     check = _Check(bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within))
     faults = [*check.service_faults(), *check.vehicle_faults()]
+    for remark in check.outdated():
+        if remark not in faults:
+            write_stderr(to_text(f"nedbus: {remark}", MAX_TEXT))
     if json_output:
         counts = {"services": len(check.services), "sources": len(check.sources), "vehicles": check.ages}
         write(json.dumps({"healthy": not faults, "reason": faults[0] if faults else None, **counts, "faults": faults}))
@@ -89,34 +92,40 @@ class _Check:
         self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
         self._routers = " or ".join(bus.routers)
         self._is_local = count is None and not expected.expect and expected.vehicles is None
-        self.services = [each for each in bus.services() if not self._is_local or each.host == _HOST]
-        self.sources = [source for service in self.services for source in service.sources]
+        self._statuses = [each for each in bus.services() if not self._is_local or each.host == _HOST]
+        self.services = dict.fromkeys(each.service for each in self._statuses)
+        self.sources = {(each.service, source.source) for each in self._statuses for source in each.sources}
+        # A source occurs once for each of its vehicles.
+        self._sources = [source for status in self._statuses for source in status.sources]
         self.ages: dict[str, float] = {}  # as measured by the services
-        for source in self.sources:
-            for stream in source.streams:
-                name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
-                if age is not None and stream.address in source.addresses:
-                    self.ages[name] = min(age, self.ages.get(name, age))
+        for status in self._statuses:
+            for source in status.sources:
+                for stream in source.streams:
+                    name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
+                    is_published = stream.address in source.addresses
+                    if age is not None and name == status.vehicle and is_published:  # its word on others does not count
+                        self.ages[name] = min(age, self.ages.get(name, age))
         self._reports = bus.accounts(within=expected.within or 0.0)
         self._known = {name for report in self._reports for name in report.vehicles}
         self._publishers = bus.publishers()
         self._answers: list[Sample[Message]] = []
-        if vehicle is not None or expected.vehicles is not None or set(expected.expect) - self._known:
+        if expected.expect or expected.vehicles is not None:
             only = expected.expect[0] if len(expected.expect) == 1 and expected.vehicles is None else ANY
             self._answers = [sample for sample in bus.latest(ANY, vehicle=only) if not sample.stored]
         # The status also lists streams that the router's access rules drop.
         self._is_refused = False
         if vehicle is not None:
             latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]
-            self._is_refused = vehicle in self.ages and not latencies
+            refused = {name for status in self._statuses for name in status.refused}
+            self._is_refused = (vehicle in self.ages or vehicle in refused) and not latencies
             measured = min((max(0.0, each) for each in latencies if each is not None), default=None)
             newest = self.ages.get(vehicle, measured)
             self.ages = {vehicle: newest} if latencies and newest is not None else {}
 
     def service_faults(self) -> Iterator[str]:
         """Yield at most one fault: of a service or a source, or that the newest message is missing or too old."""
-        refused = sorted({to_text(name, 64) for service in self.services for name in service.refused})
-        failed = [source for source in self.sources if source.state in {"retrying", "failed"}]
+        refused = sorted({to_text(name, 64) for status in self._statuses for name in status.refused})
+        failed = [source for source in self._sources if source.state in {"retrying", "failed"}]
         if self._count is not None and len(self.services) < self._count:
             yield f"{len(self.services)} of {self._count} services answer at {self._routers}"
         elif not self.services and self._is_local:
@@ -127,10 +136,11 @@ class _Check:
         elif failed and self._vehicle is None:
             source = failed[0]
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
-        elif overloaded := [each for each in self.sources if each.overload]:
+        elif overloaded := [each for each in self._sources if each.overload]:
             yield f"{to_text(overloaded[0].source)}: {to_text(overloaded[0].overload, 300)}"
         elif not self.ages and (self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)):
-            states = ", ".join(f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self.sources)
+            texts = (f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self._sources)
+            states = ", ".join(dict.fromkeys(texts))
             others = sorted({each.vehicle for each in self._publishers} - {self._vehicle})[:20]
             only = f" (published: {', '.join(others)})" if others and not self._is_refused else ""
             what = f"vehicle {self._vehicle} is not published{only}" if self._vehicle else "no vehicle is published"
@@ -152,23 +162,59 @@ class _Check:
         for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
             if not expected.expect or name in expected.expect:
                 yield f"vehicle {name} has several publishers: stop one, or give it another vehicle id"
-        vehicles: dict[str, VehicleReport] = {}
-        for sample in others:
-            if sample.topic == DEFAULT_TOPIC:
-                unknown = tuple(sample.missing.intersection(VALID.values()))
-                invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
-                flags = dict.fromkeys(invalid)
-                vehicles[sample.vehicle] = VehicleReport("info", "ok", flags=flags, has_position=True, unknown=unknown)
-            vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
-        reports = [*self._reports, AccountReport("", _HOST, 0.0, vehicles)]
-        for fault in faults_of(reports, expected, only=_HOST if self._is_local else None):
+        reports = [*self._reports, AccountReport("", _HOST, 0.0, _reports_of(others))]
+        faults = faults_of(reports, expected, only=_HOST if self._is_local else None)
+        for fault in (*faults, *self._faults_of_answers(faults)):
             if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
                 yield fault
-        if expected.valid or expected.within is not None:
+        yield from self._faults_of_history()
+
+    def _faults_of_answers(self, known: Sequence[str]) -> Iterator[str]:
+        """Yield faults of expected vehicles that their own answers and tokens show, beyond the `known` ones."""
+        alive = {address.vehicle for address in self._publishers}
+        answered = {sample.vehicle for sample in self._answers}
+        for name in self._expected.expect:
+            if any(fault.startswith(f"vehicle {name}") for fault in known):
+                continue
+            if self._publishers.complete and name not in alive:
+                yield f"vehicle {name} is missing: it has no publisher, although a service reports it"
+            elif name not in answered:
+                yield f"vehicle {name} does not answer a query for its last messages"
+            else:
+                own = _reports_of(sample for sample in self._answers if sample.vehicle == name)
+                asked = replace(self._expected, expect=(name,), vehicles=None)
+                yield from faults_of([AccountReport("", _HOST, 0.0, own)], asked)
+
+    def outdated(self) -> Iterator[str]:
+        """Yield a line for each older service: its reports are not used."""
+        for status in self._statuses:
+            if status.is_outdated:
+                where = f"service {to_text(status.service, 64)} on {to_text(status.host or 'an unknown host', 64)}"
+                version = f"nedbus {to_text(status.version or 'of an unknown version', 20)}"
+                yield f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
+
+    def _faults_of_history(self) -> Iterator[str]:
+        if not self._expected.expect:  # else the vehicles are asked, and an unrelated service is no fault of theirs
+            yield from self.outdated()
+        if self._expected.valid or self._expected.within is not None:
             with_history = {report.service for report in self._reports}
+            outdated = {status.service for status in self._statuses if status.is_outdated}
             for service in self.services:
-                if service.service not in with_history:
-                    yield f"service {to_text(service.service, 64)} keeps no event history: update nedbus on its host"
+                if service not in with_history and service not in outdated:
+                    yield f"service {to_text(service, 64)} keeps no event history: update nedbus on its host"
+
+
+def _reports_of(answers: Iterable[Sample[Message]]) -> dict[str, VehicleReport]:
+    """Return a report on each vehicle from its own last messages."""
+    vehicles: dict[str, VehicleReport] = {}
+    for sample in answers:
+        if sample.topic == DEFAULT_TOPIC:
+            unknown = tuple(sample.missing.intersection(VALID.values()))
+            invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
+            flags = dict.fromkeys(invalid)
+            vehicles[sample.vehicle] = VehicleReport("info", "ok", flags=flags, has_position=True, unknown=unknown)
+        vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
+    return vehicles
 
 
 @command

@@ -2,8 +2,9 @@
 
 import json
 import math
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -50,6 +51,10 @@ _MAX_TEXT: Final = 400  # characters of a peer's text
 _WITHIN: Final = "First show the events of the last SECONDS"
 _ORIGIN: Final = "PX4's own log messages, or events derived by nedbus"
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
+_LOSS_KINDS: Final = frozenset({"lost", "dropout"})
+_LOSS_QUERY: Final = 5.0  # s between queries of the services for losses
+_LOSS_TIMEOUT: Final = 1.0  # s
+_LOSS_WINDOW: Final = 60.0  # s; a loss is reported up to 25 s after it began
 _DAY: Final = 86_400.0
 
 
@@ -143,6 +148,7 @@ def why(
             reports = bus.accounts(within=_DAY)
             published = bus.vehicles()
             routers = " or ".join(bus.routers)
+            absence = "" if by_vehicle(reports) else _explain_absence(bus)
         found = _in_order(event for report in reports for event in report.events)
         times, where, advice = Times(is_live=True), "the history of the services", _LIVE_ADVICE
     reporting, faults, texts = by_vehicle(reports), 0, list[str]()
@@ -151,7 +157,7 @@ def why(
             hint = f"follow it with 'nedbus events --vehicle {name}'"
             raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
     if not files and not reporting:
-        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: start one with 'nedbus serve'")
+        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: {absence}")
     _require_vehicles(where, reporting, vehicle or ())
     for name in vehicle or reporting:
         events = [event for event in found if event.vehicle in (name, ANY)]
@@ -179,16 +185,22 @@ def why(
         write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
 
 
+def _explain_absence(bus: "Bus") -> str:
+    from nedbus.cli.absence import explain_absence  # loads Zenoh, which files do not need
+
+    return explain_absence(bus, ()).reason
+
+
 def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
     yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
-    sections = {"before it": story.before, "meanwhile": story.meanwhile}
+    sections = {"evidence": story.before, "meanwhile": story.meanwhile}
     if story.end is not None:
         sections[f"ended at {times.text(story.end)}{' with' * bool(story.after)}"] = story.after
     for title, shown in sections.items():
         if shown or title.startswith("ended"):
             yield f"  {title}"
         for each in shown:
-            yield _timed(each, times, story.since if title == "before it" else None)
+            yield _timed(each, times, story.since if title == "evidence" else None)
     if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before it"
     if story.lacking:
@@ -234,12 +246,14 @@ def _follow(
 
     observer, seen = Observer(bus, selection), 0
     known: set[str] = set()
+    losses = _LinkLosses(bus)
 
     def show_new() -> None:
         nonlocal seen
         observer.poll()
         new, seen = observer.event_log.events_since(seen)
         show(event.later(clock.to_utc()) for event in new)
+        show(losses.poll())
         known.intersection_update(observer.event_log.vehicles)
         for name, each in list(observer.event_log.vehicles.items()):
             if name not in known and each.main is not None:
@@ -249,6 +263,36 @@ def _follow(
 
     with observer.subscription as subscription:
         follow(bus, subscription, observer.add, count=None, duration=duration, each_second=show_new)
+
+
+class _LinkLosses:
+    """Losses on the links of vehicles and logging dropouts: only the services that receive the vehicles know them."""
+
+    def __init__(self, bus: "Bus") -> None:
+        self._bus = bus
+        self._shown: set[tuple[object, ...]] = set()
+        self._next_query = 0.0
+        self.poll()  # earlier ones are shown by --within
+
+    def poll(self) -> list[Event]:
+        """Return what the services have reported since the last call; ask them at most every 5 s."""
+        now = time.monotonic()
+        if now < self._next_query:
+            return []
+        self._next_query = now + _LOSS_QUERY
+        found = {
+            (report.service, event.vehicle, *event.identity): _on_link(event, report.service)
+            for report in self._bus.accounts(within=_LOSS_WINDOW, timeout=_LOSS_TIMEOUT)
+            for event in report.events
+            if event.kind in _LOSS_KINDS
+        }
+        new = [event for key, event in found.items() if key not in self._shown]
+        self._shown |= found.keys()
+        return _in_order(new)
+
+
+def _on_link(event: Event, service: str) -> Event:
+    return replace(event, text=f"{event.text}, on the link to the service {service}")
 
 
 def _name(files: Sequence[Path]) -> str:

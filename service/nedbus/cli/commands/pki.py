@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from nedbus import clock
-from nedbus import pki as certificates
+from nedbus import clock, pki as certificates
 from nedbus.cli.options import JsonOption, allow_one, command
 from nedbus.cli.output.streams import counted, write, write_stderr
 from nedbus.cli.output.table import to_table

@@ -8,11 +8,21 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus.cli.absence import explain_absence
 from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
+from nedbus.client import (
+    Bus,
+    Health,
+    ServiceStatus,
+    SourceStatus,
+    StreamStatus,
+    describe_stream,
+    health_of_last,
+    stream_state,
+)
 from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
@@ -33,15 +43,18 @@ _MAX_WARNINGS: Final = 5  # shown per source: damage of its file, or the first r
 def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption = False) -> None:
     """List the published streams with the state of each and the age of its last message.
 
-    Exits with 1 if the given vehicle is not published, or if the router is too slow or refuses the query.
+    A stream is stale by the rule of `nedbus hz`, if a service publishes it: services report its usual interval.
+    Without any, states the reason: a failed source, a vehicle's lost link, another prefix.
+    Exits with 1 then, if the given vehicle is not published, and if the router is too slow or refuses the query.
     """
     selection = Selection(ANY, vehicle or ANY)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=selection.vehicles)}
-    rows = []
+    measured = _measured_by_services(bus) if newest else {}
+    rows, is_fault = [], False
     for address in sorted({*filter(selection.matches, everything), *newest}):
         sample = newest.get(address)
-        health = health_of_last(sample) if sample else None
+        health = health_of_last(sample, measured=measured.get(str(address))) if sample else None
         state = stream_state(health, publishers=everything[address]) if health else None
         age = health.age if health else None
         is_stored = sample is not None and sample.stored
@@ -54,16 +67,21 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
-        hint = "start a source with 'nedbus serve'" if everything.complete else "not all streams are listed: try again"
-        if others := sorted({address.vehicle for address in everything}):
-            hint = f"choose one of {to_text(', '.join(others[:20]))}"
-        elif bus.services():
-            hint = "a service answers: see 'nedbus info' and the access rules for it and this client (docs/security.md)"
+        published = {address.vehicle for address in everything}
+        hint, is_fault = "not all streams are listed: try again", True
+        if everything.complete or published:
+            hint, is_fault = explain_absence(bus, published, vehicle or ())
         what = f"no vehicle {' or '.join(vehicle)}" if vehicle else "no vehicle"
         known = "is published" if everything.complete else "is known yet"
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
-    if not everything.complete or (not rows and vehicle):
+    if not everything.complete or (not rows and (vehicle or is_fault)):
         raise typer.Exit(1)
+
+
+def _measured_by_services(bus: Bus) -> dict[str, Health]:
+    """Return the health of the streams that services report, by address; one message reveals no usual interval."""
+    sources = [source for service in bus.services() for source in service.sources]
+    return {stream.address: stream.health for source in sources for stream in source.streams}
 
 
 @command
@@ -96,8 +114,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
     for service in services[:_MAX_ROWS]:
-        name, version, role = map(to_text, (service.service, service.version, service.role))
-        write(f"\nservice {name}, nedbus {version}, as {role}")
+        write(f"\n{_head_of(service)}")
         rows = [
             [*map(to_text, (
                 each.source, each.state, each.published, each.rejected,
@@ -136,7 +153,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a message, or its supported layouts.
 
-    The schema of a message that is not built in is requested from its publisher.
+    The schema of a message that is not built in is requested from its publisher, by its name or its topic's.
     """
     try:
         definition: Definition[Any] = definition_of(message)
@@ -145,21 +162,33 @@ def schema(
     write(json.dumps(definition.schema()["layouts" if layouts else "json_schema"], indent=2))
 
 
-def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
-    reason = "and no such topic is published"
+def _ask_publisher(open_bus: Callable[[], Bus], name: str) -> Definition[Any]:
+    """Return the definition of a published message, given by the name of its topic or its own."""
+    reason = "and no such message or topic is published"
+    is_message_name = name[:1].isupper()
     try:
-        get_topic(topic)  # raises AddressError for "*"
+        if not is_message_name:
+            get_topic(name)  # raises AddressError for "*"
         with open_bus() as bus:
-            for sample in bus.latest(topic):
+            for sample in bus.latest(ANY if is_message_name else name):
                 message: Message = sample.message
-                return message.DEFINITION
+                if name in (message.DEFINITION.name, sample.topic):
+                    return message.DEFINITION
     except AddressError:
         pass
     except ConnectError as exc:
         reason = f"and no publisher can be queried ({exc})"
-    near = get_close_matches(topic, [*MESSAGES, *TOPICS], 3, _SIMILAR)
+    near = get_close_matches(name, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
-    raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
+    raise ConfigError("message", f"unknown message {name!r}, {reason}: {hint}")
+
+
+def _head_of(service: ServiceStatus) -> str:
+    name, version, role, host = map(to_text, (service.service, service.version, service.role, service.host))
+    if service.is_outdated:
+        reason = "its status does not name its vehicle, and is not shown: update nedbus on its host"
+        return f"service {name} on {host}, nedbus {version}: {reason}"
+    return f"service {name}, nedbus {version}, as {role}, vehicle {to_text(service.vehicle)}"
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

@@ -11,6 +11,7 @@ from nedbus.client import Sample, format_duration
 from nedbus.errors import ConfigError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, Message, message_doubts
+from nedbus_msgs.frames import derive, derived_from
 
 from .streams import csv_line
 from .table import COLUMN_GAP, fit_columns, terminal_width
@@ -129,6 +130,10 @@ def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     head = asdict(sample.address) | {name: getattr(sample, name) for name in ("received", "sent", "lost", "source")}
     head |= {"missing": sorted(sample.missing)} | ({"stored": True} if sample.stored else {})
     message = sample.message.model_dump_json(include=set(fields) or None)
+    derived = {name: derive(sample.message, name) for name in _derived_fields(sample.message, fields)}
+    if derived:
+        numbers = {name: value if math.isfinite(value) else "NaN" for name, value in derived.items()}
+        message = json.dumps(json.loads(message) | numbers, separators=(",", ":"))
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 
 
@@ -165,6 +170,9 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
     for name in fields or types:
         if name == "timestamp":
             continue
+        if name in _derived_fields(message, fields):
+            row.append((name, str(derive(message, name))))
+            continue
         value = getattr(message, name, "")
         digits = _DIGITS.get(types[name].base) if name in types else None
         if isinstance(value, tuple):
@@ -174,7 +182,15 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
     return [*row, ("state", message_doubts(message, sample.missing))] if message.DEFINITION is DEFAULT else row
 
 
+def _derived_fields(message: Message, fields: Sequence[str]) -> list[str]:
+    """Return those of the fields that are not PX4's, but derived from its fields."""
+    known = derived_from(message.DEFINITION.types)
+    return [name for name in fields if name in known]
+
+
 def _to_value(sample: Sample[Any], name: str) -> str:
+    if _derived_fields(sample.message, [name]):
+        return f"{derive(sample.message, name):.9g}"
     kind = sample.message.DEFINITION.types.get(name)
     return "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
 

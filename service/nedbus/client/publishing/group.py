@@ -23,7 +23,7 @@ MAX_HOLD: Final = 0.005
 _QUICK: Final = 0.0002  # s between two messages of a quick succession
 _AT_ONCE: Final = 16  # messages of a succession that are handed over at once, before the first group
 
-Outgoing = tuple[bytes, zenoh.Timestamp, str]
+Outgoing = tuple[bytes, zenoh.Timestamp, zenoh.Encoding]
 """Payload, time of publication and encoding of a message."""
 
 

@@ -29,7 +29,8 @@ FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 class Publisher(AbstractContextManager["Publisher"]):
     """Publisher of the messages of one address; get one from `bus.publisher(...)`.
 
-    A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
+    A history cache keeps messages for readers that missed some: 20 s at the topic's nominal rate, at least 400
+    messages. The last message answers queries.
     `publish` does not wait for readers: Zenoh drops what a link does not accept within 1 ms. A lossless publisher slows
     down to 10 messages per second while a reader in mode "every" has more than 2,000 unread messages.
     Not thread-safe. A context manager.
@@ -43,6 +44,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         registry: PublisherRegistry,
         listener: MatchingListener,
         lossless: bool,
+        short_history: bool,
         source: str | None,
         owner: object,
     ) -> None:
@@ -56,10 +58,14 @@ class Publisher(AbstractContextManager["Publisher"]):
         self._registry, self._owner = registry, owner  # the owner keeps the bus open
         self.definition = definition
         self._codec, self._all = codec_of(definition), definition.all_fields
-        self._encoding = self._declared = encoding_of(definition, source)
-        self._partial: tuple[Set[str], str] = self._all, self._encoding  # of the last message with missing fields
+        # Objects, not texts: Zenoh would copy a text into each message of the history cache, and objects are shared.
+        self._encoding = zenoh.Encoding(encoding_of(definition, source))
+        # Of the last message with missing fields.
+        self._partial: tuple[Set[str], zenoh.Encoding] = self._all, self._encoding
         topic = get_topic(address.topic)
-        cache = CACHE if lossless else topic.kept
+        cache = topic.kept_for_source(self._codec.size) if short_history else topic.kept
+        if lossless:
+            cache = CACHE
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         # Not beside a router in this process: its session hands messages over without waking a thread.
         groups = lossless and registry.is_client
@@ -94,7 +100,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def relabel(self, source: str) -> None:
         """Set the source of all subsequent messages, which readers see in `sample.source`."""
         if source != self.source:
-            self.source, self._encoding = source, encoding_of(self.definition, source)
+            self.source, self._encoding = source, zenoh.Encoding(encoding_of(self.definition, source))
             self._partial = self._all, self._encoding
 
     def publish(self, message: Message | Mapping[str, object]) -> None:
@@ -157,10 +163,12 @@ class Publisher(AbstractContextManager["Publisher"]):
         If the process ends without a flush, messages in transit to a slow reader are lost, but not counted as lost.
         A disconnected reader detects the messages it missed, and recovers those still in the history cache.
 
-        Raises ClosedError once the bus is closed.
+        Raises ClosedError once the bus is closed, RefusedError if the access rules of the router drop the messages.
         """
         if self._group is not None:
             self._group.hand_over()
+        if self._registry.permission is not None:
+            self._registry.permission.require(self.address.vehicle)
         return self._flow_control.wait_for_reception(self._writer.published, timeout=timeout)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
@@ -196,7 +204,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         if len(provided) != len(self._all):
             known = self._partial[0]
             if provided is not known and provided != known:  # rare: usually the same fields are missing
-                self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
+                text = encoding_of(self.definition, self.source, frozenset(provided))
+                self._partial = frozenset(provided), zenoh.Encoding(text)
             encoding = self._partial[1]
         message = payload, self._new_timestamp(), encoding
         if (group := self._group) is None:

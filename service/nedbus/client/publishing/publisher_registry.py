@@ -21,6 +21,7 @@ from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Select
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
+from .publish_permission import PublishPermission
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, QueryServer
 from .writer import Heartbeats
@@ -35,10 +36,23 @@ class PublisherRegistry:
     """Create the publishers of a session, one per address, and reply to queries for their last messages.
 
     `is_client`: the session is a client, and reaches readers through a router.
+    `on_vehicle`: called before the first publisher of a vehicle.
+    `permission`: checks whether the router accepts what is published; None without a client certificate.
     """
 
-    def __init__(self, session: Session, queries: QueryServer, *, prefix: str, is_client: bool) -> None:
+    def __init__(
+        self,
+        session: Session,
+        queries: QueryServer,
+        *,
+        prefix: str,
+        is_client: bool,
+        on_vehicle: Callable[[str], None] = lambda _: None,
+        permission: PublishPermission | None = None,
+    ) -> None:
+        self.permission = permission
         self.prefix, self.is_client = prefix, is_client
+        self._on_vehicle = on_vehicle
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
         self.publishers: dict[Address, Publisher] = {}  # open publishers
@@ -55,12 +69,14 @@ class PublisherRegistry:
         definition: Definition[Any] | None = None,
         *,
         lossless: bool = False,
+        short_history: bool = False,
         source: str | None = None,
         owner: object = None,
     ) -> Publisher:
         """Return a new publisher for an address; the publisher keeps `owner` alive.
 
         `definition`: required for a topic that is not in BY_TOPIC.
+        `short_history`: for one of the many streams of a source; see `Topic.kept_for_source`.
 
         Raises AddressInUseError if the address has a publisher, AddressError for an unknown topic.
         """
@@ -76,8 +92,9 @@ class PublisherRegistry:
                 self._add_vehicle(address.vehicle)
             listener = self._rate_listeners[address.vehicle]
             publisher = self.publishers[address] = Publisher(
-                address, definition, registry=self, listener=listener, lossless=lossless, source=source, owner=owner
-            )
+                address, definition, registry=self, listener=listener, lossless=lossless, short_history=short_history,
+                source=source, owner=owner,
+            )  # fmt: skip
             undo.pop_all()
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
             if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
@@ -136,6 +153,7 @@ class PublisherRegistry:
     def _add_vehicle(self, vehicle: str) -> None:
         prefix, selection = self.prefix, Selection(vehicle=vehicle)
         schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
+        self._on_vehicle(vehicle)
         self._directories[vehicle] = VehicleDirectory(
             partial(LivelinessTokens, self._session, *selection.alive_key_exprs(prefix=prefix)), prefix=prefix
         )
@@ -161,7 +179,10 @@ class PublisherRegistry:
 
 def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:
     """Reply with the last messages of a vehicle; a strong reference would keep the registry and its bus alive."""
-    for publisher in tuple(found.publishers.values()) if (found := registry()) is not None else ():
+    found = registry()
+    if found is None or (found.permission is not None and found.permission.is_refused(vehicle)):
+        return  # this process sees what others see
+    for publisher in tuple(found.publishers.values()):
         matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
         if matches and publisher.last is not None:
             payload, stamp, encoding = publisher.last

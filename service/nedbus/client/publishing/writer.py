@@ -28,7 +28,7 @@ class Writer:
     """Put payloads of one topic on one key, with a history cache of `cache` messages."""
 
     def __init__(
-        self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: str | None = None
+        self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: zenoh.Encoding | None = None
     ) -> None:
         self.session, self.key, self.published = heartbeats.session, key, 0
         self.priority = Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA

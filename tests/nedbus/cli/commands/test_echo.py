@@ -270,6 +270,19 @@ def test_echo_csv_has_a_row_per_message(endpoint: str, bus: nedbus.Bus) -> None:
         assert datetime.fromisoformat(each["utc"]).timestamp() == pytest.approx(int(each["sent"]) / 1e9, abs=1e-5)
 
 
+def test_echo_offers_derived_fields_by_name(endpoint: str, bus: nedbus.Bus) -> None:
+    """--field accepts height, speed and angles in every format; they are NaN while invalid."""
+    fields = VALID | {"z": -12.5, "vx": 3.0, "vy": 4.0, "v_xy_valid": False}
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1, **fields))
+    names = "--field", "height,speed"
+    [row] = csv.DictReader(echo(endpoint, "--csv", *names, "--once").out.splitlines())
+    assert (row["height"], row["speed"]) == ("12.5", "nan")
+    found = json.loads(echo(endpoint, "--json", *names, "--once").out)["message"]
+    assert found == {"height": 12.5, "speed": "NaN"}
+    assert "height 12.5  speed nan" in echo(endpoint, *names, "--once").out
+
+
 def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
     """Every position row includes its state, whatever fields are selected; the message counts follow on stderr."""
     bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))

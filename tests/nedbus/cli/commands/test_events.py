@@ -8,9 +8,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import re
 import struct
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +20,12 @@ import pytest
 
 import nedbus
 from nedbus import Address
-from nedbus.events import KINDS
+from nedbus.cli.commands.events import _LinkLosses
+from nedbus.client import QueryServer, reply_parts
+from nedbus.events import KINDS, EventLog, report_of
 from nedbus.flights import format_of, read_file_events
 from nedbus.transport import Session
+from nedbus_msgs import status_key
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, cached_events
 from tests.peers.command_line import CommandResult, run_command
@@ -45,7 +50,7 @@ Evidence: 5.000 dead reckoning. Not in the data: {MISSING}.
 WHY = f"""\
 {VERDICT}
 1: xy and vxy not valid from 8.000 to 12.000 s since boot (4.0 s)
-  before it
+  evidence
     5.000  dead reckoning (3.0 s before)
   ended at 12.000 with
     12.000  dead reckoning ended after 7.0 s
@@ -160,7 +165,7 @@ def test_real_flight_has_expected_events() -> None:
     fault = "xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
     begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix lost: 3D to none, satellites 10 to 0"
     assert story.startswith(begin)
-    assert f"\n\n1: {fault}\n  before it\n    23:08:59.8  GPS fix" in story
+    assert f"\n\n1: {fault}\n  evidence\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
 
 
@@ -289,7 +294,7 @@ def test_why_without_router_or_service_fails(endpoint: str) -> None:
     assert len(result.err.splitlines()) == 1
     result = run_command("why", "-c", endpoint)
     assert (result.exit_code, result.err) == (
-        1, f"nedbus: no nedbus service at {endpoint} has data on any vehicle: start one with 'nedbus serve'\n"
+        1, f"nedbus: no nedbus service at {endpoint} has data on any vehicle: start a source with 'nedbus serve'\n"
     )  # fmt: skip
 
 
@@ -327,7 +332,7 @@ def test_why_live_uses_service_history(
     clock = r"\d\d:\d\d:\d\d\.\d"
     fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
     begin = rf"1: was not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
-    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", result.out)
+    assert re.match(rf"{begin}\n\n1: {fault}\n  evidence\n", result.out)
     assert "to publish them, add them to PX4's dds_topics.yaml" in result.out
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # end of the fault
     assert since_boot.out.startswith("1: not usable: xy and vxy not valid")
@@ -415,6 +420,32 @@ def test_events_live_are_printed_as_they_happen(
     lines = [line.split(None, 2)[1:] for line in follower.out.splitlines()]
     assert [line[0] for line in lines] == ["7"] * len(lines)
     assert lines[0][1].startswith("BAD    xy not valid")
+
+
+def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """Live `events` shows losses that a service reports, once each: begin, duration, count and the service."""
+    event_log, address = EventLog(), Address("7", VLP)
+    server = QueryServer(zenoh_session)
+    server.answer_json(
+        status_key("gcs"),
+        lambda _: reply_parts(report_of(event_log, "gcs", "host", 200.0, within=math.inf, to_utc=1.7e9)),
+    )
+
+    def lose(start: int) -> None:
+        for second in range(8):
+            event_log.add(address, message(second), float(start + second), lost=100)
+        event_log.settle(start + 20.0)
+
+    with closing(server):
+        lose(100)
+        losses = _LinkLosses(bus)
+        lose(150)
+        losses._next_query = 0.0
+        shown = losses.poll()
+        again = losses.poll()
+    text = f"800 messages lost in 7.0 s ({VLP}), on the link to the service gcs"
+    assert [(event.vehicle, event.text, event.time) for event in shown] == [("7", text, 1.7e9 + 150)]
+    assert again == []
 
 
 def test_events_live_filter_by_vehicle_and_severity(

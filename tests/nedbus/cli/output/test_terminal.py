@@ -212,9 +212,9 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
 @pytest.mark.process
 def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_session: Session) -> None:
     """The table shows the number of gone streams; their addresses are listed below it, unsplit on a terminal."""
-    gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
+    gone = [f"wing-1/vehicle_local_position_{number}" for number in range(5)]
     sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
-    service = answer(zenoh_session, "nedbus/@service/s/status", {"service": "s", "sources": sources})
+    service = answer(zenoh_session, "nedbus/@service/wing-1/s/status", {"service": "s", "sources": sources})
     info = run_command("info", "-c", endpoint)
     assert info.exit_code == 0, info.err
     assert "  5 gone\n" in info.out
@@ -337,7 +337,7 @@ def test_malicious_status_is_escaped(endpoint: str, zenoh_session: Session) -> N
     stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
     source = {**flood[0], "stale": [EVIL], "streams": [stream, None, {"address": 1}], "addresses": EVIL}
     status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
-    hostile = answer(zenoh_session, "nedbus/@service/hostile/status", status)
+    hostile = answer(zenoh_session, "nedbus/@service/1/hostile/status", status)
     for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
         result = run_command(*arguments, "-c", endpoint)
         assert result.exit_code == (arguments[0] == "health"), result.err

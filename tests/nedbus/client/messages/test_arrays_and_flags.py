@@ -210,7 +210,7 @@ def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bu
     for wrong in ("wheel_encoders_b", "WheelEncoders", "*"):
         ended = run_command("schema", wrong, "-c", endpoint)
         assert (ended.exit_code, ended.out) == (2, "")
-        assert "and no such topic is published: known messages are VehicleLocalPosition, " in ended.err
+        assert "and no such message or topic is published: known messages are VehicleLocalPosition, " in ended.err
 
 
 def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:

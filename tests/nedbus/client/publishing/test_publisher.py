@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import numpy as np
 import pytest
 import zenoh
 
 import nedbus
+from nedbus import Counts, Mode
 from nedbus.client import PublisherRegistry, QueryServer, io_thread
-from nedbus.transport import Session, token_keys
-from nedbus_msgs import Address, VehicleLocalPosition
+from nedbus.client.publishing.group import Outgoing
+from nedbus.client.receiving import Receiver
+from nedbus.transport import Session, open_client, token_keys
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, VehicleLocalPosition, get_topic
 from nedbus_msgs.arrays import DTYPE, to_array
 from tests.flights.messages import VLP, message
+from tests.nedbus.client.lossy import LossyQueue
 from tests.nedbus.client.numbered import numbered, receive_timestamps, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
 
@@ -172,3 +177,92 @@ def assert_nothing_is_open(registry: PublisherRegistry, session: Session) -> Non
     assert not registry._directories
     assert not registry.heartbeats.writers
     wait_for(lambda: open_tokens(session) == [], what="the end of the liveliness tokens")
+
+
+UNKNOWN_RATE: Final = nedbus.define_msg("SensorCombined", "uint64 timestamp\nfloat32[3] gyro_rad")
+
+
+def recover(endpoint: str, publisher: nedbus.Publisher, sent: Iterable[nedbus.Message]) -> tuple[list[int], Counts]:
+    """Publish messages of which a reader in mode `every` misses all but the first and the last; return what it gets."""
+    first, *missed, last = sent
+    queue = LossyQueue(publisher.key)
+    queue.missing = range(1, len(missed) + 1)
+    with closing(open_client([endpoint], timeout=DEADLINE)) as session:
+        receiver = Receiver(session, queue)
+        with nedbus.Subscription[Any](receiver, queue, owner=None) as subscription:
+            wait_for_subscriber(publisher)
+            for each in (first, *missed, last):
+                publisher.publish(each)
+            received = [subscription.receive(DEADLINE).message.timestamp]
+            while received[-1] != last.timestamp:
+                received.append(subscription.receive(DEADLINE).message.timestamp)
+            return received, subscription.counts
+
+
+@pytest.mark.parametrize("excess", [0, 3])
+@pytest.mark.parametrize("topic", list(DEFAULT.topics))
+def test_20_s_of_a_position_topic_are_recovered(endpoint: str, bus: nedbus.Bus, topic: str, excess: int) -> None:
+    """A reader recovers 20 s of each position topic at its nominal rate, at least 400 messages, and counts older ones.
+
+    The last message reveals the gap, so the history holds one message less.
+    """
+    instance = 0 if get_topic(topic).instances else None
+    publisher = bus._publishers.publisher(Address("1", topic, instance), short_history=True)
+    depth = max(400, round(20 * get_topic(topic).rate))
+    sent = [message(timestamp) for timestamp in range(depth + 1 + excess)]
+    received, counts = recover(endpoint, publisher, sent)
+    assert received == [0, *range(1 + excess, len(sent))]
+    assert counts == Counts(received=len(received), lost=excess)
+
+
+@pytest.mark.parametrize("excess", [0, 3])
+@pytest.mark.parametrize(("is_source", "depth"), [(True, 50), (False, 400)])
+def test_messages_of_a_topic_without_a_rate_are_recovered(
+    endpoint: str, bus: nedbus.Bus, is_source: bool, depth: int, excess: int
+) -> None:
+    """A reader recovers 50 messages of a source's topic without a nominal rate, and 400 of a script's.
+
+    It counts older ones as lost.
+    """
+    address, model = Address("1", "home_position"), BY_TOPIC["home_position"].model
+    publisher = bus._publishers.publisher(address, short_history=is_source)
+    sent = [model.model_validate({"timestamp": timestamp}) for timestamp in range(depth + 1 + excess)]
+    received, counts = recover(endpoint, publisher, sent)
+    assert received == [0, *range(1 + excess, len(sent))]
+    assert counts == Counts(received=len(received), lost=excess)
+
+
+@pytest.mark.parametrize("mode", ["latest", "every"])
+def test_late_reader_gets_the_last_message_of_a_topic_sent_on_change(
+    client: nedbus.Bus, bus: nedbus.Bus, mode: Mode
+) -> None:
+    """A reader that joins later gets the last message of a topic sent on change, or whose rate is unknown.
+
+    It does not depend on the other messages that the vehicle publishes meanwhile.
+    """
+    home = bus.publisher("home_position", vehicle="1")
+    other = bus.publisher("sensor_combined", vehicle="1", definition=UNKNOWN_RATE)
+    home.publish({"timestamp": 1, "lat": 47.0, "lon": 8.0, "alt": 400.0, "valid_hpos": True, "valid_alt": True})
+    for timestamp in range(300):
+        other.publish({"timestamp": timestamp, "gyro_rad": (0.0, 0.0, 0.0)})
+    for topic, timestamp in (("home_position", 1), ("sensor_combined", 299)):
+        with client.subscribe(topic, mode=mode) as subscription:
+            sample = subscription.receive(DEADLINE)
+            assert (sample.message.timestamp, sample.retained) == (timestamp, True)
+
+
+def test_messages_share_one_encoding(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All messages with the same source and missing fields have one encoding object: the history holds it once."""
+    publisher, put = bus.publisher(VLP, vehicle="1", source="a"), list[Outgoing]()
+    monkeypatch.setattr(publisher._writer, "put", put.extend)
+    for source in ("a", "b"):
+        publisher.relabel(source)
+        for timestamp in range(3):
+            publisher.publish(message(timestamp))
+        for timestamp in range(3):
+            publisher.publish({"timestamp": timestamp, "x": 1.0})
+    encodings = [encoding for _, _, encoding in put]
+    assert len(encodings) == 12
+    for start in range(0, 12, 3):
+        assert all(encoding is encodings[start] for encoding in encodings[start : start + 3])
+    assert len({str(encoding) for encoding in encodings}) == 4

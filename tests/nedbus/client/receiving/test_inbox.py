@@ -16,18 +16,21 @@ import zenoh
 
 import nedbus
 from nedbus import Batch, Counts, Mode
-from nedbus.client.receiving import Decoder, Inbox, LayoutLookup
-from nedbus.client.receiving import inbox as module
-from nedbus.client.receiving import streams as streams_module
-from nedbus.client.receiving import unread as unread_module
+from nedbus.client.receiving import (
+    Decoder,
+    Inbox,
+    LayoutLookup,
+    inbox as module,
+    streams as streams_module,
+    unread as unread_module,
+)
 from nedbus.client.receiving.arrival import Stream
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
 from nedbus.client.receiving.unread import CAPACITY
 from nedbus.client.receiving.writer_proxy import NUMBERS, WriterProxy
 from nedbus.timings import Timings
 from nedbus.transport import RawSample
-from nedbus_msgs import Codec, Definition, codec_of
-from nedbus_msgs import encoding_of as provenance_encoding
+from nedbus_msgs import Codec, Definition, codec_of, encoding_of as provenance_encoding
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.local_position import encode, encoding_of
 from tests.waits import DEADLINE, wait_for

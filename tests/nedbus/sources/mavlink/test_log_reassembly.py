@@ -13,8 +13,7 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.mavlink.log_reassembly import Chunk, Reassembly, Verdict

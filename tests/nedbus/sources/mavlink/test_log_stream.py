@@ -32,8 +32,7 @@ from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STOP, STREAMS, Entry, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
-from .test_log_reassembly import compare as compare_records
-from .test_log_reassembly import deliver, recorded, to_messages
+from .test_log_reassembly import compare as compare_records, deliver, recorded, to_messages
 
 MESSAGES: Final = 47_708
 """Number of messages of all topics in the stream of the flight."""

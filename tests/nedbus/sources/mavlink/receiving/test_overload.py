@@ -15,8 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LinkLoad, LiveSource, SourceMessage, parse_source
-from nedbus.sources.mavlink import log_stream
-from nedbus.sources.mavlink import source as mavlink_source
+from nedbus.sources.mavlink import log_stream, source as mavlink_source
 from nedbus.sources.mavlink.link import open_link
 from tests.flights.ulogs import write_raw_log
 from tests.peers.ports import free_port

@@ -1,0 +1,76 @@
+"""Why no vehicle, or not the requested one, is published: the reason of its source first, then other causes."""
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Final, NamedTuple
+
+from nedbus.client import Bus, ServiceStatus, SourceStatus, prefix_of
+from nedbus.transport import token_keys
+
+from .output.streams import to_text
+
+_TIMEOUT: Final = 1.0  # s for the router to list the tokens of other prefixes
+_MAX_NAMED: Final = 20  # vehicles or addresses in a hint
+_MAX_REASONS: Final = 5  # sources in a hint
+_MAX_REASON: Final = 300  # characters of the error of a source
+
+
+class Absence(NamedTuple):
+    """Why nothing is published, and the remedy; `is_fault`: True if a source or the prefix is known to be at fault."""
+
+    reason: str
+    is_fault: bool
+
+
+def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] = ()) -> Absence:
+    """Return why no vehicle is published, or none of the `wanted` ones; queries the services."""
+    services = bus.services()
+    reasons = [reason for service in services for reason in _source_reasons(service, wanted)]
+    if reasons:
+        hidden = len(reasons) - _MAX_REASONS
+        more = f"; and {hidden} more" if hidden > 0 else ""
+        return Absence(f"{'; '.join(reasons[:_MAX_REASONS])}{more}", is_fault=True)
+    if published:
+        return Absence(f"choose one of {to_text(', '.join(sorted(published)[:_MAX_NAMED]))}", is_fault=False)
+    if services:
+        advice = "see 'nedbus info' and the access rules for it and this client (docs/security.md)"
+        outdated = [service.service for service in services if service.is_outdated]
+        if outdated:
+            names = to_text(", ".join(outdated[:_MAX_NAMED]))
+            advice = f"{advice}; update nedbus on the host of {names}, which is older"
+        return Absence(f"a service answers: {advice}", is_fault=False)
+    if prefixes := _other_prefixes(bus):
+        names = " and ".join(f"{to_text(prefix)}/" for prefix in prefixes)
+        advice = f"use --prefix {to_text(prefixes[0])}"
+        reason = f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
+        return Absence(reason, is_fault=True)
+    return Absence("start a source with 'nedbus serve'", is_fault=False)
+
+
+def _other_prefixes(bus: Bus) -> list[str]:
+    """Return the first prefixes, other than this bus's, under which vehicles are published."""
+    session = bus._session  # noqa: SLF001 - a further one might exceed the limit of the router
+    keys = token_keys(session, "**/@alive/**", timeout=_TIMEOUT)
+    return sorted({prefix_of(key) for key in keys} - {"", bus.prefix})[:_MAX_REASONS]
+
+
+def _source_reasons(service: ServiceStatus, wanted: Sequence[str]) -> Iterator[str]:
+    where = f"of service {to_text(service.service)} on {to_text(service.host or 'an unknown host')}"
+    for source in service.sources:
+        if reason := _source_reason(source, wanted):
+            yield f"source {to_text(source.source)} {where} {reason}"
+
+
+def _source_reason(source: SourceStatus, wanted: Sequence[str]) -> str:
+    """Return the state of a source that publishes none of the wanted vehicles, "" if it works."""
+    error = to_text(source.error or "unknown reason", _MAX_REASON)
+    if source.state == "failed":
+        return f"has failed: {error}"
+    if source.state == "retrying":
+        return f"fails and is restarted: {error}"
+    stale = [address for address in source.stale if not wanted or address.partition("/")[0] in wanted]
+    if stale:
+        names = to_text(", ".join(stale[:_MAX_NAMED]))
+        return f"receives no more messages of {names}: check that the vehicle is on and its link is up"
+    if source.state in {"waiting", "starting"} and not source.addresses:
+        return "has received no message yet: check that the vehicle sends to it"
+    return ""

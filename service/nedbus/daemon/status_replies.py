@@ -1,0 +1,82 @@
+"""The service's replies to queries of its status and events: one key for each vehicle, with what concerns it."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from nedbus import clock
+from nedbus.client import QueryServer, ServiceStatus, reply_parts
+from nedbus.events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
+from nedbus_msgs import status_key
+
+_FRESH: Final = 0.1  # s; a query for all vehicles of a service asks once for each of them
+
+
+class StatusReplies:
+    """Reply to queries on the status keys of a service's vehicles.
+
+    `status`, `report`: return the current status, and the report of the last seconds, of all vehicles.
+    """
+
+    def __init__(
+        self,
+        queries: QueryServer,
+        service: str,
+        *,
+        prefix: str,
+        status: Callable[[], ServiceStatus],
+        report: Callable[[float], AccountReport],
+    ) -> None:
+        self._queries, self._service, self._prefix = queries, service, prefix
+        self._make_status, self._make_report = status, report
+        self._lock = threading.Lock()
+        self._vehicles: set[str] = set()
+        self._status: tuple[float, ServiceStatus] | None = None  # with the time at which it was made
+        self._report: tuple[float, float, AccountReport] | None = None  # with that time, and the period it covers
+
+    def add(self, vehicle: str) -> None:
+        """Reply for this vehicle, too, until the service ends; do nothing beyond MAX_VEHICLES."""
+        with self._lock:
+            if vehicle in self._vehicles or len(self._vehicles) >= MAX_VEHICLES:
+                return
+            self._vehicles.add(vehicle)
+        key = status_key(self._service, vehicle=vehicle, prefix=self._prefix)
+        self._queries.answer_json(key, partial(self._reply, vehicle))
+
+    def _reply(self, vehicle: str, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
+        within = parameter(ACCOUNT_PARAMETER)
+        if within is None:
+            return self._status_parts(vehicle)
+        seconds = 0.0
+        with suppress(ValueError):
+            seconds = float(within)
+        return reply_parts(self._current_report(seconds).about(vehicle))
+
+    def _status_parts(self, vehicle: str) -> Iterator[bytes]:
+        """Yield the status of a vehicle; nothing if all sources publish others, as with `sim:?vehicle=2`."""
+        status = self._current_status()
+        own = status.about(vehicle)
+        if own.sources or own.refused or not status.sources:
+            yield from reply_parts(replace(own, now=clock.utc()))
+
+    def _current_status(self) -> ServiceStatus:
+        now = time.monotonic()
+        known = self._status
+        if known is not None and now - known[0] < _FRESH:
+            return known[1]
+        status = self._make_status()
+        self._status = now, status
+        return status
+
+    def _current_report(self, within: float) -> AccountReport:
+        now = time.monotonic()
+        known = self._report
+        if known is not None and known[1] == within and now - known[0] < _FRESH:
+            return known[2]
+        report = self._make_report(within)
+        self._report = now, within, report
+        return report
