@@ -197,7 +197,7 @@ class SourceOutput:
                 event = "stream_resumed" if resumed else "published"
                 _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
             self._republish_retained(message)
-        stream.last_received, stream.last = message.due or self._now(), message
+        stream.last_received, stream.last = message.arrived or self._now(), message
         self._publish(message, stream, stream.last_received)
 
     def expire_stale(self) -> bool:

@@ -34,7 +34,7 @@ def convert(
 ) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
-    The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `due`.
+    The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `at`.
     `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
     `on_progress`: called with the number of messages handled so far.
 
@@ -73,7 +73,7 @@ def _write(
         if start is None:
             start = min(message.timestamp * 1000, _MAX_START)
         provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
-        pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
+        pending.append((message, each.address, provenance, start + round(each.at * 1e9)))
         if len(pending) == _CHUNK:
             writer.write_messages(pending)
             pending.clear()

@@ -50,7 +50,7 @@ class UtcEstimate:
         found = {stream: times for (is_other, stream), times in stamps.items() if is_other}
         with_utc = [times for (is_other, _), times in stamps.items() if not is_other]
         others = [found[DEFAULT_TOPIC]] if DEFAULT_TOPIC in found else [*found.values()]
-        used = np.concatenate([np.zeros(0), *with_utc, *others])
+        used = np.concatenate([np.zeros(0), *with_utc, *(others if with_utc else found.values())])
         if (unix := int(np.sum(is_unix_time(used)))) > len(used) / 2:
             return UtcOffset("timestamp", 0, unix, 0)
         period, reasons = _period(np.concatenate([np.zeros(0), *others])), list[str]()

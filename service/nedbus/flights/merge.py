@@ -15,10 +15,11 @@ from typing import Any, Final
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.samples import SourceMessage
+from nedbus.timeline import Order
 from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import Address, Definition
 
-from .readers import MAX_GAP, Clock, ReadOptions, open_reader, sort_by_time
+from .readers import ReadOptions, open_reader
 from .utc import estimate_utc
 from .utc_offset import UtcOffset
 
@@ -27,7 +28,7 @@ LOOKAHEAD: Final = 1000
 
 
 class FlightFile:
-    """One pass over one file: its reader, its messages in order of their due times, and its vehicles.
+    """One pass over one file: its reader, its messages in order, and its vehicles.
 
     `names`: the name of each vehicle among several files.
     """
@@ -35,9 +36,8 @@ class FlightFile:
     def __init__(self, path: Path, options: ReadOptions) -> None:
         self.path, self.options = path, options
         reader = self.reader = open_reader(path, options)
-        self._unordered: Counter[Address] = Counter()
-        self._clock = Clock(lambda: reader.start, max_behind=reader.max_behind)
-        messages = self._replay()
+        self.order = Order[SourceMessage](lambda: reader.start, has_log_times=reader.has_log_times)
+        messages = self.order.arrange(reader.messages())
         try:
             self.ahead = list(islice(messages, LOOKAHEAD))
         except BaseException:
@@ -49,14 +49,11 @@ class FlightFile:
     @property
     def warnings(self) -> list[str]:
         """Damage, omissions and times out of order so far."""
-        unordered = self._unordered.copy()
-        if isinstance(self._clock.stray, SourceMessage):
-            unordered[self._clock.stray.address] += 1
-        text = "timestamps of {} are out of order ({}); the order of the file is kept"
-        found = [*self.reader.warnings, *(text.format(*each) for each in unordered.items())]
-        if self._clock.gaps:
-            found.append(f"skipped gaps of more than {MAX_GAP // 1e6:.0f} s in the timestamps ({self._clock.gaps})")
-        return found
+        found = [*self.reader.warnings]
+        for address, count in self.order.unordered.items():
+            if address.topic != LOG_MESSAGE.name and count:  # PX4 queues log messages
+                found.append(f"timestamps of {address} are out of order ({count}); the order of the file is kept")
+        return [*found, *self.order.remarks]
 
     @cached_property
     def utc(self) -> Mapping[str, UtcOffset | str]:
@@ -70,21 +67,10 @@ class FlightFile:
         """Return the Unix time of the first message [s]; raise SourceError if it is unknown."""
         known = ((each, each.timestamp) for each in self.ahead if not each.error)
         offsets = ((self.utc.get(each.address.vehicle), each, time) for each, time in known if time is not None)
-        found = [int(utc.unix_us(time)) / 1e6 - each.due for utc, each, time in offsets if isinstance(utc, UtcOffset)]
+        found = [int(utc.unix_us(time)) / 1e6 - each.at for utc, each, time in offsets if isinstance(utc, UtcOffset)]
         if not found:
             raise no_utc(self.path, next((utc for utc in self.utc.values() if isinstance(utc, str)), ""))
         return median(found)
-
-    def _replay(self) -> Iterator[SourceMessage]:
-        messages, newest = self.reader.messages(), dict[Address, int]()
-        ordered = messages if self.reader.is_sorted else sort_by_time(messages)
-        for due, message in self._clock.pace(ordered, attrgetter("time")):
-            message.due = due / 1e6
-            time, address = message.time, message.address
-            if time < newest.get(address, 0) and address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
-                self._unordered[address] += 1
-            newest[address] = time
-            yield message
 
 
 class MergedFlights(AbstractContextManager["MergedFlights"]):
@@ -139,7 +125,7 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
             return
         starts = [file.start() for file in self.files]
         shifted = (self._shift(*each, min(starts)) for each in zip(self.files, starts, strict=True))
-        yield from merge(*shifted, key=attrgetter("due"))
+        yield from merge(*shifted, key=attrgetter("at"))
 
     @property
     def boot_utc(self) -> int:
@@ -156,7 +142,7 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
 
     def _shift(self, file: FlightFile, start: float, first: float) -> Iterator[SourceMessage]:
         for each in file.messages:
-            each.due, each.address = each.due + start - first, renamed(each.address, file.names)
+            each.at, each.address = each.at + start - first, renamed(each.address, file.names)
             yield each
         self.ended.update(file.names.values())
 

@@ -36,7 +36,8 @@ def utc_of(
     any sample until the vehicle reboots.
 
     The source is a GNSS receiver with a `time_utc_usec` other than 0, a companion's clock in `timesync_status`, or a
-    log's `boot_time_utc_us`, accepted only with a date from 2000 to 2100; Unix timestamps are used as they are.
+    log's `boot_time_utc_us`, accepted only with a date from 2009-02-13, as in PX4, to 2100. Unix timestamps are used as
+    they are.
     A receiver may correct its UTC in flight, at most twice and by up to 20 s; the last part then holds for all. Else
     the offset is unknown, and the reason is logged, if over 10 % of the messages are more than a second off their
     median. A source whose timestamps do not overlap those of the other messages is not used.

@@ -13,7 +13,7 @@ from nedbus.log_event import about
 from nedbus.samples import Rejection, SourceMessage
 from nedbus.timeline import RecentTimes, TimeKind
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
-from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, FIRST_UNIX_TIME, TOPICS, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
 from .boot_time import new_clock, read_time
@@ -274,7 +274,7 @@ class Vehicle:
         self._delivered.add(address, timestamp)
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(address.topic, fields, timestamp, now)
-        return self.report(SourceMessage(now, address, fields), log)
+        return self.report(SourceMessage(0.0, address, fields, arrived=now), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
@@ -348,7 +348,7 @@ class Vehicle:
             self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
             self._reset(now)
         microseconds: int = getattr(message, "time_usec", 0)
-        if 0 < microseconds < YEAR_2000:
+        if 0 < microseconds < FIRST_UNIX_TIME:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", None)
         if reading is not None:

@@ -49,7 +49,7 @@ class UnavailableTopics:
 class ReplayRun:
     """One run of a replay; its attributes are updated while the messages are iterated.
 
-    `messages`: in order of `due`; can be iterated once.
+    `messages`: in order of `at`; can be iterated once.
     `addresses`: addresses of the messages so far, each with its definition, or None for the topic's default.
     `total`: number of messages, or of bytes if `position` is set; None if endless.
     `summary`: description for the log; `warnings`: damage and skipped parts.

@@ -1,4 +1,4 @@
-"""Time of vehicles; no I/O.
+"""Time: the clocks of vehicles, the order of messages, the axis of a flight, the pace of a replay; no I/O.
 
 `VehicleClock` follows the own time of one vehicle. `add(stream, time, now)` returns what a message's time shows:
 
@@ -12,4 +12,8 @@
 | STEP | a synchronised (Unix) time was set: no reboot | as received |
 """
 
+from .arrivals import arrivals
+from .axis import Axis
+from .order import Order
+from .pace import MAX_PAUSE, Pace
 from .vehicle_clock import Reading, RecentTimes, TimeKind, VehicleClock, is_boot_possible

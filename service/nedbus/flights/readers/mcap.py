@@ -108,7 +108,6 @@ class McapReader(FlightReader):
     """
 
     kind = "mcap"
-    is_sorted = False
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)

@@ -82,13 +82,11 @@ class FlightReader(ABC):
     `definitions`: the streams so far; those of an indexed file at once. `start`: when recording began, on the clock
     of the timestamps [us], 0 if unknown. `boot_utc`: Unix time of the boot [us], 0 if unknown.
     `position`, `total`: bytes read so far, and of the file. `damaged`: True if messages were lost so far.
-    `kind`: the format, which becomes `sample.source`. `is_sorted`: False if writers batch messages by stream.
-    `max_behind`: consecutive messages far in the past that show that the clock was set back.
+    `kind`: the format, which becomes `sample.source`. `has_log_times`: False if messages have only timestamps.
     """
 
     kind = ""
-    is_sorted = True
-    max_behind = 1
+    has_log_times = True
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         self.path, self.options = path, options

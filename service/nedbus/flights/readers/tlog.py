@@ -13,10 +13,10 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.errors import SourceError
 from nedbus.mavlink import SequenceCounter, Vehicle, new_parser, parse
 from nedbus.samples import Rejection, SourceMessage
+from nedbus.timeline import arrivals
 from nedbus_msgs import BY_TOPIC, Address, Encoded
 
 from .formats import open_file
-from .order import Clock
 from .reader import FlightReader, ReadOptions, Record
 
 _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
@@ -93,8 +93,8 @@ class TlogReader(FlightReader):
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
         vehicles = self._senders
         parser, booted = new_parser(), set[int]()
-        for due, (stamp, frame) in Clock().pace(self._frames(), itemgetter(0)):
-            for item in parse(parser, frame, str(self.path), None, due / 1e6):
+        for arrived, (stamp, frame) in arrivals(self._frames(), itemgetter(0)):
+            for item in parse(parser, frame, str(self.path), None, arrived):
                 if isinstance(item, Rejection):
                     if self.position > self._end:
                         self._is_cut = True  # a record whose end was not written

@@ -61,7 +61,7 @@ def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> N
     run = open_replay(f"tlog:{path}?vehicle=a")
     replayed = [each for each in run.messages if each.address.topic == VLP]
     assert [(each.address.vehicle, each.fields["x"]) for each in replayed] == [("a", x) for x in range(100)]
-    np.testing.assert_allclose([each.due for each in replayed], [number / 10 for number in range(100)])
+    np.testing.assert_allclose([each.at for each in replayed], [number / 10 for number in range(100)])
     assert not run.warnings
     assert run_command("events", str(path)).exit_code == 0
     assert run_command("convert", str(path), str(tmp_path / "a.mcap")).exit_code == 0
@@ -69,9 +69,9 @@ def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> N
     assert nedbus.missing_of(nedbus.read(tmp_path / "a.mcap")) == nedbus.missing_of(positions)
 
 
-@pytest.mark.parametrize(("seconds", "kept"), [(60.0, 60.0), (60.2, 0.0), (-3600.0, 0.0)])
-def test_pauses_of_over_a_minute_are_skipped(tmp_path: Path, seconds: float, kept: float) -> None:
-    """A replay keeps pauses of up to a minute; longer ones and backward steps of the host's clock take no time."""
+@pytest.mark.parametrize("seconds", [20.0, 60.2, -5.0, -3600.0])
+def test_step_of_the_hosts_clock_takes_no_time(tmp_path: Path, seconds: float) -> None:
+    """The vehicle's clock determines how much time passed, not that of the ground station."""
     path = tmp_path / "flight.tlog"
     records = list(frames(7, 20))
     middle = len(records) // 2
@@ -79,8 +79,8 @@ def test_pauses_of_over_a_minute_are_skipped(tmp_path: Path, seconds: float, kep
         (stamp,) = struct.unpack_from(">Q", records[index])
         records[index] = struct.pack(">Q", stamp + round((seconds - 0.1) * 1e6)) + records[index][8:]
     path.write_bytes(b"".join(records))
-    due = [each.due for each in open_replay(f"tlog:{path}").messages if each.address.topic == VLP]
-    np.testing.assert_allclose(np.diff(due), [*[0.1] * 9, kept, *[0.1] * 9], atol=1e-6)
+    due = [each.at for each in open_replay(f"tlog:{path}").messages if each.address.topic == VLP]
+    np.testing.assert_allclose(np.diff(due), [0.1] * 19, atol=1e-6)
 
 
 def test_autopilots_in_tlog_are_separate_vehicles(tmp_path: Path) -> None:
