@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from nedbus.timeline import MAX_PAUSE, Order, Pace
 from nedbus_msgs import Address

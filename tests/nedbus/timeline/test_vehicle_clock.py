@@ -1,8 +1,7 @@
 """A vehicle's own time: what is a reboot, and what is a copy, a late message, a wrap, a wild time or a step."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from nedbus.timeline import TimeKind, VehicleClock, is_boot_possible
 
