@@ -10,8 +10,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from heapq import heappop, heappush, heappushpop
-from itertools import islice
 from statistics import median_low
 from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
@@ -24,6 +22,7 @@ _MAX_LATE: Final = 60_000_000  # us; a message that arrived later than this is o
 _MAX_GAP: Final = 30 * 86_400_000_000  # us; a longer pause between two log times is a damaged one
 _MAX_LAST: Final = 86_400_000_000  # us; a last message further ahead has a damaged timestamp
 _CONFIRM: Final = 20  # messages in a row that show that a clock has changed
+_AGREEING: Final = 3  # streams that show together that a clock has gone on
 _OPENING: Final = 1000  # messages from which the start of a file is determined; PX4 first logs an old one of each topic
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
@@ -109,6 +108,8 @@ class _Track(Generic[M]):
         if place is None:
             self.doubtful.append(item)
             return self._decide() if len(self.doubtful) >= _CONFIRM or self._is_set_back() else []
+        if self._has_gone_on():
+            return [*self._decide(), *self.add(item)]
         earlier = self._outliers(self.doubtful, newest)
         self.doubtful = []
         return [*earlier, (place, item)]
@@ -181,6 +182,14 @@ class _Track(Generic[M]):
             found.append((self.base + (item.stamp if is_late else newest), item))
         return found
 
+    def _has_gone_on(self) -> bool:
+        """Return whether several streams went on after the same pause, while others still have earlier messages."""
+        ahead = [each for each in self.doubtful if each.stamp > self.newest]
+        if len(ahead) < _AGREEING:
+            return False
+        middle = median_low([each.stamp for each in ahead])
+        return len({id(each.stream) for each in ahead if abs(each.stamp - middle) <= _NEAR}) >= _AGREEING
+
     def _is_set_back(self) -> bool:
         """Return whether a synchronized clock was set back: a stream goes on from an earlier time."""
         last = self.doubtful[-1]
@@ -196,7 +205,7 @@ class _Track(Generic[M]):
         index = next(
             number
             for number, each in enumerate(items)
-            if each.stamp <= middle and (each.stamp > self.newest) == is_ahead and is_unix_time(each.stamp) == is_unix
+            if abs(each.stamp - middle) <= _NEAR and (each.stamp > self.newest) == is_ahead
         )
         first = items[index]
         if not self._is_possible(items, first, is_ahead=is_ahead, is_unix=is_unix, is_end=is_end):
@@ -250,6 +259,7 @@ class Order(Generic[M]):
         self.unordered: Counter[Address] = Counter()
         self._start, self._has_log_times = start, has_log_times
         self._zero: int | None = None
+        self._place_of_last: int | None = None  # of the messages that were yielded
         self._tracks: dict[str, _Track[M]] = {}
         self._anchors: tuple[list[int], list[int]] = [], []  # numbers of messages, and place minus log time from there
         self._candidate: int | None = None  # place minus log time of the last message, if it differs
@@ -265,7 +275,38 @@ class Order(Generic[M]):
 
     def arrange(self, messages: Iterable[M]) -> Iterator[M]:
         """Yield the messages in order, each with `at`, which does not decrease."""
-        return self._sorted(messages) if self._has_log_times else self._in_file_order(messages)
+        waiting: list[tuple[int, int, M]] = []  # place, number, message
+        opening: list[_Item[M]] = []
+        tracks = self._tracks
+        has_log_times = self._has_log_times
+        for number, message in enumerate(messages):
+            stream, log = message.logged, message.time
+            stamp = 0 if message.error is not None else message.timestamp or 0 if has_log_times else log
+            track = tracks.get(message.address.vehicle) or self._track_of(message.address.vehicle)
+            if (
+                track.is_open
+                and -_NEAR <= stamp - track.newest <= _NEAR
+                and not track.doubtful
+                and stamp >= track.last.get(stream, 0)
+                and (not has_log_times or (track.lag is not None and -_NEAR <= log - stamp - track.lag <= _NEAR))
+            ):
+                track.last[stream] = stamp
+                if stamp > track.newest:
+                    track.newest = stamp
+                    track.log = log if has_log_times else None
+                if has_log_times:
+                    track.lag = log - stamp
+                waiting.append((track.base + stamp, number, message))
+            else:
+                item = _Item(message, stream, stamp, log if has_log_times else None, number)
+                waiting += self._place(item, opening)
+            if len(waiting) >= 2 * _BUFFER:
+                waiting.sort()
+                yield from self._emit(waiting[:_BUFFER])
+                del waiting[:_BUFFER]
+        waiting += self._end(opening)
+        waiting.sort()
+        yield from self._emit(waiting)
 
     def _track_of(self, vehicle: str) -> _Track[M]:
         def on_part(place: int, stamp: int) -> None:
@@ -275,128 +316,60 @@ class Order(Generic[M]):
         self._tracks[vehicle] = track
         return track
 
-    def _in_file_order(self, messages: Iterable[M]) -> Iterator[M]:
-        """Yield the messages of a log: one vehicle, without log times."""
-        source = iter(messages)
-        first_messages = islice(source, _OPENING)
-        opening = [_Item(each, each.logged, _stamp_of(each, each.time), None, 0) for each in first_messages]
-        if not opening:
-            return
-        track = self._track_of(opening[0].message.address.vehicle)
-        first = _first_of(opening, self._start())
-        self._zero = first.stamp
-        track.begin(first, first.stamp)
-        self.axis.zero = first.stamp
-        place = first.stamp
-        last = track.last
-        for item in opening:
-            for found, placed in track.add(item):
-                place = max(place, found)
-                placed.message.at = (place - self._zero) / 1e6
-                yield placed.message
-        zero = self._zero
-        for message in source:
-            stamp, stream = message.time, message.logged
-            newest = track.newest
-            if (
-                newest <= stamp <= newest + _NEAR
-                and not track.doubtful
-                and message.error is None
-                and stamp >= last.get(stream, 0)
-            ):
-                last[stream] = track.newest = stamp
-                place = max(place, track.base + stamp)
-                message.at = (place - zero) / 1e6
-                yield message
-                continue
-            for found, placed in track.add(_Item(message, stream, _stamp_of(message, stamp), None, 0)):
-                place = max(place, found)
-                placed.message.at = (place - zero) / 1e6
-                yield placed.message
-        for found, placed in track.end():
-            place = max(place, found)
-            placed.message.at = (place - zero) / 1e6
-            yield placed.message
+    def _place(self, item: _Item[M], opening: list[_Item[M]]) -> list[tuple[int, int, M]]:
+        """Return the messages whose places are known now; those of a new vehicle wait in `opening`."""
+        track = self._tracks[item.message.address.vehicle]
+        if track.is_open:
+            return self._placed(track.add(item))
+        opening.append(item)
+        enough = _OPENING if self._zero is None else _OPENING_LATER
+        if len(opening) < enough:
+            return []
+        placed = self._placed(self._begin(opening))
+        opening.clear()
+        return placed
 
-    def _sorted(self, messages: Iterable[M]) -> Iterator[M]:  # noqa: PLR0912 - the fast path stays in one loop
-        """Yield the messages of a recording: several vehicles, and streams in batches."""
-        waiting: list[tuple[int, int, M]] = []
-        opening: list[_Item[M]] = []
-        tracks = self._tracks
-        number = 0
-        emit = self._emit
-        for number, message in enumerate(messages):
-            address, log = message.address, message.time
-            stamp = 0 if message.error is not None else message.timestamp or 0
-            track = tracks.get(address.vehicle) or self._track_of(address.vehicle)
-            stream = message.logged
-            if (
-                track.lag is not None
-                and -_NEAR <= stamp - track.newest <= _NEAR
-                and -_NEAR <= log - stamp - track.lag <= _NEAR
-                and not track.doubtful
-                and stamp > track.last.get(stream, 0)
-            ):
-                track.last[stream] = stamp
-                if stamp >= track.newest:
-                    track.newest, track.log = stamp, log
-                track.lag = log - stamp
-                placed = track.base + stamp
-                if len(waiting) < _BUFFER:
-                    heappush(waiting, (placed, number, message))
-                else:
-                    yield emit(heappushpop(waiting, (placed, number, message)))
-                continue
-            item = _Item(message, stream, stamp, log, number)
-            if track.is_open:
-                found = track.add(item)
-            else:
-                opening.append(item)
-                enough = _OPENING if self._zero is None and not waiting else _OPENING_LATER
-                if len(opening) < enough:
-                    continue
-                found = self._begin(opening)
-                opening = []
-            self._watch(found)
-            for placed, each in found:
-                heappush(waiting, (placed, each.number, each.message))
-            while len(waiting) > _BUFFER:
-                yield emit(heappop(waiting))
-        found = self._begin(opening)
-        for track in tracks.values():
-            found += track.end()
-        self._watch(found)
-        for placed, each in found:
-            heappush(waiting, (placed, each.number, each.message))
-        while waiting:
-            yield emit(heappop(waiting))
+    def _end(self, opening: list[_Item[M]]) -> list[tuple[int, int, M]]:
+        """Return the places of the messages that still wait."""
+        placed = self._begin(opening)
+        for track in self._tracks.values():
+            placed += track.end()
+        return self._placed(placed)
 
-    def _emit(self, entry: tuple[int, int, M]) -> M:
-        place, _, message = entry
-        if self._zero is None or place < self._zero:
-            self._zero = place if self._zero is None else self._zero
-            self.axis.zero = self._zero
-            self._place = self._zero
-        self._place = max(self._place, place)
-        message.at = (self._place - self._zero) / 1e6
-        return message
+    def _placed(self, placed: _Placed[M]) -> list[tuple[int, int, M]]:
+        self._watch(placed)
+        return [(place, item.number, item.message) for place, item in placed]
+
+    def _emit(self, placed: Iterable[tuple[int, int, M]]) -> Iterator[M]:
+        """Yield sorted messages with their times on the axis; those from before its zero are at 0."""
+        zero = self._zero or 0
+        newest = self._place_of_last or zero
+        for place, _, message in placed:
+            if place > newest:
+                newest = place
+            message.at = (newest - zero) / 1e6
+            yield message
+        self._place_of_last = newest
 
     def _begin(self, opening: Sequence[_Item[M]]) -> _Placed[M]:
         """Place the first messages of vehicles on the axis; the log times place the vehicles against each other."""
         by_vehicle = defaultdict[str, list[_Item[M]]](list)
         for item in opening:
             by_vehicle[item.message.address.vehicle].append(item)
-        firsts = {name: _first_of(items, 0) for name, items in by_vehicle.items()}
+        start = 0 if self._has_log_times else self._start()
+        firsts = {name: _first_of(items, start) for name, items in by_vehicle.items()}
         for name, first in sorted(firsts.items(), key=lambda each: each[1].number):
-            log = first.log or 0
-            self._tracks[name].begin(first, log + self._offset_at(first.number))
+            time = first.stamp if first.log is None else first.log
+            self._tracks[name].begin(first, time + self._offset_at(first.number))
             if not self._anchors[0]:
                 self._anchors[0].append(first.number)
                 self._anchors[1].append(0)
-        found: _Placed[M] = []
+        if self._zero is None and firsts:
+            self._zero = self.axis.zero = min(track.base + track.newest for track in self._tracks.values())
+        placed: _Placed[M] = []
         for item in opening:
-            found += self._tracks[item.message.address.vehicle].add(item)
-        return found
+            placed += self._tracks[item.message.address.vehicle].add(item)
+        return placed
 
     def _offset_at(self, number: int) -> int:
         numbers, offsets = self._anchors
@@ -462,5 +435,5 @@ def _first_of(items: Sequence[_Item[M]], start: int) -> _Item[M]:
 def _is_old(first: _Item[M], second: _Item[M], start: int) -> bool:
     """Return whether the first message of a stream was sent long before its recording began."""
     if first.log is None or second.log is None:
-        return first.stamp < start - _NEAR <= second.stamp - _NEAR
+        return first.stamp < start <= second.stamp
     return (second.stamp - first.stamp) - (second.log - first.log) > _NEAR
