@@ -36,7 +36,7 @@ class FlightFile:
     def __init__(self, path: Path, options: ReadOptions) -> None:
         self.path, self.options = path, options
         reader = self.reader = open_reader(path, options)
-        self.order = Order[SourceMessage](lambda: reader.start, has_log_times=reader.has_log_times)
+        self.order = Order[SourceMessage](reader.start_of, has_log_times=reader.has_log_times)
         messages = self.order.arrange(reader.messages())
         try:
             self.ahead = list(islice(messages, LOOKAHEAD))
@@ -126,6 +126,17 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
         starts = [file.start() for file in self.files]
         shifted = (self._shift(*each, min(starts)) for each in zip(self.files, starts, strict=True))
         yield from merge(*shifted, key=attrgetter("at"))
+
+    @property
+    def starts(self) -> Mapping[str, int]:
+        """The timestamp of each vehicle at the first message of its file [us]."""
+        found = dict[str, int]()
+        for file in self.files:
+            for own, name in file.names.items():
+                stamp = file.order.axis.stamp_at(own, 0.0)
+                if stamp is not None and stamp > 0:
+                    found[name] = stamp
+        return found
 
     @property
     def boot_utc(self) -> int:

@@ -26,7 +26,7 @@ _AGREEING: Final = 3  # streams that show together that a clock has gone on
 _OPENING: Final = 1000  # messages from which the start of a file is determined; PX4 first logs an old one of each topic
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
-_QUEUED: Final = "log_message"  # PX4 queues texts, so the first ones of a log may be from long before it
+_QUEUED: Final = ("log_message", "event")  # PX4 queues these: the first ones of a log may be from long before it
 _MAX_STEPS: Final = 1000  # changes of the recorder's clock that are kept, to place a vehicle that appears later
 
 
@@ -239,25 +239,32 @@ class _Track(Generic[M]):
             return len(items) > 1 or (is_end and is_same and first.stamp - self.newest <= _MAX_LAST)
         if len(items) == 1:
             return False
-        if is_unix or self.is_unix or first.log is None or self.log is None:
+        if first.log is None or self.log is None:  # a log: a few streams may have waited in a queue
+            set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
+            return len(set_back) >= min(_AGREEING, len(self.last))
+        if is_unix or self.is_unix:
             return True
         elapsed = first.log - self.log
         return elapsed < 0 or first.stamp <= elapsed + _NEAR  # nothing runs for longer than it has existed
 
 
+def _unknown(_: str) -> int:
+    return 0
+
+
 class Order(Generic[M]):
     """The messages of one file in order, each with its time on the axis of the file.
 
-    `start`: returns when recording began, on the vehicle's clock [us], 0 if unknown; called at the first message.
+    `start_of`: returns when the recording of a vehicle began, on its clock [us], 0 if unknown.
     `has_log_times`: False for a log that has only timestamps: its order is that of the file.
 
     `axis`: the places of the vehicles' clocks. `unordered`: messages whose timestamps are out of order, by address.
     """
 
-    def __init__(self, start: Callable[[], int] = int, *, has_log_times: bool = True) -> None:
+    def __init__(self, start_of: Callable[[str], int] = _unknown, *, has_log_times: bool = True) -> None:
         self.axis = Axis()
         self.unordered: Counter[Address] = Counter()
-        self._start, self._has_log_times = start, has_log_times
+        self._start_of, self._has_log_times = start_of, has_log_times
         self._zero: int | None = None
         self._place_of_last: int | None = None  # of the messages that were yielded
         self._tracks: dict[str, _Track[M]] = {}
@@ -345,8 +352,7 @@ class Order(Generic[M]):
         zero = self._zero or 0
         newest = self._place_of_last or zero
         for place, _, message in placed:
-            if place > newest:
-                newest = place
+            newest = max(newest, place)
             message.at = (newest - zero) / 1e6
             yield message
         self._place_of_last = newest
@@ -356,8 +362,7 @@ class Order(Generic[M]):
         by_vehicle = defaultdict[str, list[_Item[M]]](list)
         for item in opening:
             by_vehicle[item.message.address.vehicle].append(item)
-        start = 0 if self._has_log_times else self._start()
-        firsts = {name: _first_of(items, start) for name, items in by_vehicle.items()}
+        firsts = {name: _first_of(items, self._start_of(name)) for name, items in by_vehicle.items()}
         for name, first in sorted(firsts.items(), key=lambda each: each[1].number):
             time = first.stamp if first.log is None else first.log
             self._tracks[name].begin(first, time + self._offset_at(first.number))
@@ -410,12 +415,15 @@ def _first_of(items: Sequence[_Item[M]], start: int) -> _Item[M]:
             streams[item.stream].append(item)
     if not streams:
         return items[0]
-    current = {stream: own for stream, own in streams.items() if own[0].message.address.topic != _QUEUED}
+    current = {stream: own for stream, own in streams.items() if own[0].message.address.topic not in _QUEUED}
     streams = current or streams
     for own in streams.values():
-        if len(own) > 1 and _is_old(own[0], own[1], start):
+        if len(own) > 1 and _is_old(own[0], own[1]):
             del own[0]
-    advancing = [own for own in streams.values() if len(own) > 1 and own[0].stamp < own[-1].stamp]
+    advancing = _advancing(streams.values())
+    since_start = _advancing([item for item in own if item.stamp >= start] for own in streams.values())
+    if start and since_start:
+        advancing = since_start
     if not advancing:
         known = [own[0] for own in streams.values() if own[0].stamp >= start - _NEAR] if start else []
         return min(known or [own[0] for own in streams.values()][:1], key=lambda each: each.stamp)
@@ -432,8 +440,13 @@ def _first_of(items: Sequence[_Item[M]], start: int) -> _Item[M]:
     return min((own[0] for own in together), key=lambda each: each.stamp)
 
 
-def _is_old(first: _Item[M], second: _Item[M], start: int) -> bool:
+def _advancing(streams: Iterable[list[_Item[M]]]) -> list[list[_Item[M]]]:
+    """Return the streams whose timestamps advance."""
+    return [own for own in streams if len(own) > 1 and own[0].stamp < own[-1].stamp]
+
+
+def _is_old(first: _Item[M], second: _Item[M]) -> bool:
     """Return whether the first message of a stream was sent long before its recording began."""
     if first.log is None or second.log is None:
-        return first.stamp < start <= second.stamp
+        return False
     return (second.stamp - first.stamp) - (second.log - first.log) > _NEAR

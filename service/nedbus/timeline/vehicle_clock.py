@@ -14,6 +14,7 @@ _MAX_STREAMS: Final = 1000  # bounds the memory that a peer can use
 _MAX_REMEMBERED: Final = 512  # times of each stream that are known, to find copies
 _MAX_DOUBT: Final = 1.0  # s without a current message after which one stream is enough
 _MAX_OTHER: Final = 10.0  # s without a current message after which another clock counts, possible or not
+_MAX_DELAY: Final = 10_000_000  # us by which a second link may be behind; the same time, later, is another boot
 _UNKNOWN_PAUSE: Final = 60_000_000  # us that may have passed if the arrival time is unknown
 
 
@@ -99,7 +100,7 @@ class VehicleClock:
         if self.newest is None:
             return self._begin(stream, time, now, TimeKind.NEW)
         time = self.unwrap(time, now)
-        if self._known.contains(stream, time):
+        if self._known.contains(stream, time) and self._is_delay(self.newest - time, now):
             self.copies += 1
             if time >= self.newest - _MAX_LATE:
                 self._older.clear()  # a current message: the vehicle continues to run
@@ -155,6 +156,11 @@ class VehicleClock:
         self._known.add(stream, time)
         return Reading(kind, time, self.boot)
 
+    def _is_delay(self, late: int, now: float | None) -> bool:
+        """Return whether the delay of a link explains a message that is this late [us]."""
+        elapsed = self._elapsed(now)
+        return late + 1e6 * (elapsed or 0.0) <= _MAX_DELAY
+
     def _elapsed(self, now: float | None) -> float | None:
         if now is None or self._arrived is None:
             return None
@@ -179,8 +185,8 @@ class VehicleClock:
     def _is_wild(self, time: int, newest: int, now: float | None) -> bool:
         """Return whether a time is too far ahead, and the message before does not confirm it."""
         elapsed = self._elapsed(now)
-        passed = _UNKNOWN_PAUSE if elapsed is None else 1e6 * elapsed
-        is_ahead = time > newest + passed + _MAX_LATE
-        is_confirmed = abs(time - self._ahead) <= _MAX_LATE
+        passed = 0.0 if elapsed is None else 1e6 * elapsed
+        is_ahead = time > newest + passed + _UNKNOWN_PAUSE
+        is_confirmed = 0 <= time - self._ahead <= _UNKNOWN_PAUSE
         self._ahead = time if is_ahead else math.inf
         return is_ahead and not is_confirmed

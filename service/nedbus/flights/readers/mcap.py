@@ -298,6 +298,8 @@ class _RecordedFile:
         address, metadata = Address(vehicle, own.topic, own.instance), channel.metadata
         if (boot := metadata.get("boot_time_utc_us", "")[:20]).isdecimal():
             self._reader.add_boot_time(int(boot))
+        if (start := metadata.get("start_time_us", "")[:20]).isdecimal():
+            self._reader.starts[vehicle] = int(start)
         missing = frozenset(metadata.get("missing", "").split()).intersection(definition.names)
         return RecordedStream(channel.topic, address, definition, layout, missing)
 
