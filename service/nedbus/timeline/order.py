@@ -16,6 +16,7 @@ from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 from nedbus_msgs import Address, is_unix_time
 
 from .axis import Axis
+from .vehicle_clock import is_boot_possible
 
 _NEAR: Final = 1_000_000  # us; a message this much older or newer than the newest one is usual
 _MAX_LATE: Final = 60_000_000  # us; a message that arrived later than this is old, and keeps its place in the file
@@ -205,7 +206,9 @@ class _Track(Generic[M]):
         index = next(
             number
             for number, each in enumerate(items)
-            if abs(each.stamp - middle) <= _NEAR and (each.stamp > self.newest) == is_ahead
+            if each.stamp <= middle + _NEAR
+            and (each.stamp > self.newest) == is_ahead
+            and is_unix_time(each.stamp) == is_unix
         )
         first = items[index]
         if not self._is_possible(items, first, is_ahead=is_ahead, is_unix=is_unix, is_end=is_end):
@@ -245,7 +248,7 @@ class _Track(Generic[M]):
         if is_unix or self.is_unix:
             return True
         elapsed = first.log - self.log
-        return elapsed < 0 or first.stamp <= elapsed + _NEAR  # nothing runs for longer than it has existed
+        return elapsed < 0 or is_boot_possible(first.stamp, elapsed / 1e6)
 
 
 def _unknown(_: str) -> int:
