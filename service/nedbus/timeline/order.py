@@ -27,6 +27,7 @@ _AGREEING: Final = 3  # streams that show together that a clock has gone on
 _OPENING: Final = 1000  # messages from which the start of a file is determined; PX4 first logs an old one of each topic
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
+_PART: Final = 2048  # messages that are sorted and passed on at once
 _QUEUED: Final = ("log_message", "event")  # PX4 queues these: the first ones of a log may be from long before it
 _MAX_STEPS: Final = 1000  # changes of the recorder's clock that are kept, to place a vehicle that appears later
 
@@ -310,10 +311,10 @@ class Order(Generic[M]):
             else:
                 item = _Item(message, stream, stamp, log if has_log_times else None, number)
                 waiting += self._place(item, opening)
-            if len(waiting) >= 2 * _BUFFER:
+            if len(waiting) >= _BUFFER + _PART:
                 waiting.sort()
-                yield from self._emit(waiting[:_BUFFER])
-                del waiting[:_BUFFER]
+                yield from self._emit(waiting[:_PART])
+                del waiting[:_PART]
         waiting += self._end(opening)
         waiting.sort()
         yield from self._emit(waiting)
