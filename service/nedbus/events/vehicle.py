@@ -96,7 +96,7 @@ class Vehicle:
         """Note that a message without a loss before it has arrived; return whether `add` would do no more than that."""
         self.last_seen = time
         detector = self._detectors.get(address, _NEW)
-        return detector is None or time < detector.due
+        return detector is None or time < detector.resumes_at
 
     def add(self, address: Address, message: object, time: float, missing: frozenset[str]) -> None:
         """Add a message."""
@@ -107,10 +107,10 @@ class Vehicle:
             if len(self._detectors) >= _MAX_STREAMS:
                 return
             detector = self._detectors[address] = self._open(address)
-        if detector is None or time < detector.due:
+        if detector is None or time < detector.resumes_at:
             return
         if detector.pause:
-            detector.due = time + detector.pause
+            detector.resumes_at = time + detector.pause
         self._before, detector.time = detector.time, time
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)

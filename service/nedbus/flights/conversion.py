@@ -35,7 +35,8 @@ def convert(
 ) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
-    The publish time of a message is its PX4 timestamp; its log time is the vehicle's clock at the first message plus `at`.
+    The publish time of a message is its PX4 timestamp; its log time is that of the first message, by the
+    vehicle's clock, plus `at`.
     `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
     `starts`: the timestamp of each vehicle at the first message [us].
     `on_progress`: called with the number of messages handled so far.

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypedDict, Unpack, overload
 from weakref import WeakSet
 
-from nedbus.errors import ArgumentError, ClosedError, InvalidMessageError
+from nedbus.errors import ArgumentError, ClosedError, InvalidMessageError, SourceError
 from nedbus.samples import M_co, Sample
+from nedbus.timeline import UtcOffset, to_unix_ns
 from nedbus_msgs import (
     ANY,
     BY_TOPIC,
@@ -27,15 +28,13 @@ from nedbus_msgs import (
     VehicleLocalPosition,
     VehicleNames,
     codec_of,
-    is_unix_time,
     topic_of,
     vehicle_name,
 )
 
-from .merge import MergedFlights, require_files
+from .merge import MergedFlights, Survey, require_files
 from .readers import ReadOptions
 from .selection import matching
-from .utc_offset import UtcOffset
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
@@ -78,7 +77,7 @@ class Flight(AbstractContextManager["Flight"]):
     """One or more files open for reading; `nedbus.open` returns one. Its memory does not depend on their size.
 
     Call it as `bus.subscribe`, with message classes or names of topics, or "*" for all streams of the files. Each call
-    reads the files once. The properties read them once more, on first use.
+    reads the files once. The properties read them once, on first use.
     """
 
     def __init__(self, paths: Sequence[Path], *, vehicle: str, layout: str | None) -> None:
@@ -86,7 +85,7 @@ class Flight(AbstractContextManager["Flight"]):
         self._options, self._is_closed = replace(_ALL, layout=layout), False
         self._selection = Selection(vehicle=vehicle)
         self._samples = WeakSet[FlightSamples[Any]]()  # open ones, which `close` closes
-        self._open(_ALL.topics).close()  # raises the errors of unreadable files
+        self._unread: MergedFlights | None = self._open(_ALL.topics, surveys=True)  # raises errors of unreadable files
 
     @overload
     def __call__(
@@ -136,23 +135,24 @@ class Flight(AbstractContextManager["Flight"]):
     @property
     def definitions(self) -> dict[Address, Definition[Any]]:
         """The definition of each address."""
-        found = self._pass[0].definitions
+        found = self._survey[0].definitions
         return {address: known for address, known in found.items() if self._selection.matches(address)}
 
     @property
     def duration(self) -> float:
         """Seconds from the first to the last message, by the vehicle's clock, pauses included."""
-        return self._pass[1]
+        flights, surveys = self._survey
+        return flights.duration(surveys)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Damage of the files, and what was left out."""
-        return self._pass[0].warnings
+        return self._survey[0].warnings
 
     @property
     def damaged(self) -> bool:
         """True if messages are lost to damage."""
-        return self._pass[0].damaged
+        return self._survey[0].damaged
 
     @property
     def utc(self) -> UtcOffset | None:
@@ -163,6 +163,8 @@ class Flight(AbstractContextManager["Flight"]):
     def close(self) -> None:
         """Close the flight and its samples, which then raise ClosedError; a second call does nothing."""
         self._is_closed = True
+        if self._unread is not None:
+            self._unread.close()
         for samples in list(self._samples):
             samples.abort()
 
@@ -170,23 +172,23 @@ class Flight(AbstractContextManager["Flight"]):
         self.close()
 
     @cached_property
+    def _survey(self) -> tuple[MergedFlights, list[Survey]]:
+        """The files after one pass, and what it shows of each."""
+        flights, self._unread = self._unread, None
+        if flights is None:
+            flights = self._open(_ALL.topics, surveys=True)
+        return flights, flights.survey()
+
+    @property
     def _utc(self) -> dict[str, UtcOffset]:
-        with self._open(_ALL.topics) as flights:
-            return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
+        flights, _ = self._survey
+        return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
 
-    @cached_property
-    def _pass(self) -> tuple[MergedFlights, float]:
-        """The files after one pass, and the time of their last message."""
-        with self._open(_ALL.topics) as flights:
-            duration = 0.0
-            for message in flights.messages():
-                duration = message.at
-            return flights, duration
-
-    def _open(self, topics: Any) -> MergedFlights:
+    def _open(self, topics: Any, *, surveys: bool = False) -> MergedFlights:
         if self._is_closed:
             raise ClosedError
-        return MergedFlights(self._paths, replace(self._options, topics=topics))
+        known = self.__dict__.get("_survey", (None, ()))[1]
+        return MergedFlights(self._paths, replace(self._options, topics=topics), known=known, surveys=surveys)
 
     def _seconds(self, time: float | datetime, name: str) -> float:
         """Return seconds since the first message."""
@@ -195,12 +197,12 @@ class Flight(AbstractContextManager["Flight"]):
         if time.tzinfo is None:
             expected = "seconds, or a datetime with a time zone, such as datetime(2025, 10, 9, 8, 53, tzinfo=UTC)"
             raise ArgumentError(name, str(time), expected, problem="has no time zone, so it names no moment")
-        with self._open(_ALL.topics) as flights:
-            for message in flights.messages():
-                utc = self._utc.get(message.address.vehicle)
-                if utc is not None and (timestamp := message.timestamp) is not None:
-                    return time.astimezone(UTC).timestamp() - int(utc.unix_us(timestamp)) / 1e6 + message.at
-        raise ArgumentError(name, str(time), "seconds since the first message, because this flight has no UTC")
+        try:
+            start = self._survey[0].start()
+        except SourceError as exc:
+            expected = "seconds since the first message, because this flight has no UTC"
+            raise ArgumentError(name, str(time), expected) from exc
+        return time.astimezone(UTC).timestamp() - start
 
 
 class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]):
@@ -302,7 +304,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
                     self._reasons.setdefault(address, exc.reason)
                     continue
                 definition = message.definition or BY_TOPIC[address.topic]
-                time = 1000 * (message.time + (0 if is_unix_time(message.time) else flights.boot_utc))
+                time = to_unix_ns(message.time, flights.boot_utc)
                 yield address, definition, encoded, time, _provenance(message.source, encoded.missing)
         finally:
             flights.close()

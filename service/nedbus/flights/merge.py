@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from heapq import merge
 from itertools import chain, islice
@@ -15,29 +15,44 @@ from typing import Any, Final
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.samples import SourceMessage
-from nedbus.timeline import Order
+from nedbus.timeline import Order, UtcOffset
 from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import Address, Definition
 
 from .readers import ReadOptions, open_reader
-from .utc import estimate_utc
-from .utc_offset import UtcOffset
+from .utc import FileUtc, read_utc
 
 LOOKAHEAD: Final = 1000
 """Messages that are read ahead to determine the first streams and the start time of a file."""
 
 
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What a pass over a whole file shows.
+
+    `utc`: the UTC offset of each vehicle, or why it is unknown. `duration`: from the first to the last message [s].
+    """
+
+    utc: Mapping[str, UtcOffset | str]
+    duration: float
+
+
 class FlightFile:
     """One pass over one file: its reader, its messages in order, and its vehicles.
 
-    `names`: the name of each vehicle among several files.
+    `names`: the name of each vehicle among several files. `known`: what an earlier pass has found.
+    `surveys`: note what `survey` needs.
     """
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
-        self.path, self.options = path, options
+    def __init__(self, path: Path, options: ReadOptions, *, known: Survey | None = None, surveys: bool = False) -> None:
+        self.path, self.options, self._known = path, options, known
         reader = self.reader = open_reader(path, options)
         self.order = Order[SourceMessage](reader.start_of, has_log_times=reader.has_log_times)
-        messages = self.order.arrange(reader.messages())
+        self._seen = FileUtc()
+        records = reader.records()
+        if surveys:
+            records = self._seen.watch(records)
+        messages = self.order.arrange(map(reader.message_of, records))
         try:
             self.ahead = list(islice(messages, LOOKAHEAD))
         except BaseException:
@@ -57,11 +72,21 @@ class FlightFile:
 
     @cached_property
     def utc(self) -> Mapping[str, UtcOffset | str]:
-        """The UTC offset of each vehicle, by its own name, or why it is unknown; reads the file."""
+        """The UTC offset of each vehicle, by its own name, or why it is unknown; reads the file unless it is known."""
+        if self._known is not None:
+            return self._known.utc
         topics = ReadOptions().topics if self.options.topics else None  # a file may have other topics only
         with open_reader(self.path, replace(self.options, topics=topics)) as reader:
-            estimates = estimate_utc(reader)
-            return {name: each.result(reader.boot_utc) for name, each in estimates.items()}
+            return read_utc(reader)
+
+    def survey(self) -> Survey:
+        """Read all messages, and return what they show; the file must have been opened with `surveys`."""
+        duration = 0.0
+        for message in self.messages:
+            duration = message.at
+        self.reader.close()
+        self._known = Survey(self._seen.results(self.reader), duration)
+        return self._known
 
     def start(self) -> float:
         """Return the Unix time of the first message [s]; raise SourceError if it is unknown."""
@@ -77,12 +102,23 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
     """One pass over one file, or over several files merged by UTC.
 
     Vehicles with the same name in several files are named after their files. `ended`: vehicles whose file has ended.
+    `known`, `surveys`: as those of a file.
 
     Raises ArgumentError without files, ConfigError or SourceError if a file cannot be read.
     """
 
-    def __init__(self, paths: Sequence[Path], options: ReadOptions = ReadOptions()) -> None:  # noqa: B008 - immutable
-        self.files = [FlightFile(path, options) for path in require_files(paths)]
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        options: ReadOptions = ReadOptions(),  # noqa: B008 - immutable
+        *,
+        known: Sequence[Survey] = (),
+        surveys: bool = False,
+    ) -> None:
+        known_of = dict(zip(paths, known, strict=False))
+        self.files = [
+            FlightFile(path, options, known=known_of.get(path), surveys=surveys) for path in require_files(paths)
+        ]
         names = distinct_names([(file.path, file.names) for file in self.files])
         for file, own in zip(self.files, names, strict=True):
             file.names = own
@@ -117,6 +153,21 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
     def utc(self) -> Mapping[str, UtcOffset | str]:
         """The UTC offset of each vehicle, or why it is unknown; reads the files."""
         return {file.names.get(own, own): utc for file in self.files for own, utc in file.utc.items()}
+
+    def survey(self) -> list[Survey]:
+        """Read all messages of each file; the files must have been opened with `surveys`."""
+        return [file.survey() for file in self.files]
+
+    def start(self) -> float:
+        """Return the Unix time of the first message [s]; raise SourceError if it is unknown."""
+        return min(file.start() for file in self.files)
+
+    def duration(self, surveys: Sequence[Survey]) -> float:
+        """Return seconds from the first to the last message; raise SourceError if one of several files has no UTC."""
+        if len(surveys) == 1:
+            return surveys[0].duration
+        end = max(file.start() + survey.duration for file, survey in zip(self.files, surveys, strict=True))
+        return end - self.start()
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in chronological order; raise SourceError if one of several files has no UTC."""

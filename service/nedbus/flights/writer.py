@@ -65,8 +65,8 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     PX4 release has all its fields, the layout with exactly the fields that the source provides is preferred.
     PX4's log messages are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
     `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
-    vehicle's boot [us], for `utc_of` if the messages do not provide it. `starts`: when the recording of each vehicle began, on the clock of
-    its timestamps [us]: older messages belong to the time before.
+    vehicle's boot [us], for `utc_of` if the messages do not provide it. `starts`: when the recording of each vehicle
+    began, on the clock of its timestamps [us]; older messages are from before.
 
     `omitted`: messages left out beyond 1,000 channels of their vehicle, or beyond those of a file.
 
@@ -188,7 +188,8 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
             "vehicle": address.vehicle, "topic": address.topic,
             "instance": "" if address.instance is None else str(address.instance), "source": provenance.source or "",
             "boot_time_utc_us": str(self._boot_utc or ""),
-            "start_time_us": str(self._starts.get(address.vehicle, "")), "missing": " ".join(sorted(provenance.missing)),
+            "start_time_us": str(self._starts.get(address.vehicle, "")),
+            "missing": " ".join(sorted(provenance.missing)),
         }  # fmt: skip
         metadata = {name: value for name, value in known.items() if value}
         channel = self._register(f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata)

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.extras import import_optional
-from nedbus.flights import Columns, Decoded, FileStream, ReadOptions, UtcEstimate, UtcOffset, open_reader, provides_utc
+from nedbus.flights import Columns, Decoded, FileStream, ReadOptions, open_reader
+from nedbus.timeline import UtcEstimate, UtcOffset, provides_utc
 from nedbus_msgs import Address, decode_text
 from nedbus_msgs.arrays import MessageArray
 

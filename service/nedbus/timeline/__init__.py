@@ -12,8 +12,19 @@
 | STEP | a synchronised (Unix) time was set: no reboot | as received |
 """
 
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
 from .arrivals import arrivals
 from .axis import Axis
 from .order import Order
 from .pace import MAX_PAUSE, Pace
+from .utc_offset import UTC_COLUMNS, UtcOffset, provides_utc, to_unix_ns, unix_seconds, utc_text
 from .vehicle_clock import Reading, RecentTimes, TimeKind, VehicleClock, is_boot_possible
+
+if TYPE_CHECKING:
+    from .utc_estimate import UtcEstimate, to_datetime64
+else:
+    # NumPy is slow to import.
+    __getattr__ = lazy_exports(__name__, dict.fromkeys(("UtcEstimate", "to_datetime64"), ("", "utc_estimate")))

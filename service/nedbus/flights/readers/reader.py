@@ -80,7 +80,8 @@ class FlightReader(ABC):
     """One pass over a file, with memory independent of its size.
 
     `definitions`: the streams so far; those of an indexed file at once. `start`: when recording began, on the clock
-    of the timestamps [us], 0 if unknown; `starts`: the same for each vehicle that has its own. `boot_utc`: Unix time of the boot [us], 0 if unknown.
+    of the timestamps [us], 0 if unknown; `starts`: the same for each vehicle that has its own.
+    `boot_utc`: Unix time of the boot [us], 0 if unknown.
     `position`, `total`: bytes read so far, and of the file. `damaged`: True if messages were lost so far.
     `kind`: the format, which becomes `sample.source`. `has_log_times`: False if messages have only timestamps.
     """

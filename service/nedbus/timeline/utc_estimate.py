@@ -63,6 +63,11 @@ class UtcEstimate:
         return UtcOffset("boot_time_utc_us", boot_utc, 1, 0) if is_unix_time(boot_utc) else "".join(reasons[:1])
 
 
+def to_datetime64(unix: _Ints) -> npt.NDArray[np.datetime64]:
+    """Return Unix times [us] as datetimes; NaT for other times."""
+    return np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
+
+
 def _find_agreement(stream: str, times: _Ints, offsets: _Ints, others: tuple[float, float]) -> UtcOffset | str:
     """Return the offset on which the messages of a stream agree, or why it is unusable.
 
