@@ -221,7 +221,7 @@ class Worker:
         self._set_state("running")
         start, pace = self._clock.now(), Pace(speed or 1.0)
         for message in run.messages:
-            due = pace.due(message.at)
+            due = pace.publish_at(message.at)
             if speed is not None:
                 early = start + due - self._clock.now()
                 if early < -_MAX_DELAY:

@@ -16,7 +16,7 @@ class Pace:
         self.skipped = 0
         self._speed, self._last, self._due = speed, 0.0, 0.0
 
-    def due(self, at: float) -> float:
+    def publish_at(self, at: float) -> float:
         """Return when to publish the message at a time on the axis [s], as seconds since the first message."""
         step = at - self._last
         if step > MAX_PAUSE:
