@@ -31,7 +31,7 @@ def read():
             fields = upgrade_fields(message.definition or BY_TOPIC[message.address.topic], message.fields)
         except InvalidMessageError:
             continue
-        yield message.address, fields, message.due
+        yield message.address, fields, message.at
 
 messages = list(read())
 print(len(messages), flush=True)

@@ -18,7 +18,7 @@ from .messages.vehicle_local_position import DOUBT_FLAGS, VehicleLocalPosition, 
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, FieldReader, Row, upgrade_fields, upgrade_with
 from .model.message import Message
-from .model.px4_types import BASES, YEAR_2000, FieldType, decode_text, field_type, is_unix_time
+from .model.px4_types import BASES, FIRST_UNIX_TIME, FieldType, decode_text, field_type, is_unix_time
 from .model.rules import UnitQuaternion
 from .provenance import Provenance, encoding_of, identity_of, provenance_of, short_hash
 from .resets import JUMP_FIELDS, RESET_COUNTERS, Continuous, Quantity, ResetTracker, jump_of
@@ -49,8 +49,8 @@ from .topics import (
 )
 
 __all__ = [
-    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "JUMP_FIELDS",
-    "MESSAGES", "PAYLOAD_LIMIT", "RATE", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address",
+    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FIRST_UNIX_TIME",
+    "JUMP_FIELDS", "MESSAGES", "PAYLOAD_LIMIT", "RATE", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address",
     "AddressError", "ArgumentError", "CdrLayout", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError",
     "Encoded", "FieldReader", "FieldType", "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError",
     "NedbusError", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion",

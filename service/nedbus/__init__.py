@@ -72,12 +72,12 @@ if TYPE_CHECKING:
     from .flights import (
         Flight,
         FlightSamples,
-        UtcOffset,
         open_flight as open,  # noqa: A004 - as in nedbus.open(path)
         utc_of,
     )
     from .samples import Batch, Counts, Mode, Sample
     from .tables import addresses_of, align, missing_of, read
+    from .timeline import UtcOffset
     from .transport import Session, Tls
 
 __version__ = "0.1.0"
@@ -144,8 +144,9 @@ _MODULES = {
     "nedbus.samples": "Batch Counts Mode Sample",
     "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest Publisher Subscription connect"
     " connect_async",
-    "nedbus.flights": "Flight FlightSamples UtcOffset open utc_of",
+    "nedbus.flights": "Flight FlightSamples open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
+    "nedbus.timeline": "UtcOffset",
     "nedbus.transport": "Session Tls",
     "nedbus_msgs": "ANY TOPICS Address Continuous Message Provenance Quantity ResetTracker Row Selection Topic"
     " VehicleLocalPosition define_msg",

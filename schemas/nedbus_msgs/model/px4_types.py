@@ -13,7 +13,7 @@ from pydantic_core import CoreSchema, core_schema
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
-YEAR_2000: Final = 946_684_800_000_000  # us since 1970; earlier timestamps are time since boot
+FIRST_UNIX_TIME: Final = 1_234_567_890_000_000  # us since 1970, 2009-02-13: PX4 sets no clock to an earlier time
 _YEAR_2100: Final = 4_102_444_800_000_000
 _MAX_ARRAY: Final = 1024  # elements; PX4's longest array has 512
 
@@ -155,8 +155,8 @@ def field_type(text: str) -> FieldType:
 
 
 def is_unix_time(timestamp_us: Any) -> Any:
-    """Return whether a timestamp [us], or each in an array, is Unix time (2000 to 2100), not time since boot."""
-    return (timestamp_us >= YEAR_2000) & (timestamp_us < _YEAR_2100)
+    """Return whether a timestamp [us], or each in an array, is Unix time (2009-02-13 to 2100), not time since boot."""
+    return (timestamp_us >= FIRST_UNIX_TIME) & (timestamp_us < _YEAR_2100)
 
 
 def field(meaning: str) -> Any:

@@ -61,7 +61,7 @@ class SourceStatus(UntrustedReply):
     in messages, or in bytes of a log.
     `lost`: messages lost before a live source that detects losses published them, with `log_streams` an estimate.
     `dropped`: those of them that its host dropped. `overload`: how the host does not keep up, "" if it does.
-    `reboots`: reboots of vehicles.
+    `reboots`: reboots of vehicles. `copies`: messages left out because they came before, as over a second link.
     `stale`: addresses of a live source without a message for 3 s.
     `not_carried`: names of vehicles' messages for which this source has no definition. `silent`: addresses that a
     vehicle announces without sending messages, while messages of its other topics arrive.
@@ -81,6 +81,7 @@ class SourceStatus(UntrustedReply):
     dropped: int = 0
     overload: str = ""
     reboots: int = 0
+    copies: int = 0
     done: int = 0
     total: int | None = None
     retries: int = 0

@@ -50,7 +50,7 @@ class Job:
         self.wake()
 
     @property
-    def due(self) -> float:
+    def runs_at(self) -> float:
         """The monotonic time of the next call [s]."""
         return min((self._due, *self._requested)) if self._requested else self._due
 
@@ -121,10 +121,10 @@ def _run_jobs() -> None:
     while True:
         now, _sleeps_until = time.monotonic(), 0.0
         for job in tuple(_jobs):
-            if job.due <= now:
+            if job.runs_at <= now:
                 job.run(now)
         _sleeps_until = math.inf  # from here `wake` puts an item; after the next line only for an earlier time
-        _sleeps_until = due = min((job.due for job in tuple(_jobs)), default=math.inf)
+        _sleeps_until = due = min((job.runs_at for job in tuple(_jobs)), default=math.inf)
         with suppress(queue.Empty):
             _woken.get(timeout=None if due == math.inf else max(0.0, due - time.monotonic()))
 

@@ -63,6 +63,7 @@ class SourceOutput:
         self.unavailable = UnavailableTopics()  # topics that vehicles publish but a live source does not deliver now
         self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
         self.load = LinkLoad()  # of a live source
+        self.copies = 0  # messages that a live source left out
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message, of every 16th one
         self._name = name
         self._text = text
@@ -204,7 +205,7 @@ class SourceOutput:
                 event = "stream_resumed" if resumed else "published"
                 _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
             self._republish_retained(message)
-        stream.last_received, stream.last = message.due or self._now(), message
+        stream.last_received, stream.last = message.arrived or self._now(), message
         self._publish(message, stream, stream.last_received)
 
     def expire_stale(self) -> bool:

@@ -13,6 +13,7 @@ from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import (
+    LinkCopies,
     LinkLoad,
     LiveItem,
     LiveSource,
@@ -23,6 +24,7 @@ from nedbus.sources import (
     SourceMessage,
     UnavailableTopics,
 )
+from nedbus.timeline import MAX_PAUSE, Pace
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
@@ -134,6 +136,7 @@ class Worker:
             dropped=output.load.dropped,
             overload=output.load.overload,
             reboots=output.reboots,
+            copies=output.copies,
             done=run.done(self._done) if run else self._done,
             total=run.total if run else None,
             retries=self._retries,
@@ -216,10 +219,11 @@ class Worker:
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=speed is None)
         self._set_state("running")
-        start = self._clock.now()
+        start, pace = self._clock.now(), Pace(speed or 1.0)
         for message in run.messages:
+            due = pace.publish_at(message.at)
             if speed is not None:
-                early = start + message.due / speed - self._clock.now()
+                early = start + due - self._clock.now()
                 if early < -_MAX_DELAY:
                     extra = about("replay_late", source=self._name)
                     text = "%s: the replay is %.1f s behind its schedule, so later messages are delayed by as much"
@@ -234,6 +238,8 @@ class Worker:
             self._output.publish_replay(message, lossless=speed is None)
             self._message_start = None
             self._done += 1
+        if pace.skipped:
+            run.warnings = *run.warnings, f"skipped pauses of more than {MAX_PAUSE:.0f} s ({pace.skipped})"
         self._warn(run)
         self._error = run.damage
 
@@ -261,6 +267,8 @@ class Worker:
                     self._output.note(item)
                 elif isinstance(item, LinkLoad):
                     self._output.note_load(item)
+                elif isinstance(item, LinkCopies):
+                    self._output.copies = item.count
                 elif item is not None:
                     self._output.log_streams[item.vehicle] = item
                 if now >= next_poll:

@@ -68,11 +68,11 @@ class ChangeDetector:
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: timestamps of the last message and of the one before [us].
     `time`: time of the last message on the event log's clock [s], set by Vehicle.
-    `pause`: minimum interval between messages [s]; those before `due`, on the event log's clock, are skipped.
+    `pause`: minimum interval between messages [s]; those before `resumes_at`, on the event log's clock, are skipped.
     """
 
     pause = 0.0
-    due = time = -math.inf
+    resumes_at = time = -math.inf
 
     def __init__(self, compared: Sequence[str], context: Sequence[str], detect: Detect) -> None:
         self._read = read_fields(("timestamp", *compared))

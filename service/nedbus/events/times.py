@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from nedbus.clock import format_duration
-from nedbus_msgs import is_unix_time
+from nedbus.timeline import unix_seconds
 
 from .event import Event
 
@@ -51,8 +51,7 @@ class Times:
 
     def utc_of_boot(self, vehicle: str, boot: float) -> float | None:
         """Convert a time since a vehicle's boot, which may already be Unix time, to Unix time [s]; None if unknown."""
-        utc = boot + (0.0 if is_unix_time(boot * 1e6) else self.offsets.get(vehicle, math.nan))
-        return utc if is_unix_time(utc * 1e6) else None
+        return unix_seconds(boot, self.offsets.get(vehicle))
 
     def clock(self, event: Event) -> str:
         """Return the clock used for an event: host, vehicle, boot or start."""

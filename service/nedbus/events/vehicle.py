@@ -10,6 +10,7 @@ from functools import partial
 from statistics import median
 from typing import Final
 
+from nedbus.timeline import is_boot_possible
 from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
 
 from . import detectors, rules
@@ -96,7 +97,7 @@ class Vehicle:
         """Note that a message without a loss before it has arrived; return whether `add` would do no more than that."""
         self.last_seen = time
         detector = self._detectors.get(address, _NEW)
-        return detector is None or time < detector.due
+        return detector is None or time < detector.resumes_at
 
     def add(self, address: Address, message: object, time: float, missing: frozenset[str]) -> None:
         """Add a message."""
@@ -107,15 +108,16 @@ class Vehicle:
             if len(self._detectors) >= _MAX_STREAMS:
                 return
             detector = self._detectors[address] = self._open(address)
-        if detector is None or time < detector.due:
+        if detector is None or time < detector.resumes_at:
             return
         if detector.pause:
-            detector.due = time + detector.pause
+            detector.resumes_at = time + detector.pause
         self._before, detector.time = detector.time, time
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
         is_queued = type(detector) is detectors.TextDetector  # a log may begin with old texts
+        elapsed = time - self.time
         self._set_boot(stamp / 1e6, time, is_queued=is_queued)
         if type(detector) is PositionDetector:  # of `main`
             if math.isinf(self._main_time):
@@ -126,7 +128,8 @@ class Vehicle:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
             found = iter([*(found or ()), *self._comparison.add_estimate(stamp, message, missing)])
         if not is_queued and (stamp < before - _REBOOT or self._suspect is not None):
-            known = self._check_reboot(_Suspect(address, before, [*(found or ())]), stamp, earlier, time)
+            suspect = _Suspect(address, before, [*(found or ())])
+            known = self._check_reboot(suspect, stamp, earlier, time, elapsed)
             found = detector.add(message, missing) if known is None else iter(known)
         self._emit_all(found or (), address, time)
 
@@ -476,13 +479,19 @@ class Vehicle:
             if each.kind == "ekf_changed":
                 self._use_ekf(int(each.numbers["to"]))
 
-    def _check_reboot(self, new: _Suspect, stamp: int, earlier: int, time: float) -> list[Finding] | None:
-        """Return the findings to report now; None after a reboot, which a second message must confirm."""
+    def _check_reboot(
+        self, new: _Suspect, stamp: int, earlier: int, time: float, elapsed: float
+    ) -> list[Finding] | None:
+        """Return the findings to report now; None after a reboot, which a second message must confirm.
+
+        `elapsed`: time since the last message [s].
+        """
         # Only the previous message was damaged unless another one before it, or of another stream, is later as well.
         others = (each for at, each in self._detectors.items() if each is not None and at != new.address)
         support = earlier or max((max(each.stamp, each.earlier) for each in others), default=0)
         is_earlier = min(new.before, support) > stamp + _REBOOT
         if (old := self._suspect) is None:
+            is_earlier = is_earlier and is_boot_possible(stamp, elapsed)
             self._suspect = new if is_earlier else None
             return [] if is_earlier else new.found
         is_back = stamp >= old.before - _REBOOT

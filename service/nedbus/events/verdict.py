@@ -235,7 +235,7 @@ def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]
 
     def order(text: Event) -> tuple[bool, bool, float, float]:
         distance = round(abs(text.time - worst.since), 1)
-        if text.time > worst.since or worst.begin is None:
+        if text.time >= worst.since or worst.begin is None:
             return True, False, text.numbers.get("level", 0.0), distance
         return False, subjects.isdisjoint(_subjects(text.text)), text.severity != "bad", distance
 

@@ -10,28 +10,24 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .columns import Columns, Decoded
     from .conversion import convert
-    from .corrections import UtcEstimate
     from .events import EVENT_OPTIONS, MAX_FILE_EVENTS, FileEvents, follow, read_file_events, times_of
     from .flight import Flight, FlightSamples, open_flight
     from .merge import FlightFile, MergedFlights, distinct_names, no_utc, renamed, require_files
     from .readers import FileStream, FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
     from .utc import find_utc, utc_of
-    from .utc_offset import UtcOffset, provides_utc
     from .writer import RecordingWriter
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "columns"): "Columns Decoded",
         ("mcap", "conversion"): "convert",
-        ("", "corrections"): "UtcEstimate",
         ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow read_file_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight",
         ("", "merge"): "FlightFile MergedFlights distinct_names no_utc renamed require_files",
         ("", "readers"): "FileStream FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
-        ("", "utc_offset"): "UtcOffset provides_utc",
         ("mcap", "writer"): "RecordingWriter",
     }
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})

@@ -13,11 +13,11 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from nedbus.samples import Batch
+from nedbus.timeline import UTC_COLUMNS
 from nedbus_msgs import Address, Definition, Encoded, Provenance, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .readers import FileStream, Run
-from .utc_offset import UTC_COLUMNS
 
 _MAX_TIME: Final = 2**62  # us; later log times of a damaged file are of no use
 

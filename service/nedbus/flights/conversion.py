@@ -1,7 +1,7 @@
 """Convert flights to an MCAP recording, validating each message."""
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -30,12 +30,15 @@ def convert(
     *,
     source: str = "",
     boot_utc: int = 0,
+    starts: Mapping[str, int] | None = None,
     on_progress: Callable[[int], object],
 ) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
-    The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `due`.
+    The publish time of a message is its PX4 timestamp; its log time is that of the first message, by the
+    vehicle's clock, plus `at`.
     `source`: the kind of source of messages that name none. `boot_utc`: Unix time of the boot [us].
+    `starts`: the timestamp of each vehicle at the first message [us].
     `on_progress`: called with the number of messages handled so far.
 
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written, SourceError
@@ -43,8 +46,11 @@ def convert(
     """
     check_recording(path)
     try:
-        with atomic_write(path) as part, RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc) as writer:
-            rejected, reason = _write(messages, writer, source=source, on_progress=on_progress)
+        with (
+            atomic_write(path) as part,
+            RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts) as writer,
+        ):
+            rejected, reason = _write(messages, writer, starts or {}, source=source, on_progress=on_progress)
             if rejected and not writer.messages:
                 raise SourceError(str(path), f"not written, because all {rejected} messages are rejected: {reason}")
     except OSError as exc:  # an OutputError names the temporary file
@@ -53,7 +59,12 @@ def convert(
 
 
 def _write(
-    messages: Iterable[SourceMessage], writer: RecordingWriter, *, source: str, on_progress: Callable[[int], object]
+    messages: Iterable[SourceMessage],
+    writer: RecordingWriter,
+    starts: Mapping[str, int],
+    *,
+    source: str,
+    on_progress: Callable[[int], object],
 ) -> tuple[int, str]:
     """Write the valid messages; return the number of rejected ones, and the reason of the first."""
     pending: list[tuple[Message, Address, Provenance, int]] = []
@@ -71,9 +82,10 @@ def _write(
                 _log.warning("%s rejected: %s", each.address, reason, extra=extra)
             continue
         if start is None:
-            start = min(message.timestamp * 1000, _MAX_START)
+            first = starts.get(each.address.vehicle, message.timestamp)
+            start = min(first * 1000, _MAX_START)
         provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
-        pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
+        pending.append((message, each.address, provenance, start + round(each.at * 1e9)))
         if len(pending) == _CHUNK:
             writer.write_messages(pending)
             pending.clear()

@@ -21,6 +21,7 @@ EVENT_OPTIONS: Final = ReadOptions(topics={*EVENT_TOPICS})
 """Options to read the messages from which events are derived."""
 
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
+_MAX_CHECKED: Final = 120.0  # s of a pause that are checked; by then all events have settled
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
 
 
@@ -39,7 +40,7 @@ def read_file_events(*paths: Path) -> FileEvents:
     event_log, due = EventLog(MAX_FILE_EVENTS), 0.0
     with MergedFlights(paths, EVENT_OPTIONS) as flights:
         for message, _, _ in follow(flights.messages(), event_log, ended=flights.ended):
-            due = message.due
+            due = message.at
         event_log.label_first_events()
         return FileEvents(event_log, times_of(flights), due, flights.warnings)
 
@@ -74,12 +75,15 @@ def follow(
     for message in messages:
         if message.dropout:
             event_log.add_dropout(message.address.vehicle, message.dropout, due)
-        due, reason, payload = message.due, message.error, None
+        due, reason, payload = message.at, message.error, None
         if due - checked >= _CHECK_INTERVAL and event_log.vehicles.keys() <= set(ended):
             checked = due  # no vehicle is active between two files
+        settled = checked + _MAX_CHECKED
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
             update(checked)
+            if checked >= settled and due - checked > _CHECK_INTERVAL:
+                checked = due - _CHECK_INTERVAL  # a long pause changes nothing more
         if reason is None:
             try:
                 row, payload, _, missing = message.encode()

@@ -11,9 +11,11 @@ from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypedDict, Unpack, overload
+from weakref import WeakSet
 
-from nedbus.errors import ArgumentError, ClosedError, InvalidMessageError
+from nedbus.errors import ArgumentError, ClosedError, InvalidMessageError, SourceError
 from nedbus.samples import M_co, Sample
+from nedbus.timeline import UtcOffset, to_unix_ns
 from nedbus_msgs import (
     ANY,
     BY_TOPIC,
@@ -26,15 +28,13 @@ from nedbus_msgs import (
     VehicleLocalPosition,
     VehicleNames,
     codec_of,
-    is_unix_time,
     topic_of,
     vehicle_name,
 )
 
-from .merge import MergedFlights, require_files
+from .merge import MergedFlights, Survey, require_files
 from .readers import ReadOptions
 from .selection import matching
-from .utc_offset import UtcOffset
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
@@ -77,14 +77,15 @@ class Flight(AbstractContextManager["Flight"]):
     """One or more files open for reading; `nedbus.open` returns one. Its memory does not depend on their size.
 
     Call it as `bus.subscribe`, with message classes or names of topics, or "*" for all streams of the files. Each call
-    reads the files once. The properties read them once more, on first use.
+    reads the files once. The properties read them once, on first use.
     """
 
     def __init__(self, paths: Sequence[Path], *, vehicle: str, layout: str | None) -> None:
         self._paths, self._vehicle = require_files(paths), vehicle
         self._options, self._is_closed = replace(_ALL, layout=layout), False
         self._selection = Selection(vehicle=vehicle)
-        self._open(_ALL.topics).close()  # raises the errors of unreadable files
+        self._samples = WeakSet[FlightSamples[Any]]()  # open ones, which `close` closes
+        self._unread: MergedFlights | None = self._open(_ALL.topics, surveys=True)  # raises errors of unreadable files
 
     @overload
     def __call__(
@@ -107,10 +108,10 @@ class Flight(AbstractContextManager["Flight"]):
         end: float | datetime | None = None,
         rows: bool = False,
     ) -> FlightSamples[Any]:
-        """Return the samples of one or more messages, in the order of their log times, as an iterator.
+        """Return the samples of one or more messages, in the order of the vehicle's timestamps, as an iterator.
 
         `message`, `topic`, `vehicle`, `instance`: as in `bus.subscribe`. `start`, `end`: seconds since the first
-        message of the files, without pauses of more than a minute, or UTC as a datetime. `rows`: a sample's message is
+        message of the files, pauses included, or a datetime with its time zone. `rows`: a sample's message is
         a Row, a named tuple: faster, with the same validation.
         `sample.received` is the log time [ns]: Unix time, or time since boot in a log without `boot_time_utc_us`.
 
@@ -122,7 +123,9 @@ class Flight(AbstractContextManager["Flight"]):
         selection = Selection(names, chosen, instance)
         topics = None if selection.topics == (ANY,) else set(selection.topics)
         period = self._seconds(start, "start"), None if end is None else self._seconds(end, "end")
-        return FlightSamples(self._open(topics), selection, period, rows=rows)
+        samples = FlightSamples[Any](self._open(topics), selection, period, rows=rows)
+        self._samples.add(samples)
+        return samples
 
     @property
     def addresses(self) -> list[Address]:
@@ -132,23 +135,24 @@ class Flight(AbstractContextManager["Flight"]):
     @property
     def definitions(self) -> dict[Address, Definition[Any]]:
         """The definition of each address."""
-        found = self._pass[0].definitions
+        found = self._survey[0].definitions
         return {address: known for address, known in found.items() if self._selection.matches(address)}
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last message, without pauses of more than a minute."""
-        return self._pass[1]
+        """Seconds from the first to the last message, by the vehicle's clock, pauses included."""
+        flights, surveys = self._survey
+        return flights.duration(surveys)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Damage of the files, and what was left out."""
-        return self._pass[0].warnings
+        return self._survey[0].warnings
 
     @property
     def damaged(self) -> bool:
         """True if messages are lost to damage."""
-        return self._pass[0].damaged
+        return self._survey[0].damaged
 
     @property
     def utc(self) -> UtcOffset | None:
@@ -157,41 +161,48 @@ class Flight(AbstractContextManager["Flight"]):
         return found[0] if len(found) == 1 else None
 
     def close(self) -> None:
-        """Close the flight; a second call does nothing."""
+        """Close the flight and its samples, which then raise ClosedError; a second call does nothing."""
         self._is_closed = True
+        if self._unread is not None:
+            self._unread.close()
+        for samples in list(self._samples):
+            samples.abort()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     @cached_property
+    def _survey(self) -> tuple[MergedFlights, list[Survey]]:
+        """The files after one pass, and what it shows of each."""
+        flights, self._unread = self._unread, None
+        if flights is None:
+            flights = self._open(_ALL.topics, surveys=True)
+        return flights, flights.survey()
+
+    @property
     def _utc(self) -> dict[str, UtcOffset]:
-        with self._open(_ALL.topics) as flights:
-            return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
+        flights, _ = self._survey
+        return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
 
-    @cached_property
-    def _pass(self) -> tuple[MergedFlights, float]:
-        """The files after one pass, and the time of their last message."""
-        with self._open(_ALL.topics) as flights:
-            duration = 0.0
-            for message in flights.messages():
-                duration = message.due
-            return flights, duration
-
-    def _open(self, topics: Any) -> MergedFlights:
+    def _open(self, topics: Any, *, surveys: bool = False) -> MergedFlights:
         if self._is_closed:
             raise ClosedError
-        return MergedFlights(self._paths, replace(self._options, topics=topics))
+        known = self.__dict__.get("_survey", (None, ()))[1]
+        return MergedFlights(self._paths, replace(self._options, topics=topics), known=known, surveys=surveys)
 
     def _seconds(self, time: float | datetime, name: str) -> float:
         """Return seconds since the first message."""
         if not isinstance(time, datetime):
             return time
-        with self._open(_ALL.topics) as flights:
-            for message in flights.messages():
-                utc = self._utc.get(message.address.vehicle)
-                if utc is not None and (timestamp := message.timestamp) is not None:
-                    return time.astimezone(UTC).timestamp() - int(utc.unix_us(timestamp)) / 1e6 + message.due
-        raise ArgumentError(name, str(time), "seconds since the first message, because this flight has no UTC")
+        if time.tzinfo is None:
+            expected = "seconds, or a datetime with a time zone, such as datetime(2025, 10, 9, 8, 53, tzinfo=UTC)"
+            raise ArgumentError(name, str(time), expected, problem="has no time zone, so it names no moment")
+        try:
+            start = self._survey[0].start()
+        except SourceError as exc:
+            expected = "seconds since the first message, because this flight has no UTC"
+            raise ArgumentError(name, str(time), expected) from exc
+        return time.astimezone(UTC).timestamp() - start
 
 
 class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]):
@@ -209,6 +220,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         self._reasons: dict[Address, str] = {}
         self._matches = lru_cache(10_000)(selection.matches)
         self._messages = self._select()
+        self._is_aborted = False  # by the flight
 
     @property
     def warnings(self) -> list[str]:
@@ -226,8 +238,15 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
     def rows(self) -> Iterator[Sample[M_co]]:
         """Iterate over samples whose message is a Row, as `subscription.rows` does."""
-        self._rows = True
-        return self
+        while True:
+            if self._is_aborted:
+                raise ClosedError
+            selected = next(self._messages, None)
+            if selected is None:
+                return
+            address, definition, encoded, received, provenance = selected
+            message: Any = codec_of(definition).decode_row(encoded.payload)
+            yield Sample(message, address, received, provenance=provenance)
 
     def batches(self) -> Iterator[Batch]:
         """Iterate over messages as NumPy arrays, up to 4096 of one type, with the same validation."""
@@ -235,6 +254,8 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
         while ahead := list(islice(self._messages, _BATCH)):
             yield from make_batches(ahead)
+            if self._is_aborted:
+                raise ClosedError
 
     def close(self) -> None:
         """Close the files; a second call does nothing."""
@@ -245,10 +266,17 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         return self
 
     def __next__(self) -> Sample[M_co]:
+        if self._is_aborted:
+            raise ClosedError
         address, definition, encoded, received, provenance = next(self._messages)
         codec = codec_of(definition)
         message: Any = (codec.decode_row if self._rows else codec.decode)(encoded.payload)
         return Sample(message, address, received, provenance=provenance)
+
+    def abort(self) -> None:
+        """Close the files, because their flight is closed: another sample raises ClosedError."""
+        self._is_aborted = True
+        self.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -258,13 +286,16 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         flights, is_found = self._flights, False
         try:
             for message in flights.messages():
-                if self._end is not None and message.due > self._end:
+                is_late = self._end is not None and message.at > self._end
+                if is_late and is_found:
                     return
                 address = message.address
                 if not self._matches(address):
                     continue
                 is_found = True
-                if message.due < self._start:
+                if is_late:
+                    return
+                if message.at < self._start:
                     continue
                 try:
                     encoded = message.encode()
@@ -273,7 +304,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
                     self._reasons.setdefault(address, exc.reason)
                     continue
                 definition = message.definition or BY_TOPIC[address.topic]
-                time = 1000 * (message.time + (0 if is_unix_time(message.time) else flights.boot_utc))
+                time = to_unix_ns(message.time, flights.boot_utc)
                 yield address, definition, encoded, time, _provenance(message.source, encoded.missing)
         finally:
             flights.close()

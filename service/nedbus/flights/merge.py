@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from heapq import merge
 from itertools import chain, islice
@@ -15,29 +15,44 @@ from typing import Any, Final
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.samples import SourceMessage
+from nedbus.timeline import Order, UtcOffset
 from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import Address, Definition
 
-from .readers import MAX_GAP, Clock, ReadOptions, open_reader, sort_by_time
-from .utc import estimate_utc
-from .utc_offset import UtcOffset
+from .readers import ReadOptions, open_reader
+from .utc import FileUtc, read_utc
 
 LOOKAHEAD: Final = 1000
 """Messages that are read ahead to determine the first streams and the start time of a file."""
 
 
-class FlightFile:
-    """One pass over one file: its reader, its messages in order of their due times, and its vehicles.
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What a pass over a whole file shows.
 
-    `names`: the name of each vehicle among several files.
+    `utc`: the UTC offset of each vehicle, or why it is unknown. `duration`: from the first to the last message [s].
     """
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
-        self.path, self.options = path, options
+    utc: Mapping[str, UtcOffset | str]
+    duration: float
+
+
+class FlightFile:
+    """One pass over one file: its reader, its messages in order, and its vehicles.
+
+    `names`: the name of each vehicle among several files. `known`: what an earlier pass has found.
+    `surveys`: note what `survey` needs.
+    """
+
+    def __init__(self, path: Path, options: ReadOptions, *, known: Survey | None = None, surveys: bool = False) -> None:
+        self.path, self.options, self._known = path, options, known
         reader = self.reader = open_reader(path, options)
-        self._unordered: Counter[Address] = Counter()
-        self._clock = Clock(lambda: reader.start, max_behind=reader.max_behind)
-        messages = self._replay()
+        self.order = Order[SourceMessage](reader.start_of, has_log_times=reader.has_log_times)
+        self._seen = FileUtc()
+        records = reader.records()
+        if surveys:
+            records = self._seen.watch(records)
+        messages = self.order.arrange(map(reader.message_of, records))
         try:
             self.ahead = list(islice(messages, LOOKAHEAD))
         except BaseException:
@@ -49,54 +64,61 @@ class FlightFile:
     @property
     def warnings(self) -> list[str]:
         """Damage, omissions and times out of order so far."""
-        unordered = self._unordered.copy()
-        if isinstance(self._clock.stray, SourceMessage):
-            unordered[self._clock.stray.address] += 1
-        text = "timestamps of {} are out of order ({}); the order of the file is kept"
-        found = [*self.reader.warnings, *(text.format(*each) for each in unordered.items())]
-        if self._clock.gaps:
-            found.append(f"skipped gaps of more than {MAX_GAP // 1e6:.0f} s in the timestamps ({self._clock.gaps})")
-        return found
+        found = [*self.reader.warnings]
+        for address, count in self.order.unordered.items():
+            if address.topic != LOG_MESSAGE.name and count:  # PX4 queues log messages
+                found.append(f"timestamps of {address} are out of order ({count}); the order of the file is kept")
+        return [*found, *self.order.remarks]
 
     @cached_property
     def utc(self) -> Mapping[str, UtcOffset | str]:
-        """The UTC offset of each vehicle, by its own name, or why it is unknown; reads the file."""
+        """The UTC offset of each vehicle, by its own name, or why it is unknown; reads the file unless it is known."""
+        if self._known is not None:
+            return self._known.utc
         topics = ReadOptions().topics if self.options.topics else None  # a file may have other topics only
         with open_reader(self.path, replace(self.options, topics=topics)) as reader:
-            estimates = estimate_utc(reader)
-            return {name: each.result(reader.boot_utc) for name, each in estimates.items()}
+            return read_utc(reader)
+
+    def survey(self) -> Survey:
+        """Read all messages, and return what they show; the file must have been opened with `surveys`."""
+        duration = 0.0
+        for message in self.messages:
+            duration = message.at
+        self.reader.close()
+        self._known = Survey(self._seen.results(self.reader), duration)
+        return self._known
 
     def start(self) -> float:
         """Return the Unix time of the first message [s]; raise SourceError if it is unknown."""
         known = ((each, each.timestamp) for each in self.ahead if not each.error)
         offsets = ((self.utc.get(each.address.vehicle), each, time) for each, time in known if time is not None)
-        found = [int(utc.unix_us(time)) / 1e6 - each.due for utc, each, time in offsets if isinstance(utc, UtcOffset)]
+        found = [int(utc.unix_us(time)) / 1e6 - each.at for utc, each, time in offsets if isinstance(utc, UtcOffset)]
         if not found:
             raise no_utc(self.path, next((utc for utc in self.utc.values() if isinstance(utc, str)), ""))
         return median(found)
-
-    def _replay(self) -> Iterator[SourceMessage]:
-        messages, newest = self.reader.messages(), dict[Address, int]()
-        ordered = messages if self.reader.is_sorted else sort_by_time(messages)
-        for due, message in self._clock.pace(ordered, attrgetter("time")):
-            message.due = due / 1e6
-            time, address = message.time, message.address
-            if time < newest.get(address, 0) and address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
-                self._unordered[address] += 1
-            newest[address] = time
-            yield message
 
 
 class MergedFlights(AbstractContextManager["MergedFlights"]):
     """One pass over one file, or over several files merged by UTC.
 
     Vehicles with the same name in several files are named after their files. `ended`: vehicles whose file has ended.
+    `known`, `surveys`: as those of a file.
 
     Raises ArgumentError without files, ConfigError or SourceError if a file cannot be read.
     """
 
-    def __init__(self, paths: Sequence[Path], options: ReadOptions = ReadOptions()) -> None:  # noqa: B008 - immutable
-        self.files = [FlightFile(path, options) for path in require_files(paths)]
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        options: ReadOptions = ReadOptions(),  # noqa: B008 - immutable
+        *,
+        known: Sequence[Survey] = (),
+        surveys: bool = False,
+    ) -> None:
+        known_of = dict(zip(paths, known, strict=False))
+        self.files = [
+            FlightFile(path, options, known=known_of.get(path), surveys=surveys) for path in require_files(paths)
+        ]
         names = distinct_names([(file.path, file.names) for file in self.files])
         for file, own in zip(self.files, names, strict=True):
             file.names = own
@@ -132,6 +154,21 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
         """The UTC offset of each vehicle, or why it is unknown; reads the files."""
         return {file.names.get(own, own): utc for file in self.files for own, utc in file.utc.items()}
 
+    def survey(self) -> list[Survey]:
+        """Read all messages of each file; the files must have been opened with `surveys`."""
+        return [file.survey() for file in self.files]
+
+    def start(self) -> float:
+        """Return the Unix time of the first message [s]; raise SourceError if it is unknown."""
+        return min(file.start() for file in self.files)
+
+    def duration(self, surveys: Sequence[Survey]) -> float:
+        """Return seconds from the first to the last message; raise SourceError if one of several files has no UTC."""
+        if len(surveys) == 1:
+            return surveys[0].duration
+        end = max(file.start() + survey.duration for file, survey in zip(self.files, surveys, strict=True))
+        return end - self.start()
+
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in chronological order; raise SourceError if one of several files has no UTC."""
         if len(self.files) == 1:
@@ -139,7 +176,18 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
             return
         starts = [file.start() for file in self.files]
         shifted = (self._shift(*each, min(starts)) for each in zip(self.files, starts, strict=True))
-        yield from merge(*shifted, key=attrgetter("due"))
+        yield from merge(*shifted, key=attrgetter("at"))
+
+    @property
+    def starts(self) -> Mapping[str, int]:
+        """The timestamp of each vehicle at the first message of its file [us]."""
+        found = dict[str, int]()
+        for file in self.files:
+            for own, name in file.names.items():
+                stamp = file.order.axis.stamp_at(own, 0.0)
+                if stamp is not None and stamp > 0:
+                    found[name] = stamp
+        return found
 
     @property
     def boot_utc(self) -> int:
@@ -156,7 +204,7 @@ class MergedFlights(AbstractContextManager["MergedFlights"]):
 
     def _shift(self, file: FlightFile, start: float, first: float) -> Iterator[SourceMessage]:
         for each in file.messages:
-            each.due, each.address = each.due + start - first, renamed(each.address, file.names)
+            each.at, each.address = each.at + start - first, renamed(each.address, file.names)
             yield each
         self.ended.update(file.names.values())
 

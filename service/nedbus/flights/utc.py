@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from nedbus.log_event import about
 from nedbus.samples import Sample
+from nedbus.timeline import UTC_COLUMNS, UtcOffset, provides_utc
 from nedbus_msgs import ANY, TOPICS, Address, FieldReader, Selection, vehicle_name
 
-from .readers import FlightReader, Run, open_reader
+from .readers import FileStream, FlightReader, Record, Run, open_reader
 from .selection import matching, require_one_vehicle
-from .utc_offset import UTC_COLUMNS, UtcOffset, provides_utc
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
 
-    from .corrections import UtcEstimate
+    from .columns import Columns
 
 _log = logging.getLogger(__name__)
 _BATCH: Final = 4096  # messages of a stream with UTC that are decoded at once
@@ -36,7 +36,8 @@ def utc_of(
     any sample until the vehicle reboots.
 
     The source is a GNSS receiver with a `time_utc_usec` other than 0, a companion's clock in `timesync_status`, or a
-    log's `boot_time_utc_us`, accepted only with a date from 2000 to 2100; Unix timestamps are used as they are.
+    log's `boot_time_utc_us`, accepted only with a date from 2009-02-13, as in PX4, to 2100. Unix timestamps are used as
+    they are.
     A receiver may correct its UTC in flight, at most twice and by up to 20 s; the last part then holds for all. Else
     the offset is unknown, and the reason is logged, if over 10 % of the messages are more than a second off their
     median. A source whose timestamps do not overlap those of the other messages is not used.
@@ -55,7 +56,7 @@ def find_utc(
     flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
 ) -> UtcOffset | str:
     """Return what `utc_of` returns, or why it is unknown, "" if no message contains UTC."""
-    from .corrections import UtcEstimate
+    from nedbus.timeline import UtcEstimate
 
     vehicle, estimate = vehicle_name(vehicle), UtcEstimate()
     if isinstance(flight, Mapping):
@@ -74,33 +75,66 @@ def find_utc(
         return estimate.result()
     path = Path(flight).expanduser()
     with open_reader(path) as reader:
-        estimates = estimate_utc(reader)
+        offsets = read_utc(reader)
         addresses = matching(path, sorted(reader.definitions), Selection(vehicle=vehicle))
         require_one_vehicle(path, addresses, vehicle)
-        return estimates[addresses[0].vehicle].result(reader.boot_utc)
+        return offsets[addresses[0].vehicle]
 
 
-def estimate_utc(reader: FlightReader) -> dict[str, UtcEstimate]:
-    """Read a file; return the estimate of each vehicle."""
-    from .columns import Columns
-    from .corrections import UtcEstimate
-
-    found = defaultdict[str, UtcEstimate](UtcEstimate)
-    columns = defaultdict[Address, Columns](Columns)  # of messages with UTC, not yet in the estimate
+def read_utc(reader: FlightReader) -> dict[str, UtcOffset | str]:
+    """Read a file; return the UTC offset of each vehicle, or why it is unknown."""
+    found = FileUtc()
     for stream, payloads, _ in reader.runs():
+        found.add(stream, payloads)
+    return found.results(reader)
+
+
+class FileUtc:
+    """The UTC of the vehicles of a file, from its records."""
+
+    def __init__(self) -> None:
+        from nedbus.timeline import UtcEstimate
+
+        self._estimates = defaultdict[str, UtcEstimate](UtcEstimate)
+        self._columns: dict[Address, Columns] = {}  # messages with UTC, not yet in the estimate
+        self._payloads = defaultdict[FileStream, list[Any]](list)  # of records that `watch` has seen
+
+    def watch(self, records: Iterable[Record]) -> Iterator[Record]:
+        """Yield records on their way to another reader, and add them."""
+        payloads = self._payloads
+        for record in records:
+            own = payloads[record.stream]
+            own.append(record.payload)
+            if len(own) >= _BATCH:
+                self.add(record.stream, own)
+                own.clear()
+            yield record
+
+    def add(self, stream: FileStream, payloads: list[Any]) -> None:
+        """Add the payloads of a stream."""
+        from .columns import Columns
+
         address = stream.address
         if address.topic not in TOPICS:
-            continue
-        if provides_utc(stream.definition):
-            columns[address].add(Run(stream, payloads, []))
-            if len(columns[address]) < _BATCH:
-                continue
-            found[address.vehicle].add(address.stream, columns.pop(address).decode(stream.definition).utc_columns())
-        else:
-            stamps = [stream.timestamp(each)[0] or 0 for each in payloads if not stream.check(each)]
-            found[address.vehicle].add(address.stream, {"timestamp": stamps})
-    for address, own in columns.items():
-        found[address.vehicle].add(address.stream, own.decode(reader.definitions[address]).utc_columns())
-    for address in reader.definitions:
-        found[address.vehicle]
-    return found
+            return
+        if not provides_utc(stream.definition):
+            stamps = [stream.timestamp(payload)[0] or 0 for payload in payloads if not stream.check(payload)]
+            self._estimates[address.vehicle].add(address.stream, {"timestamp": stamps})
+            return
+        columns = self._columns.setdefault(address, Columns())
+        columns.add(Run(stream, payloads, []))
+        if len(columns) >= _BATCH:
+            del self._columns[address]
+            self._estimates[address.vehicle].add(address.stream, columns.decode(stream.definition).utc_columns())
+
+    def results(self, reader: FlightReader) -> dict[str, UtcOffset | str]:
+        """Return the UTC offset of each vehicle, or why it is unknown, at the end of a file."""
+        for stream, payloads in self._payloads.items():
+            self.add(stream, payloads)
+        self._payloads.clear()
+        for address, columns in self._columns.items():
+            own = columns.decode(reader.definitions[address])
+            self._estimates[address.vehicle].add(address.stream, own.utc_columns())
+        self._columns.clear()
+        vehicles = {address.vehicle for address in reader.definitions}
+        return {vehicle: self._estimates[vehicle].result(reader.boot_utc) for vehicle in vehicles}

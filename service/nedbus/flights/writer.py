@@ -9,7 +9,7 @@ import logging
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import repeat
 from operator import itemgetter
@@ -65,15 +65,18 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     PX4 release has all its fields, the layout with exactly the fields that the source provides is preferred.
     PX4's log messages are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
     `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
-    vehicle's boot [us], for `utc_of` if the messages do not provide it.
+    vehicle's boot [us], for `utc_of` if the messages do not provide it. `starts`: when the recording of each vehicle
+    began, on the clock of its timestamps [us]; older messages are from before.
 
     `omitted`: messages left out beyond 1,000 channels of their vehicle, or beyond those of a file.
 
     Raises OutputError if the file exists, is deleted while open, or cannot be written; flushed messages stay readable.
     """
 
-    def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0) -> None:
-        self.path, self._boot_utc = Path(path), boot_utc
+    def __init__(
+        self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0, starts: Mapping[str, int] | None = None
+    ) -> None:
+        self.path, self._boot_utc, self._starts = Path(path), boot_utc, starts or {}
         self.messages = self.omitted = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
@@ -184,7 +187,9 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         known = {
             "vehicle": address.vehicle, "topic": address.topic,
             "instance": "" if address.instance is None else str(address.instance), "source": provenance.source or "",
-            "boot_time_utc_us": str(self._boot_utc or ""), "missing": " ".join(sorted(provenance.missing)),
+            "boot_time_utc_us": str(self._boot_utc or ""),
+            "start_time_us": str(self._starts.get(address.vehicle, "")),
+            "missing": " ".join(sorted(provenance.missing)),
         }  # fmt: skip
         metadata = {name: value for name, value in known.items() if value}
         channel = self._register(f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .boot_clock import BootClock
+    from .boot_time import new_clock, read_time
     from .fields import CONVERSIONS, HIGH_LATENCY
     from .log_reassembly import Chunk, Reassembly
     from .parser import Received, new_parser, parse
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .vehicle import Vehicle
 else:
     _NAMES = {
-        "boot_clock": "BootClock", "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
+        "boot_time": "new_clock read_time", "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
         "parser": "Received new_parser parse", "senders": "AUTOPILOT NO_HEARTBEAT Senders",
         "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",
     }  # fmt: skip

@@ -21,6 +21,7 @@ class Received(NamedTuple):
     """A message of an autopilot. `time`: arrival, monotonic [s]; `lost`: messages lost before it; `chunk`: ULog data.
 
     `sequence`: MAVLink's. A late message, which was counted as lost, has `lost` -1.
+    `link`: number of the link of its sender, from 0, or `REPEATED`, by the sequence.
     `parts`: number of messages whose ULog data was joined.
     """
 
@@ -32,6 +33,7 @@ class Received(NamedTuple):
     lost: int = 0
     chunk: Chunk | None = None
     parts: int = 1
+    link: int = 0
 
     def continues(self, before: "Received") -> bool:
         """Return whether this message has ULog data that directly follows the data of an earlier one.

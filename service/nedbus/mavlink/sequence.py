@@ -1,12 +1,17 @@
 """Losses between numbered packets; no I/O, callers pass monotonic time [s]."""
 
+from dataclasses import dataclass
 from typing import Final
 
 _MODULUS: Final = 256  # of MAVLink's sequence
 _FACTOR: Final = 4.0  # times the usual rate; a faster jump of the sequence is a restart of the sender's counter
 _MARGIN: Final = 20  # packets that may be lost at once, whatever the rate
+_MAX_OVERTAKEN: Final = 8  # packets that one packet of the same link overtakes
 _SILENCE: Final = 3.0  # s after which the sequence has no relation to the earlier one
 _WINDOW: Final = 10.0  # s over which the rate is measured
+
+REPEATED: Final = -1
+"""In place of the number of a link: this packet came before."""
 
 
 class PacketRate:
@@ -36,22 +41,143 @@ class PacketRate:
         return not self._count or lost <= margin + _FACTOR * self.expected(now)
 
 
+@dataclass(slots=True)
+class _Link:
+    """The packets that one sender numbered for one link; `last`: the number of the last one, which came at `time`."""
+
+    number: int
+    last: int
+    time: float
+
+    def step_to(self, sequence: int) -> int:
+        """Return the number of packets from the last one to one with this sequence number."""
+        return (sequence - self.last) % _MODULUS
+
+
 class SequenceCounter:
-    """Count the MAVLink messages of one sender that were lost."""
+    """Count the MAVLink messages of one sender that were lost, and tell its links apart.
+
+    Two modems number their packets on their own, and those of a slower link arrive late. A packet that follows no
+    other one is of a second link if the main one goes on, and else the first one of a sender that restarted. Losses
+    are those of the main link.
+
+    `link`: number of the link of the last packet, from 0; `REPEATED` if the packet came before.
+    """
 
     def __init__(self) -> None:
-        self._last: int | None = None
-        self._rate, self._time = PacketRate(), 0.0
+        self.link = self._links = 0
+        self._main: _Link | None = None
+        self._second: _Link | None = None
+        self._earlier: _Link | None = None  # the main link before the last gap, which may go on
+        self._skipped = 0  # packets in that gap, which counted as lost
+        self._is_late = False  # the last packet was in that gap
+        self._is_numbered = False  # two packets of the main link followed each other
+        self._missing: set[int] = set()  # sequence numbers that the main link skipped
+        self._rate = PacketRate()
 
     def add(self, sequence: int, now: float) -> int:
-        """Return the number of messages lost before this one, -1 if it is late: it was counted as lost."""
-        if self._last is None or now - self._time > _SILENCE:
-            self._last, self._rate = (sequence - 1) % _MODULUS, PacketRate()
-        self._time = now
-        step = (sequence - self._last) % _MODULUS
-        if step > _MODULUS // 2 or not step:  # late, or a duplicate
-            return -1 if step else 0
-        self._last = sequence
-        lost = step - 1 if step == 1 or self._rate.explains(step - 1, now) else 0
+        """Return the number of messages lost before this one; below 0 if so many had been counted but are not lost."""
+        main = self._main_at(now)
+        if main is None:
+            self._rate = PacketRate()
+            self._main = main = self._new_link((sequence - 1) % _MODULUS, now)
+            self._is_numbered = False
+            self.link = main.number
+            return self._go_on(main, sequence, now)
+        second, earlier = self._second, self._earlier
+        self.link = main.number
+        if main.step_to(sequence) == 1:
+            self._is_numbered = True
+            return self._go_on(main, sequence, now)
+        if second is not None and second.step_to(sequence) == 1:
+            return self._add_to_second(second, sequence, now)
+        if earlier is not None and earlier.step_to(sequence) == 1:
+            return self._add_to_earlier(main, earlier, sequence, now)
+        if main.step_to(sequence) == 0:
+            return self._add_late(sequence)
+        return self._add_after_gap(main, sequence, now)
+
+    def _main_at(self, now: float) -> _Link | None:
+        """Return the main link; the second one replaces it after a silence."""
+        main, second = self._main, self._second
+        if main is None or now - main.time <= _SILENCE:
+            return main
+        self._main = self._second = self._earlier = None
+        if second is not None and now - second.time <= _SILENCE:
+            self._main = second
+        return self._main
+
+    def _new_link(self, sequence: int, now: float) -> _Link:
+        number = self._links
+        self._links += 1
+        return _Link(number, sequence, now)
+
+    def _go_on(self, main: _Link, sequence: int, now: float) -> int:
+        lost = main.step_to(sequence) - 1
+        self._missing.discard(sequence)
+        self._missing.update((main.last + skipped) % _MODULUS for skipped in range(1, lost + 1))
+        main.last, main.time = sequence, now
         self._rate.add(now)
         return lost
+
+    def _add_late(self, sequence: int) -> int:
+        """Add a packet that others have overtaken, or that came before."""
+        if sequence in self._missing:
+            self._missing.discard(sequence)
+            return -1
+        if self._is_numbered:
+            self.link = REPEATED
+        return 0
+
+    def _add_to_second(self, second: _Link, sequence: int, now: float) -> int:
+        self.link = second.number
+        second.last, second.time = sequence, now
+        return 0
+
+    def _add_to_earlier(self, main: _Link, earlier: _Link, sequence: int, now: float) -> int:
+        """Add a packet that follows the main link from before the last gap.
+
+        One packet may have been overtaken. If the next one follows too, there was no gap: the link went on, and the
+        packets behind the gap are those of another link.
+        """
+        self.link = earlier.number
+        earlier.last, earlier.time = sequence, now
+        if self._skipped and not self._is_late:
+            self._is_late = True
+            self._skipped -= 1
+            self._missing.discard(sequence)
+            return -1
+        if main.number == earlier.number:
+            main.number = self._links
+            self._links += 1
+        self._main, self._second, self._earlier = earlier, main, None
+        return -self._skipped
+
+    def _add_after_gap(self, main: _Link, sequence: int, now: float) -> int:
+        """Add a packet that follows none: after a loss, late, the first one of another link, or after a restart."""
+        second = self._second
+        ahead = main.step_to(sequence)
+        behind = _MODULUS - ahead
+        margin = _MARGIN if self._is_numbered else _MAX_OVERTAKEN
+        is_loss = ahead <= _MODULUS // 2 and self._rate.explains(ahead - 1, now, margin=margin)
+        if second is not None:
+            ahead_of_second = second.step_to(sequence)
+            nearest = min(ahead_of_second, _MODULUS - ahead_of_second)
+            if nearest <= _MARGIN and nearest < min(ahead, behind):
+                if nearest == ahead_of_second and nearest:
+                    return self._add_to_second(second, sequence, now)
+                self.link = second.number
+                return 0
+        if is_loss:
+            if second is None:
+                self._earlier, self._skipped = _Link(main.number, main.last, main.time), ahead - 1
+                self._is_late = False
+            return self._go_on(main, sequence, now)
+        if behind <= _MAX_OVERTAKEN:
+            return self._add_late(sequence)
+        self._earlier, self._skipped, self._is_late = main, 0, False
+        self._is_numbered = False
+        self._main = self._new_link(sequence, now)
+        self.link = self._main.number
+        self._rate.add(now)
+        return 0

@@ -11,13 +11,15 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.log_event import about
 from nedbus.samples import Rejection, SourceMessage
+from nedbus.timeline import RecentTimes, TimeKind
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
-from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, FIRST_UNIX_TIME, TOPICS, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
-from .boot_clock import BootClock
+from .boot_time import new_clock, read_time
 from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
 from .senders import text_source
+from .sequence import REPEATED
 
 _log = logging.getLogger(__name__)
 
@@ -33,6 +35,9 @@ _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the te
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
 _DEBUG: Final = 7
+_HANDOVER: Final = 0.5  # s without a new message on the first link after which another one is the first
+_LINK_TIMEOUT: Final = 2.0  # s without a new message on the first link after which messages without a time are used
+_SENT_ONCE: Final = frozenset({"sensor_gps", "vehicle_odometry"})  # their messages have `time_usec`
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
 _POSITION, _STATUS, _QUATERNION = 32, 230, 31
@@ -93,6 +98,7 @@ class Vehicle:
     `topics`: those to deliver, None for all; `rate`: positions per second to request.
     `baud`: of a serial link; None for other links, whose bandwidth is unknown.
     `lost`, `rebooted`: losses and a reboot that were not reported yet.
+    `copies`: messages that came again or late over a second link, and were dropped.
     """
 
     def __init__(
@@ -103,12 +109,17 @@ class Vehicle:
         self._rates = request_rates(rate, baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
-        self.clock = BootClock()
+        self.clock = new_clock()
+        self.copies = 0
+        self._link = 0  # of the last message
+        self._first_link: int | None = None  # the link that delivers new messages first
+        self._led = -math.inf  # time of its last new message
         self._last_message = 0.0
         self._last_heartbeat = self._high_latency = -math.inf  # time of the last HEARTBEAT and HIGH_LATENCY2
         self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self.rebooted = False
         self._text_source: str | None = None  # of its log messages, if it is not PX4
+        self._kind: TimeKind | None = None  # what the time of the last message shows; None if it has none
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
@@ -116,18 +127,21 @@ class Vehicle:
     def _reset(self, now: float) -> None:
         """Discard all state and request everything again, after silence or a reboot."""
         self._stored: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
-        self._last: dict[Address, int] = {}  # newest timestamps
+        self._last: dict[Address, tuple[int, int]] = {}  # newest timestamps, and the links that delivered them
+        self._delivered = RecentTimes()
         self._texts = _StatusTexts()
         self._started = now
         self._arrivals: dict[int, float] = {}  # last arrival of each requested message
         self._pending = [*self._rates] * _FIRST_ROUNDS
         self._next_round = now + _REQUEST_INTERVAL
 
-    def count_lost(self, lost: int, now: float, *, counted: int | None = None) -> None:
+    def count_lost(self, lost: int, now: float, *, counted: int | None = None, link: int = 0) -> None:
         """Count the messages of any type lost before one that arrived at time `now`, -1 if it had been counted as lost.
 
-        `counted`: those that the ULog stream has counted, if this is one of its messages.
+        `counted`: those that the ULog stream has counted, if this is one of its messages. `link`: its number, from 0,
+        or `REPEATED`.
         """
+        self._link = link
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
@@ -181,6 +195,9 @@ class Vehicle:
             return [] if item is None else [item]
         self._high_latency = now
         timestamp = self._track_time(message, now)
+        if self._is_copy(now):
+            self.copies += 1
+            return []
         items = [
             self._publish(self._address(topic), fields_of(message), timestamp, now, log)
             for topic, fields_of in OF_HIGH_LATENCY.items()
@@ -196,6 +213,11 @@ class Vehicle:
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now)
+        if timestamp is not None and self._kind is TimeKind.WILD:
+            return self._rejected(topic, message, f"wild time ({timestamp // 1000} ms since boot)")
+        if self._is_copy(now):
+            self.copies += 1
+            return None
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
         is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
@@ -215,6 +237,21 @@ class Vehicle:
             return None
         return self._publish(address, fields_of(message), timestamp, now, log)  # a text is discarded only now
 
+    def _is_copy(self, now: float) -> bool:
+        """Return whether the last message came before; one without a time did if it is of a link behind the first."""
+        if self._kind is not None:
+            return self._kind is TimeKind.COPY
+        if self._link == REPEATED:
+            return True
+        is_led = self._first_link is not None and now - self._led <= _LINK_TIMEOUT
+        return is_led and self._link != self._first_link
+
+    def _rejected(self, topic: str, message: Any, reason: str) -> Rejection | None:
+        if topic not in self._topics:
+            return None
+        address = self._address(topic, message.id if message.get_type() == "BATTERY_STATUS" else 0)
+        return Rejection(str(address), reason, address)
+
     def _address(self, topic: str, instance: int = 0) -> Address:
         return Address(self._name, topic, instance if TOPICS[topic].instances else None)
 
@@ -225,14 +262,22 @@ class Vehicle:
         fields = {name: value for name, value in fields.items() if value is not None}
         if not fields or (log is not None and log.delivers(address)):
             return None
-        if timestamp < (last := self._last.get(address, 0)):
+        if self._delivered.contains(address, timestamp) and address.topic in _SENT_ONCE:
+            self.copies += 1
+            return None
+        last, link = self._last.get(address, (0, self._link))
+        if timestamp < last and link != self._link:  # a second link's times need not be equal to those of the first
+            self.copies += 1
+            return None
+        if timestamp < last:
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
-        self._last[address] = timestamp
+        self._last[address] = timestamp, self._link
+        self._delivered.add(address, timestamp)
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(address.topic, fields, timestamp, now)
         source = self._text_source if address == self._text_address else None
-        return self.report(SourceMessage(now, address, fields, source=source), log)
+        return self.report(SourceMessage(0.0, address, fields, source=source, arrived=now), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
@@ -297,15 +342,28 @@ class Vehicle:
 
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
-        if self.clock.add(message, now):
+        reading = read_time(self.clock, message, now)
+        self._kind = None if reading is None else reading.kind
+        if self._kind in (TimeKind.NEW, TimeKind.REBOOT, TimeKind.STEP):
+            self._follow_link(now)
+        if self._kind is TimeKind.REBOOT:
             self.rebooted = True
             self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
             self._reset(now)
         microseconds: int = getattr(message, "time_usec", 0)
-        if 0 < microseconds < YEAR_2000:
+        if 0 < microseconds < FIRST_UNIX_TIME:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", None)
-        return self.clock.newest if ms is None else 1000 * ms
+        if reading is not None:
+            return reading.time
+        return self.clock.newest if ms is None else self.clock.unwrap(1000 * ms, now)
+
+    def _follow_link(self, now: float) -> None:
+        """Note that a link has delivered a new message."""
+        if self._first_link is None or now - self._led > _HANDOVER:
+            self._first_link = self._link
+        if self._link == self._first_link:
+            self._led = now
 
 
 def _is_origin(message: Any) -> bool:

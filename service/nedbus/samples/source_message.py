@@ -31,7 +31,7 @@ class RecordStream(Protocol):
 class SourceMessage:
     """One message from a source, not yet validated.
 
-    `due`: in a replay, seconds since the start of the recording; of a live message, its arrival, monotonic, or 0.
+    `at`: in a flight, seconds since its first message, pauses included; 0 for a live message.
     `given`: the fields by name, in any PX4 layout; None for those of a `payload` of the stream `logged`.
     `lost`: number of messages lost between the vehicle and the source, just before this one.
     `rebooted`: True for the first message after the vehicle rebooted.
@@ -40,9 +40,10 @@ class SourceMessage:
     `source`: value of `sample.source`, if it differs from the kind of the source.
     `time`: in a file, its log time [us]; without one, its timestamp.
     `dropout`: seconds for which the vehicle's logger recorded nothing, just before this message.
+    `arrived`: when a live message arrived, on the host's monotonic clock [s]; 0 for now.
     """
 
-    due: float
+    at: float
     address: Address
     given: Mapping[str, object] | None
     lost: int = 0
@@ -54,6 +55,7 @@ class SourceMessage:
     logged: RecordStream | None = None
     payload: Any = b""
     time: int = 0
+    arrived: float = 0.0
 
     @property
     def fields(self) -> Mapping[str, object]:

@@ -4,6 +4,7 @@ from .kinds import SOURCE_KINDS, parse_source
 from .log_header import expected_header
 from .mavlink.link import DuplicateIds, Link, open_link, parse_link
 from .source import (
+    LinkCopies,
     LinkLoad,
     LiveItem,
     LiveSource,

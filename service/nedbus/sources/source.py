@@ -24,6 +24,16 @@ class LinkLoad:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkCopies:
+    """Messages that came again, or late, over a second link to their vehicle, and were left out; yielded on change.
+
+    `count`: of all vehicles of a source.
+    """
+
+    count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class UnavailableTopics:
     """Topics that vehicles announce but a live source does not deliver; yielded on change.
 
@@ -39,7 +49,7 @@ class UnavailableTopics:
 class ReplayRun:
     """One run of a replay; its attributes are updated while the messages are iterated.
 
-    `messages`: in order of `due`; can be iterated once.
+    `messages`: in order of `at`; can be iterated once.
     `addresses`: addresses of the messages so far, each with its definition, or None for the topic's default.
     `total`: number of messages, or of bytes if `position` is set; None if endless.
     `summary`: description for the log; `warnings`: damage and skipped parts.
@@ -76,7 +86,7 @@ class ReplaySource:
         return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
 
-LiveItem = SourceMessage | Rejection | UnavailableTopics | LinkLoad | LogStreamStatus | None
+LiveItem = SourceMessage | Rejection | UnavailableTopics | LinkLoad | LinkCopies | LogStreamStatus | None
 
 
 @runtime_checkable

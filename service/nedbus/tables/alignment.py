@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.errors import AddressError, ArgumentError, ConfigError
-from nedbus.flights import UtcOffset, utc_of
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion, is_unix_time
+from nedbus.flights import utc_of
+from nedbus.timeline import UtcOffset, to_datetime64
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray, derive_column
 from nedbus_msgs.frames import DERIVED, derived_from
 
@@ -151,8 +152,7 @@ def _choose_streams(arrays: Mapping[str, MessageArray], topics: Sequence[str] | 
 
 
 def _to_utc(times: _Ints, offset: UtcOffset | None) -> npt.NDArray[np.datetime64]:
-    unix = offset.unix_us(times) if offset else 0 * times
-    return np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
+    return to_datetime64(offset.unix_us(times) if offset else 0 * times)
 
 
 def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:

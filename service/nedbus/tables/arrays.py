@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.extras import import_optional
-from nedbus.flights import Columns, Decoded, FileStream, ReadOptions, UtcEstimate, UtcOffset, open_reader, provides_utc
+from nedbus.flights import Columns, Decoded, FileStream, ReadOptions, open_reader
+from nedbus.timeline import UtcEstimate, UtcOffset, provides_utc
 from nedbus_msgs import Address, decode_text
 from nedbus_msgs.arrays import MessageArray
 
@@ -57,7 +58,7 @@ class FlightArrays:
         self.path = path
         self._columns = defaultdict[Address, Columns](Columns)
         self._utc = dict[str, UtcOffset | str]()
-        self._invalid: list[str] = []
+        self._invalid: dict[Address, str] = {}
         with open_reader(path, options) as reader:
             is_kept = dict[FileStream, bool]()
             for run in reader.runs():
@@ -73,7 +74,7 @@ class FlightArrays:
     @property
     def warnings(self) -> list[str]:
         """Damage found and messages skipped so far."""
-        return [*self._warnings, *self._invalid]
+        return [*self._warnings, *self._invalid.values()]
 
     def read(self, address: Address) -> tuple[MessageArray, Absent]:
         """Return the valid messages of an address, with a mask of the messages that lack a field, by field.
@@ -87,7 +88,7 @@ class FlightArrays:
             if reason and not valid.any():
                 raise SourceError(str(self.path), f"no message of {address.stream} can be read: {reason}")
             skipped = f"skipped {np.sum(~valid)} of {len(valid)} messages of {address.stream} as invalid"
-            self._invalid.append(f"{skipped} ({reason})" if reason else skipped)
+            self._invalid[address] = f"{skipped} ({reason})" if reason else skipped
             messages, absent = messages[valid], absent[valid]
         masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
         if masks:

@@ -13,17 +13,16 @@ import numpy as np
 from nedbus.errors import AddressError, SourceError
 from nedbus.flights import (
     ReadOptions,
-    UtcOffset,
     distinct_names,
     matching,
     no_utc,
-    provides_utc,
     renamed,
     require_files,
     require_one_vehicle,
     single_match,
 )
 from nedbus.log_event import about
+from nedbus.timeline import UtcOffset, provides_utc
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name
 from nedbus_msgs.arrays import MessageArray
 

@@ -68,12 +68,12 @@ class Recording:
                     entry = payload
                     if is_position(address):
                         row = codec_of(DEFAULT).decode_row(payload)
-                        self.overview.add(Sample(row, address, round(message.due * 1e9)), message.due)
+                        self.overview.add(Sample(row, address, round(message.at * 1e9)), message.at)
                 if reason is None and address not in self.indices and is_position(address):
-                    self.timeline.set_clock(address.vehicle, stamp / 1e6, message.due)
+                    self.timeline.set_clock(address.vehicle, stamp / 1e6, message.at)
                 self.indices.setdefault(address, []).append(len(self.entries))
                 self.entries.append((address, entry))
-                self.dues.append(message.due)
+                self.dues.append(message.at)
             for warning in flights.warnings:
                 _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
         except NedbusError as exc:

@@ -207,14 +207,18 @@ def test_file_that_shrinks_while_it_is_read_is_reported(tmp_path: Path, suffix: 
 
 
 @each_format
-def test_pause_is_skipped(tmp_path: Path, suffix: str) -> None:
-    """A pause of more than a minute delays no replay, and is reported; times since its start have no pause."""
+def test_pause_counts_on_the_axis(tmp_path: Path, suffix: str) -> None:
+    """Times since the first message include a pause of minutes; only the pace of a replay leaves it out."""
     path = write_flight(tmp_path / f"a{suffix}", count=20, pause_before=10)
     run = open_replay(f"{SOURCES[suffix]}:{path}?speed=max")
-    due = [each.due for each in run.messages]
-    assert due[:10] == pytest.approx([index * STEP / 1e6 for index in range(10)])
-    assert due[-1] == pytest.approx(18 * STEP / 1e6)
-    assert "skipped gaps of more than 60 s in the timestamps (1)" in run.warnings
+    times = [each.at for each in run.messages]
+    assert times[:10] == pytest.approx([index * STEP / 1e6 for index in range(10)])
+    assert times[-1] > 60 + 19 * STEP / 1e6
+    assert not run.warnings
+    with nedbus.open(path) as flight:
+        assert flight.duration == pytest.approx(times[-1])
+        late = list(flight(start=times[10], end=times[12]))
+    assert [each.message.x for each in late] == [1010.0, 1011.0, 1012.0]
 
 
 def test_layout_of_another_release_is_read_on_request(caplog: pytest.LogCaptureFixture) -> None:

@@ -35,7 +35,7 @@ def count(name: str) -> dict[str, int]:
 
 def due_times(name: str) -> tuple[float, float]:
     """Return the replay times of the first and the last position [s]."""
-    found = [each.due for each in open_replay(f"ulog:{CASES / name}").messages if each.address.topic == VLP]
+    found = [each.at for each in open_replay(f"ulog:{CASES / name}").messages if each.address.topic == VLP]
     return round(found[0], 2), round(found[-1], 2)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.flights import RecordingWriter, UtcEstimate, read_file_events
+from nedbus.flights import RecordingWriter, read_file_events
+from nedbus.timeline import UtcEstimate
 from nedbus_msgs import DEFAULT_TOPIC, Address, Provenance, is_unix_time
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay

@@ -1,4 +1,4 @@
-"""Replays of recordings: paced and ordered by log time."""
+"""Order and times of recordings: those of the vehicle's clock."""
 
 from __future__ import annotations
 
@@ -8,39 +8,56 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nedbus.flights import RecordingWriter
+import nedbus
+from nedbus.flights import RecordingWriter, read_file_events
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 
 
-def due_times(path: Path, *logged: float) -> list[float]:
-    """Return the replay times of messages recorded at these times [s], with unrelated publish times."""
+def write_recording(path: Path, stamps: list[float], logged: list[float]) -> Path:
+    """Write positions with these timestamps and log times [s]."""
     with RecordingWriter(path) as writer:
-        for number, time in enumerate(logged):
-            address = Address(str(number % 2), VLP)
-            published = number % 2 * 3600 * 10**9 + (10**19 if number == 3 else number)
-            rows = to_array([message(number)])
-            writer.write(rows, DEFAULT, [(address, Provenance())], logged=[round(time * 1e9)], published=[published])
-    return [round(each.due, 6) for each in open_replay(f"mcap:{path}").messages]
+        for stamp, time in zip(stamps, logged, strict=True):
+            rows, stream = to_array([message(round(stamp * 1e6))]), (Address("1", VLP), Provenance())
+            writer.write(rows, DEFAULT, [stream], logged=[round(time * 1e9)], published=[0])
+    return path
 
 
 @pytest.mark.parametrize(
-    ("logged", "due"),
-    [
-        ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour
-        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # a retained message that is three hours old
-        ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 2, 3]),  # an outlier
-        ([5, 6, 5.5, 7], [0, 0.5, 1, 2]),  # a message that was written late
-        ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set back
-    ],
+    ("change", "after"), [(-0.5, 500), (-3.0, 300), (-5.0, 700), (20.0, 500), (3600.0, 10), (1e10, 999), (-1e9, 1)]
 )
-def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float], due: list[float]) -> None:
-    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, even after conversion."""
-    assert due_times(tmp_path / "a.mcap", *logged) == due
-    convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
-    assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == due
+def test_step_of_the_recorders_clock_changes_nothing(tmp_path: Path, change: float, after: int) -> None:
+    """The vehicle's timestamps determine order and duration, whatever the recorder's clock does, even converted."""
+    stamps = [100 + number / 50 for number in range(1000)]
+    logged = [1.76e9 + stamp + (change if number >= after else 0) for number, stamp in enumerate(stamps)]
+    convert_replay(f"mcap:{write_recording(tmp_path / 'a.mcap', stamps, logged)}", tmp_path / "b.mcap")
+    for name in ("a.mcap", "b.mcap"):
+        with nedbus.open(tmp_path / name) as flight:
+            assert [each.message.timestamp / 1e6 for each in flight()] == pytest.approx(stamps)
+            assert flight.duration == pytest.approx(19.98)
+    found = read_file_events(tmp_path / "a.mcap")
+    assert [each.kind for each in found.event_log.events] == []
+
+
+@pytest.mark.parametrize("change", [-0.5, -2.0, -3.0, 20.0])
+def test_step_of_a_unix_clock_keeps_the_order_of_the_file(tmp_path: Path, change: float) -> None:
+    """A synchronized clock that is set is no pause and no reboot: the log times show how much time passed."""
+    stamps = [1.76e9 + number / 25 + (change if number >= 250 else 0) for number in range(500)]
+    path = write_recording(tmp_path / "a.mcap", stamps, [1.76e9 + number / 25 for number in range(500)])
+    with nedbus.open(path) as flight:
+        assert [each.message.timestamp / 1e6 for each in flight()] == pytest.approx(stamps)
+        assert flight.duration == pytest.approx(19.96, abs=0.1)
+
+
+def test_reboot_begins_a_new_part(tmp_path: Path) -> None:
+    """After a reboot the order is that of the file, and the log times show the pause."""
+    stamps = [100 + number / 10 for number in range(100)] + [5 + number / 10 for number in range(100)]
+    logged = [1.76e9 + number / 10 + (20 if number >= 100 else 0) for number in range(200)]
+    with nedbus.open(write_recording(tmp_path / "a.mcap", stamps, logged)) as flight:
+        assert [each.message.timestamp / 1e6 for each in flight()] == pytest.approx(stamps)
+        assert flight.duration == pytest.approx(39.9)
 
 
 def test_replay_is_ordered_across_batches_of_streams(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_origin_option_moves_the_flight() -> None:
 def encoded(options: str) -> list[tuple[float, str, bytes]]:
     """Return all messages of a flight, in order."""
     return [
-        (each.due, str(each.address), encode(upgrade_with(BY_TOPIC[each.address.topic], each.fields)))
+        (each.at, str(each.address), encode(upgrade_with(BY_TOPIC[each.address.topic], each.fields)))
         for each in simulate(options)
     ]
 
@@ -108,7 +108,7 @@ def test_messages_are_in_time_order_and_counted(options: str) -> None:
     """A finite flight has exactly `total` messages, in order of `due`, and only at the announced addresses."""
     run = open_replay(f"sim:{options}")
     messages = list(run.messages)
-    due = [each.due for each in messages]
+    due = [each.at for each in messages]
     assert due == sorted(due)
     assert len(due) == run.total
     assert {each.address for each in messages} == set(run.addresses)

@@ -93,8 +93,8 @@ def test_tokens_are_queried_while_the_subscription_lists_none(
 def test_slow_list_is_complete(endpoint: str, zenoh_session: Session, timings: Timings) -> None:
     """A router that takes long to list the tokens of a large fleet is queried once, and the list is complete.
 
-    Zenoh 1.10 can miss the end of a token while it subscribes (findings/zenoh-missed-token-end.sh); a further token shows
-    that it has subscribed.
+    Zenoh 1.10 can miss the end of a token while it subscribes (findings/zenoh-missed-token-end.sh); a further token
+    shows that it has subscribed.
     """
     timings.slow_list = 0.0
     tokens = [declare(zenoh_session, vehicle, 1) for vehicle in OTHERS]

@@ -38,7 +38,9 @@ def convert(
         readers = [each.reader for each in merged.files]
         total = sum(each.total for each in readers)
         on_progress = lambda _: show(f"{output}", sum(each.position for each in readers), total)  # noqa: E731
-        report = write_recording(merged.messages(), output, boot_utc=merged.boot_utc, on_progress=on_progress)
+        report = write_recording(
+            merged.messages(), output, boot_utc=merged.boot_utc, starts=merged.starts, on_progress=on_progress
+        )
         absent = flights.absent_topics(names, {address.topic for address in merged.definitions}, "this file")
     for warning in (*merged.warnings, *(f"{sources[0]}: {text}" for text in absent)):
         write_stderr(warning)

@@ -103,6 +103,15 @@ def get(
         raise typer.Exit(1)
 
 
+def _write_left_out(service: ServiceStatus) -> None:
+    """Write what a service does not publish: topics that it lacks, and copies."""
+    for what, head in _ABSENT.items():
+        if absent := [each for source in service.sources for each in getattr(source, what)]:
+            write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+    if copies := sum(source.copies for source in service.sources):
+        write(f"left out: {copies} messages that came again, or late, over a second link to their vehicle")
+
+
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     """Show the services on the network with their sources and streams."""
@@ -125,9 +134,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         ]  # fmt: skip
         if rows:
             write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
-        for what, head in _ABSENT.items():
-            if absent := [each for source in service.sources for each in getattr(source, what)]:
-                write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+        _write_left_out(service)
         for text in (each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]):
             write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
         for each in (log for source in service.sources for log in source.log_streams):

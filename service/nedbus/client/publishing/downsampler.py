@@ -63,7 +63,7 @@ class Downsampler:
     """Publisher of the downsampled copies of one address; not thread-safe.
 
     `listener`: matched by subscribers of any downsampled stream of the vehicle.
-    `due`: monotonic time before which `put` has nothing to do unless `listener` is known to be matched [s].
+    `checks_at`: monotonic time before which `put` has nothing to do unless `listener` is known to be matched [s].
     """
 
     def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, listener: MatchingListener) -> None:
@@ -72,15 +72,15 @@ class Downsampler:
         self._topic = get_topic(address.topic)
         self._address_listener: MatchingListener | None = None
         self._streams: list[_Stream] = []
-        self.due = 0.0
+        self.checks_at = 0.0
 
     def put(self, message: Outgoing) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
         if self._address_listener is None:
             if not self.vehicle_listener.is_matched():
-                self.due = monotonic() + _CHECK
+                self.checks_at = monotonic() + _CHECK
                 return
-            self.due = 0.0
+            self.checks_at = 0.0
             self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
         now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
         is_matched = self._address_listener.is_matched()

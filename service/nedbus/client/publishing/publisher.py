@@ -223,7 +223,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         try:
             writer.put(messages)
             self.last = messages[-1]
-            if writer.last_put >= downsampler.due or downsampler.vehicle_listener.matched:
+            if writer.last_put >= downsampler.checks_at or downsampler.vehicle_listener.matched:
                 for message in messages:
                     downsampler.put(message)
         except zenoh.ZError as exc:

@@ -51,7 +51,7 @@ class Request:
     """Retransmission request to one publisher; times in monotonic seconds."""
 
     stop: int  # one past the highest number known to be sent
-    due: float = 0.0
+    retry_at: float = 0.0
     deadline: float | None = None  # when the gap counts as lost; each delivery resets it
     attempts: int = 0
     requested: range | None = None  # numbers of the open query
@@ -114,7 +114,7 @@ class WriterProxy:
     def next_request(self, now: float) -> range | None:
         """Return the numbers to request now, up to the end of the last gap; None if no request is due."""
         request = self.request
-        if request is None or request.requested is not None or now < request.due:
+        if request is None or request.requested is not None or now < request.retry_at:
             return None
         if request.first_available is not None and request.first_available < self.expected:
             request.first_available = request.probe = request.candidate = None
@@ -155,7 +155,7 @@ class WriterProxy:
                 self.unresponsive = request.first_available is None
                 self.give_up(last)
             request.last_answered = False
-            request.due = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
+            request.retry_at = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
 
     def give_up(self, last: int = NUMBERS) -> None:
         """Count gaps up to number `last` as lost, and deliver the messages held back behind them."""

@@ -109,7 +109,6 @@ class McapReader(FlightReader):
     """
 
     kind = "mcap"
-    is_sorted = False
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)
@@ -302,6 +301,8 @@ class _RecordedFile:
         address, metadata = Address(vehicle, own.topic, own.instance), channel.metadata
         if (boot := metadata.get("boot_time_utc_us", "")[:20]).isdecimal():
             self._reader.add_boot_time(int(boot))
+        if (start := metadata.get("start_time_us", "")[:20]).isdecimal():
+            self._reader.starts[vehicle] = int(start)
         missing = frozenset(metadata.get("missing", "").split()).intersection(definition.names)
         stream = RecordedStream(channel.topic, address, definition, layout, missing)
         if metadata.get("source") in OF_OTHER_AUTOPILOTS:

@@ -9,7 +9,6 @@ import struct
 from array import array
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -25,7 +24,7 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from nedbus.errors import SourceError
-from nedbus_msgs import is_unix_time
+from nedbus.timeline import utc_text
 
 from .formats import open_file
 
@@ -274,7 +273,4 @@ def _describe(chunk: bytes, offset: int) -> str:
     if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
         return f"at byte {offset}"
     start, end, *_ = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)
-    if not is_unix_time(start // 1000):
-        return f"at byte {offset} ({start / 1e9:.1f} to {end / 1e9:.1f} s)"
-    first, last = (datetime.fromtimestamp(time / 1e9, UTC) for time in (start, end))
-    return f"at byte {offset} ({first:%Y-%m-%d %H:%M:%S} to {last:%H:%M:%S} UTC)"
+    return f"at byte {offset} ({utc_text([start / 1e9, end / 1e9])})"

@@ -80,19 +80,19 @@ class FlightReader(ABC):
     """One pass over a file, with memory independent of its size.
 
     `definitions`: the streams so far; those of an indexed file at once. `start`: when recording began, on the clock
-    of the timestamps [us], 0 if unknown. `boot_utc`: Unix time of the boot [us], 0 if unknown.
+    of the timestamps [us], 0 if unknown; `starts`: the same for each vehicle that has its own.
+    `boot_utc`: Unix time of the boot [us], 0 if unknown.
     `position`, `total`: bytes read so far, and of the file. `damaged`: True if messages were lost so far.
-    `kind`: the format, which becomes `sample.source`. `is_sorted`: False if writers batch messages by stream.
-    `max_behind`: consecutive messages far in the past that show that the clock was set back.
+    `kind`: the format, which becomes `sample.source`. `has_log_times`: False if messages have only timestamps.
     """
 
     kind = ""
-    is_sorted = True
-    max_behind = 1
+    has_log_times = True
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         self.path, self.options = path, options
         self.definitions: dict[Address, Definition[Any]] = {}
+        self.starts: dict[str, int] = {}
         self.start = self.boot_utc = self.position = self.total = 0
         self.damaged, self._dropout = False, 0.0  # s lost by the logger before the next message
         self._vehicles: set[str] = set()
@@ -136,6 +136,10 @@ class FlightReader(ABC):
         """Return a list of at most one warning at the end of a file: it has fewer bytes than when it was opened."""
         self.damaged |= (is_shorter := self.position < self.total)
         return [f"the file has shrunk from {self.total} to {self.position} bytes"] if is_shorter else []
+
+    def start_of(self, vehicle: str) -> int:
+        """Return when the recording of a vehicle began, on the clock of its timestamps [us]; 0 if unknown."""
+        return self.starts.get(vehicle, self.start)
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -13,10 +13,10 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.errors import SourceError
 from nedbus.mavlink import SequenceCounter, Vehicle, new_parser, parse
 from nedbus.samples import Rejection, SourceMessage
+from nedbus.timeline import arrivals
 from nedbus_msgs import BY_TOPIC, Address, Encoded
 
 from .formats import open_file
-from .order import Clock
 from .reader import FlightReader, ReadOptions, Record
 
 _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
@@ -72,6 +72,7 @@ class TlogReader(FlightReader):
         self._source = self.kind  # of the next message
         self._streams: dict[Address, _ConvertedStream] = {}
         self._shrinkage: list[str] = []
+        self._senders: dict[int, tuple[Vehicle, SequenceCounter]] = {}  # by system id
 
     @property
     def warnings(self) -> list[str]:
@@ -84,14 +85,17 @@ class TlogReader(FlightReader):
             warnings.append(f"truncated (the last {zeros} B are zeros, as after a power cut)")
         elif self._is_cut:
             warnings.append("truncated (the file ends within a message)")
+        copies = sum(vehicle.copies for vehicle, _ in self._senders.values())
+        if copies:
+            warnings.append(f"{copies} {'copy' if copies == 1 else 'copies'} from a second link left out")
         return warnings
 
     def records(self) -> Iterator[Record]:
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
-        vehicles: dict[int, tuple[Vehicle, SequenceCounter]] = {}
+        vehicles = self._senders
         parser, booted = new_parser(), set[int]()
-        for due, (stamp, frame) in Clock().pace(self._frames(), itemgetter(0)):
-            for item in parse(parser, frame, str(self.path), None, due / 1e6):
+        for arrived, (stamp, frame) in arrivals(self._frames(), itemgetter(0)):
+            for item in parse(parser, frame, str(self.path), None, arrived):
                 if isinstance(item, Rejection):
                     if self.position > self._end:
                         self._is_cut = True  # a record whose end was not written
@@ -102,7 +106,8 @@ class TlogReader(FlightReader):
                     name = str(item.system)
                     vehicles[item.system] = Vehicle(name, self.options.topics), SequenceCounter()
                 vehicle, sequence = vehicles[item.system]
-                vehicle.count_lost(sequence.add(item.sequence, item.time), item.time)
+                lost = sequence.add(item.sequence, item.time)
+                vehicle.count_lost(lost, item.time, link=sequence.link)
                 for found in vehicle.handle_all(item.message, item.time):
                     if found.address is None:
                         continue

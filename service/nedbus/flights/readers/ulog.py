@@ -15,7 +15,6 @@ from .reader import FlightReader, ReadOptions, Record, Run
 _CHUNK: Final = 2**17  # bytes read at a time
 _MAX_NAMED: Final = 5  # damaged locations listed in the warnings
 _MAX_TOPICS: Final = 10  # topics listed in an error
-_MAX_BEHIND: Final = 1000  # messages: PX4 logs old ones of slow topics when logging starts
 _MAX_RECENT: Final = 1000  # messages of a topic among which duplicates are searched
 
 
@@ -23,7 +22,7 @@ class UlogReader(FlightReader):
     """Read the messages of a log in file order, with memory independent of its size."""
 
     kind = "ulog"
-    max_behind = _MAX_BEHIND
+    has_log_times = False
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)

@@ -256,7 +256,9 @@ class LogStream:
         address, definition = stream.address, stream.definition
         self._streamed.add(address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
-        return SourceMessage(now, address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload)
+        return SourceMessage(
+            0.0, address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload, arrived=now
+        )
 
     def _decode(
         self, stream: ulog.LoggedStream, payload: bytes

@@ -8,9 +8,20 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.mavlink import AUTOPILOT, BootClock, Chunk, Reassembly, Received, SequenceCounter, new_parser, parse
+from nedbus.mavlink import (
+    AUTOPILOT,
+    Chunk,
+    Reassembly,
+    Received,
+    SequenceCounter,
+    new_clock,
+    new_parser,
+    parse,
+    read_time,
+)
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import LinkLoad, Rejection
+from nedbus.timeline import TimeKind, VehicleClock
 
 from .link import Link, Peer, PeerChoice
 from .log_client import COMMANDS, Command, LogStreamClient
@@ -61,7 +72,7 @@ class _Vehicle:
     last: float
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     reassembly: Reassembly = field(default_factory=Reassembly)
-    clock: BootClock = field(default_factory=BootClock)
+    clock: VehicleClock = field(default_factory=new_clock)
     is_known: bool = False  # a heartbeat has arrived
     refusal: str = ""
 
@@ -131,8 +142,10 @@ class LogReceiver:
             vehicle = self.vehicles[system] = _Vehicle(system, client, PeerChoice(received.peer, now), now)
         vehicle.last = now
         vehicle.peers.add(received.peer, now)
-        if lost := vehicle.sequence.add(received.sequence, now):
-            received = received._replace(lost=lost)
+        lost = vehicle.sequence.add(received.sequence, now)
+        link = vehicle.sequence.link
+        if lost or link:
+            received = received._replace(lost=lost, link=link)
         return self._follow_stream(vehicle, received) if self._options.log else received
 
     def _evict(self, now: float) -> bool:
@@ -158,7 +171,7 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
         elif kind == "TIMESYNC" and message.tc1:
             self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
-        elif vehicle.clock.add(message, now):
+        elif (reading := read_time(vehicle.clock, message, now)) and reading.kind is TimeKind.REBOOT:
             vehicle.client.on_reboot()
             vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received
@@ -184,7 +197,7 @@ class LogReceiver:
             return Rejection(f"{where}, ULog stream", f"{reason}; {remedy}")
         fields = message.sequence, message.length, message.first_message_offset, message.data
         chunk = vehicle.reassembly.add(*fields, now)
-        received = Received(*received[:-2], chunk)  # takes a third of the time of `_replace`
+        received = Received(*received[:-3], chunk, link=received.link)  # takes a third of the time of `_replace`
         if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
             vehicle.clock.confirm()
         is_acked = kind == "LOGGING_DATA_ACKED"

@@ -13,7 +13,7 @@ from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.mavlink import AUTOPILOT, CONVERSIONS, Received, Vehicle
 from nedbus.sources.options import MavlinkOptions
-from nedbus.sources.source import LiveItem, Rejection, SourceMessage
+from nedbus.sources.source import LinkCopies, LiveItem, Rejection, SourceMessage
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.ulog import LOG_MESSAGE
@@ -74,6 +74,8 @@ class _LinkSession:
         self._unsent = 0  # messages that the link did not accept, to be logged
         self._vehicles: dict[int, Vehicle] = {}
         self._remarked: set[int] = set()  # system ids whose second address was reported
+        self._copied: set[int] = set()  # system ids whose copies were reported
+        self._copies = self._copies_of_removed = 0  # as last reported; those of vehicles that were removed
         self._high_latency: set[int] = set()  # system ids whose satellite link was reported
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
@@ -103,6 +105,7 @@ class _LinkSession:
                 for peer in self._all_peers():
                     self._send(heartbeat, peer)
                 self._log_unsent()
+                yield from self._report_copies()
                 for system, log in self._logs.items():
                     yield log.status(now)
                     if self._vehicles[system].is_high_latency:
@@ -127,7 +130,7 @@ class _LinkSession:
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
         yield from self._second_address(system)
-        vehicle.count_lost(received.lost, now, counted=chunk.lost if chunk else None)
+        vehicle.count_lost(received.lost, now, counted=chunk.lost if chunk else None, link=received.link)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1 and self._is_chosen(received):
             log.add_timesync(message.tc1, message.ts1, now)
@@ -207,6 +210,18 @@ class _LinkSession:
         text = f"also arrives from {name_of(known.peers.second)}; requests go to {name_of(known.peers.peer)} only"
         yield Rejection(f"{self._name} system {system}, second address", text, count=0)
 
+    def _report_copies(self) -> Iterator[LinkCopies | Rejection]:
+        """Yield the number of copies, and a remark on the first ones of each vehicle."""
+        for system, vehicle in self._vehicles.items():
+            if vehicle.copies and system not in self._copied:
+                self._copied.add(system)
+                text = "its messages come again, or late, over a second link: each is used once, the first time"
+                yield Rejection(f"{self._name} system {system}, second link", text, count=0)
+        copies = self._copies_of_removed + sum(vehicle.copies for vehicle in self._vehicles.values())
+        if copies != self._copies:
+            self._copies = copies
+            yield LinkCopies(copies)
+
     def _remove_evicted(self) -> None:
         """Forget the vehicles that the receiver has removed."""
         known = dict(self._receiver.vehicles)  # changed on another thread
@@ -214,7 +229,8 @@ class _LinkSession:
             log = self._logs.get(system)
             if system in known and (log is None or log.serves(known[system].client)):
                 continue
-            del self._vehicles[system]
+            self._copies_of_removed += self._vehicles.pop(system).copies
+            self._copied.discard(system)
             self._remarked.discard(system)
             if log is not None:
                 del self._logs[system]

@@ -25,7 +25,8 @@ Build = Callable[[int, Row], Any]  # (ms since boot, row) to a message, or None 
 Stream = tuple[float, Build]  # rate [Hz], builder
 NED = ("x", "y", "z", "vx", "vy", "vz")
 NAN = math.nan
-BOOT_MS = 5000  # time_boot_ms after a reboot
+BOOT_MS = 60_000  # time_boot_ms of the first message
+REBOOTED_MS = 1000  # of the first one after a reboot: a vehicle cannot be up for longer than it was silent
 
 
 def covariance(known: dict[int, float]) -> list[float]:
@@ -124,7 +125,7 @@ def main() -> None:
                 print_line({"time_boot_ms": message.time_boot_ms} | dict(zip(NED, values, strict=True)))
             if total == args.reboot_after:
                 plan, start = schedule(streams), time.monotonic()
-                mav.seq, base_ms, turn = 0, BOOT_MS, 0
+                mav.seq, base_ms, turn = 0, REBOOTED_MS, 0
     print_line({"packets_dropped": dropped})
 
 

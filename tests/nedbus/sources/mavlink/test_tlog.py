@@ -19,6 +19,7 @@ from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
 
+CASES = Path(__file__).parents[5] / "shared/cases/turn6"
 EPOCH = 1_760_000_000_000_000  # us; 2025-10-09 08:53:20 UTC
 FLAGS = 0x3F  # ESTIMATOR_STATUS: all valid
 
@@ -60,7 +61,7 @@ def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> N
     run = open_replay(f"tlog:{path}?vehicle=a")
     replayed = [each for each in run.messages if each.address.topic == VLP]
     assert [(each.address.vehicle, each.fields["x"]) for each in replayed] == [("a", x) for x in range(100)]
-    np.testing.assert_allclose([each.due for each in replayed], [number / 10 for number in range(100)])
+    np.testing.assert_allclose([each.at for each in replayed], [number / 10 for number in range(100)])
     assert not run.warnings
     assert run_command("events", str(path)).exit_code == 0
     assert run_command("convert", str(path), str(tmp_path / "a.mcap")).exit_code == 0
@@ -68,9 +69,9 @@ def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> N
     assert nedbus.missing_of(nedbus.read(tmp_path / "a.mcap")) == nedbus.missing_of(positions)
 
 
-@pytest.mark.parametrize(("seconds", "kept"), [(60.0, 60.0), (60.2, 0.0), (-3600.0, 0.0)])
-def test_pauses_of_over_a_minute_are_skipped(tmp_path: Path, seconds: float, kept: float) -> None:
-    """A replay keeps pauses of up to a minute; longer ones and backward steps of the host's clock take no time."""
+@pytest.mark.parametrize("seconds", [20.0, 60.2, -5.0, -3600.0])
+def test_step_of_the_hosts_clock_takes_no_time(tmp_path: Path, seconds: float) -> None:
+    """The vehicle's clock determines how much time passed, not that of the ground station."""
     path = tmp_path / "flight.tlog"
     records = list(frames(7, 20))
     middle = len(records) // 2
@@ -78,8 +79,8 @@ def test_pauses_of_over_a_minute_are_skipped(tmp_path: Path, seconds: float, kep
         (stamp,) = struct.unpack_from(">Q", records[index])
         records[index] = struct.pack(">Q", stamp + round((seconds - 0.1) * 1e6)) + records[index][8:]
     path.write_bytes(b"".join(records))
-    due = [each.due for each in open_replay(f"tlog:{path}").messages if each.address.topic == VLP]
-    np.testing.assert_allclose(np.diff(due), [*[0.1] * 9, kept, *[0.1] * 9], atol=1e-6)
+    due = [each.at for each in open_replay(f"tlog:{path}").messages if each.address.topic == VLP]
+    np.testing.assert_allclose(np.diff(due), [0.1] * 19, atol=1e-6)
 
 
 def test_autopilots_in_tlog_are_separate_vehicles(tmp_path: Path) -> None:
@@ -193,3 +194,25 @@ def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
     for read in (nedbus.read, lambda path: open_replay(f"tlog:{path}")):
         with pytest.raises(SourceError, match=r"no autopilot messages|an empty file"):
             read(path)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+@pytest.mark.parametrize(
+    ("name", "count", "seconds"),
+    [("06_boot_ms_wrap.tlog", 400, 19.95), ("09_two_links_1.5s.tlog", 300, 14.95), ("duplicate.tlog", 5, 0.4)],
+)
+def test_each_message_once_and_in_order(name: str, count: int, seconds: float) -> None:
+    """After the wrap of `time_boot_ms`, over a second, slower link, and with a frame that is in the file twice."""
+    stamps = nedbus.read(CASES / name)["timestamp"]
+    assert stamps.size == count
+    assert (np.diff(stamps) > 0).all()
+    assert (stamps[-1] - stamps[0]) / 1e6 == pytest.approx(seconds)
+    assert "reboot" not in run_command("events", str(CASES / name)).out
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+def test_copies_are_counted() -> None:
+    """A frame that is in the file twice is one sample; a warning counts the copy."""
+    with nedbus.open(CASES / "duplicate.tlog") as flight:
+        assert len(list(flight("*"))) > 0
+        assert "1 copy from a second link left out" in " ".join(flight.warnings)

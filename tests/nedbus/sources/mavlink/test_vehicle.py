@@ -145,7 +145,7 @@ def test_attitude_replaces_missing_attitude_quaternion() -> None:
 
 
 def test_order_is_checked_per_topic() -> None:
-    """Only a message older than the last one of the same topic is out of order."""
+    """Only a message older than the last one of the same topic is out of order; the same one again is a copy."""
     vehicle = new_vehicle("*")
     odometry = [1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [math.nan] * 21, [math.nan] * 21]
     assert estimate(vehicle, 2000, 100.0)
@@ -153,7 +153,44 @@ def test_order_is_checked_per_topic() -> None:
     late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
     assert isinstance(late, Rejection)
     assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order (1800 ms since boot, after 1900 ms)")
-    assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
+    assert vehicle.handle(position(2000), 100.0) is None
+    assert vehicle.copies == 1
+    assert estimate(vehicle, 2050, 100.1)["timestamp"] == 2_050_000
+
+
+def heartbeat() -> Any:
+    return dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+
+
+def test_second_link_adds_nothing() -> None:
+    """A second link is 0.3 s late, with messages at other times: they, and its old heartbeats, are left out.
+
+    A message that is older than the last one of the same link is out of order, also then.
+    """
+    vehicle = new_vehicle("*")
+    for number in range(60):
+        now, ms = 100 + 0.05 * number, 10_000 + 50 * number
+        vehicle.count_lost(0, now, link=0)
+        assert isinstance(vehicle.handle(position(ms), now), SourceMessage)
+        vehicle.count_lost(0, now, link=1)
+        assert vehicle.handle(position(ms - 320), now) is None
+        assert vehicle.handle(heartbeat(), now) is None
+    assert vehicle.copies == 120
+    vehicle.count_lost(0, 103.0, link=0)
+    assert isinstance(vehicle.handle(position(12_901), 103.0), Rejection)
+    vehicle.count_lost(0, 103.0, link=0)
+    assert isinstance(vehicle.handle(heartbeat(), 103.0), SourceMessage)
+
+
+def test_second_link_replaces_the_first_one() -> None:
+    """After the first link broke, the messages of the second one are used, also those without a time."""
+    vehicle = new_vehicle("*")
+    for number in range(20):
+        vehicle.count_lost(0, 100 + 0.05 * number, link=0)
+        vehicle.handle(position(10_000 + 50 * number), 100 + 0.05 * number)
+    vehicle.count_lost(0, 102.0, link=1)
+    assert isinstance(vehicle.handle(position(11_700), 102.0), SourceMessage)
+    assert isinstance(vehicle.handle(heartbeat(), 102.0), SourceMessage)
 
 
 def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:

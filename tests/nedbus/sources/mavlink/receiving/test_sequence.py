@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nedbus.mavlink.log_reassembly import Reassembly
-from nedbus.mavlink.sequence import PacketRate, SequenceCounter
+from nedbus.mavlink.sequence import REPEATED, PacketRate, SequenceCounter
 from tests.peers.px4_log_stream import STREAMS, datagrams, stream_message
 
 HEADER = b"ULog\x01\x12\x35\x01" + bytes(20)
@@ -57,7 +57,7 @@ def test_random_sequence_numbers_lose_little() -> None:
     (STREAMS.parent / "link_cut_20s_in_flight.bin.gz", 21, 1475),  # MAVLink's sequence is unknown after the cut
     (STREAMS.parent / "foreign_stop_in_flight.bin.gz", 0, 0),
     (STREAMS / "ulog_stream_lossy1.bin.gz", 607, 237),
-    (STREAMS / "ulog_stream_session.bin.gz", 63, 615 + 3433),  # a reader that paused for 5 s
+    (STREAMS / "ulog_stream_session.bin.gz", 84, 615 + 3433),  # a reader that paused for 5 s
 ], ids=lambda each: getattr(each, "name", ""))  # fmt: skip
 def test_losses_of_recorded_links(path: Path, lost: int, lost_data: int) -> None:
     """Losses of a real PX4 (SITL) at the recorded times are counted in full: no gap is taken for a restart."""
@@ -90,3 +90,58 @@ def test_rate_forgets_the_past() -> None:
     for number in range(4000):
         rate.add(1000 + number / 100)
     assert 80 < rate.expected(1041.0 - 0.01) < 110
+
+
+def two_links(late: float, *, offset: int, loss: float) -> list[tuple[float, int, int]]:
+    """Return times, sequence numbers and links of 20 s: 61 packets/s, the second link `late` seconds late.
+
+    `offset`: first number on the second link. `loss`: share of the packets that the first link loses after 2 s.
+    """
+    rng = random.Random(5)
+    packets = []
+    for link, delay, first in ((0, 0.0, 0), (1, late, offset)):
+        number = first
+        for burst in range(400):
+            for place in range(4 if burst % 20 == 0 else 3):
+                is_lost = link == 0 and burst > 40 and rng.random() < loss
+                if not is_lost:
+                    packets.append((100 + 0.05 * burst + delay + 1e-4 * place, number % 256, link))
+                number += 1
+    return sorted(packets)
+
+
+@pytest.mark.parametrize("offset", [0, 1, 7, 16, 100, 200, 255])
+@pytest.mark.parametrize("late", [0.01, 0.3, 1.5, 3.0, 4.0, 5.0])
+def test_second_link_loses_nothing(late: float, offset: int) -> None:
+    """Two modems of one vehicle number their packets on their own: those of the second are no losses."""
+    counter = SequenceCounter()
+    assert sum(counter.add(number, now) for now, number, _ in two_links(late, offset=offset, loss=0.0)) == 0
+
+
+@pytest.mark.parametrize("late", [0.3, 1.5, 3.0, 5.0])
+def test_losses_of_the_first_link_are_counted_beside_a_second_one(late: float) -> None:
+    """All packets that the first link loses count, and no packet is taken for one of the other link."""
+    counter, lost, links = SequenceCounter(), 0, {0: set[int](), 1: set[int]()}
+    packets = two_links(late, offset=0, loss=0.02)
+    missing = 2 * 1220 - len(packets)
+    for now, number, link in packets:
+        lost += counter.add(number, now)
+        if 100 + late + 5 < now < 120:  # both send
+            links[link].add(counter.link)
+    assert lost == missing > 10
+    assert len(links[0]) == 1
+    assert links[0].isdisjoint(links[1])
+
+
+def test_packet_that_came_twice_is_marked() -> None:
+    """A sender that counts its packets sends no number twice; one that does not count is never marked."""
+    counter = SequenceCounter()
+    links = []
+    for number in (10, 11, 11, 12):
+        counter.add(number, 100.0)
+        links.append(counter.link)
+    assert links == [0, 0, REPEATED, 0]
+    counter = SequenceCounter()
+    for _ in range(3):
+        counter.add(0, 100.0)
+        assert counter.link == 0

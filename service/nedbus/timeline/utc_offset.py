@@ -1,5 +1,6 @@
 """Offset from time since boot to UTC, and the fields from which it is derived."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -41,6 +42,31 @@ class UtcOffset:
     def unix_us(self, timestamps: Any) -> Any:
         """Return the Unix time [us] of a timestamp or an array of timestamps."""
         return timestamps + self.offset_us * (1 - is_unix_time(timestamps))
+
+
+def to_unix_ns(time: int, boot_utc: int) -> int:
+    """Return a time of a file [us], Unix time or since the boot at `boot_utc` (0 if unknown), in nanoseconds."""
+    return 1000 * (time if is_unix_time(time) else time + boot_utc)
+
+
+def unix_seconds(time: float, offset: float | None) -> float | None:
+    """Return a vehicle's time [s], Unix time or since boot, as Unix time; None if unknown.
+
+    `offset`: Unix time minus time since boot [s], None if unknown.
+    """
+    if is_unix_time(time * 1e6):
+        return time
+    unix = None if offset is None else time + offset
+    return unix if unix is not None and is_unix_time(unix * 1e6) else None
+
+
+def utc_text(times: Sequence[float]) -> str:
+    """Return times [s] as UTC if they are Unix times, else as seconds: "3.0 to 4.5 s"."""
+    first, last = times
+    if not is_unix_time(first * 1e6):
+        return f"{first:.1f} to {last:.1f} s"
+    begin, end = (datetime.fromtimestamp(time, UTC) for time in times)
+    return f"{begin:%Y-%m-%d %H:%M:%S} to {end:%H:%M:%S} UTC"
 
 
 def provides_utc(definition: Definition[Any]) -> bool:

@@ -50,7 +50,7 @@ class UtcEstimate:
         found = {stream: times for (is_other, stream), times in stamps.items() if is_other}
         with_utc = [times for (is_other, _), times in stamps.items() if not is_other]
         others = [found[DEFAULT_TOPIC]] if DEFAULT_TOPIC in found else [*found.values()]
-        used = np.concatenate([np.zeros(0), *with_utc, *others])
+        used = np.concatenate([np.zeros(0), *with_utc, *(others if with_utc else found.values())])
         if (unix := int(np.sum(is_unix_time(used)))) > len(used) / 2:
             return UtcOffset("timestamp", 0, unix, 0)
         period, reasons = _period(np.concatenate([np.zeros(0), *others])), list[str]()
@@ -61,6 +61,11 @@ class UtcEstimate:
                 return agreement
             reasons.append(agreement)
         return UtcOffset("boot_time_utc_us", boot_utc, 1, 0) if is_unix_time(boot_utc) else "".join(reasons[:1])
+
+
+def to_datetime64(unix: _Ints) -> npt.NDArray[np.datetime64]:
+    """Return Unix times [us] as datetimes; NaT for other times."""
+    return np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
 
 
 def _find_agreement(stream: str, times: _Ints, offsets: _Ints, others: tuple[float, float]) -> UtcOffset | str:

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.mavlink.boot_clock import BootClock
+from nedbus.mavlink import new_clock, read_time
 from nedbus.mavlink.parser import new_parser
+from nedbus.timeline import TimeKind, VehicleClock
 from tests.peers.px4_log_stream import STREAMS, datagrams
 
 BOOT = 60_000
@@ -31,10 +32,15 @@ def distance(ms: int, sensor: int) -> Any:
     return dialect.MAVLink_distance_sensor_message(ms, 0, 100, 50, 0, sensor, 0, 0)
 
 
+def is_reboot(clock: VehicleClock, message: Any, now: float) -> bool:
+    reading = read_time(clock, message, now)
+    return reading is not None and reading.kind is TimeKind.REBOOT
+
+
 def reboots(*messages: Any, interval: float = 0.1) -> list[bool]:
     """Return for each message of a vehicle whether it showed a reboot."""
-    clock = BootClock()
-    return [clock.add(message, interval * number) for number, message in enumerate(messages)]
+    clock = new_clock()
+    return [is_reboot(clock, message, interval * number) for number, message in enumerate(messages)]
 
 
 def test_message_with_the_time_of_an_old_sample_is_no_reboot() -> None:
@@ -53,25 +59,25 @@ def test_single_time_far_ahead_is_no_reboot() -> None:
     """One message with a wild time in the future neither sets the clock nor makes the messages after it older."""
     flight = [kind(BOOT + 100 * number) for number in range(40) for kind in (position, attitude)]
     flight[20] = position(10**8)
-    clock = BootClock()
-    assert not any(clock.add(message, 0.05 * number) for number, message in enumerate(flight))
+    clock = new_clock()
+    assert not any(is_reboot(clock, message, 0.05 * number) for number, message in enumerate(flight))
     assert clock.newest == 1000 * (BOOT + 3900)
 
 
 def test_time_far_ahead_counts_once_it_is_confirmed() -> None:
     """Two messages in a row that are ahead, as of a simulation that runs fast, set the clock."""
-    clock = BootClock()
+    clock = new_clock()
     for each in (position(1000), position(BOOT), attitude(BOOT + 10)):
-        assert not clock.add(each, 0.0)
+        assert not is_reboot(clock, each, 0.0)
     assert clock.newest == 1000 * (BOOT + 10)
 
 
 def test_two_kinds_in_a_row_that_went_back_show_a_reboot() -> None:
     """The second kind whose own time went back shows the reboot, and is the first message of the new boot."""
     assert reboots(position(BOOT), attitude(BOOT), position(300), attitude(310)) == [False, False, False, True]
-    clock = BootClock()
+    clock = new_clock()
     for each in (position(BOOT), attitude(BOOT), position(300), attitude(310), position(320)):
-        clock.add(each, 0.0)
+        is_reboot(clock, each, 0.0)
     assert clock.newest == 320_000
 
 
@@ -79,11 +85,11 @@ def test_current_message_disproves_a_reboot() -> None:
     """Kinds that went back do not add up if a current message arrives between them."""
     both = attitude(BOOT), position(BOOT)
     assert not any(reboots(*both, position(300), attitude(BOOT), attitude(310), position(BOOT), position(320)))
-    clock = BootClock()
+    clock = new_clock()
     found = []
     for each in (position(BOOT), attitude(BOOT), position(300), attitude(310)):
         clock.confirm()  # such as by a ULog stream that continues
-        found.append(clock.add(each, 0.0))
+        found.append(is_reboot(clock, each, 0.0))
     assert not any(found)
 
 
@@ -111,13 +117,13 @@ def test_delay_of_less_than_a_second_is_no_reboot() -> None:
 )  # fmt: skip
 def test_recorded_reboots_are_found_within_two_seconds(recording: str, expected: int) -> None:
     """Each reboot of a real PX4 (SITL) is found within 2 s; failed sensors and cut links are not taken for one."""
-    clock, parser, starts, found = BootClock(), new_parser(), list[float](), list[float]()
+    clock, parser, starts, found = new_clock(), new_parser(), list[float](), list[float]()
     last = 0
     for when, from_vehicle, frame in datagrams(STREAMS / f"{recording}.bin.gz"):
         for message in parser.parse_buffer(frame) or [] if from_vehicle else []:
             if message.get_type() == "LOCAL_POSITION_NED":
                 starts += [when] * (message.time_boot_ms < last - 1000)
                 last = message.time_boot_ms
-            found += [when] * clock.add(message, when)
+            found += [when] * is_reboot(clock, message, when)
     assert len(found) == len(starts) == expected
     assert all(0 <= when - start < 2 for when, start in zip(found, starts, strict=True))

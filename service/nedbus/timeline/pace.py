@@ -1,0 +1,27 @@
+"""Pace of a replay: when each message is published."""
+
+from typing import Final
+
+MAX_PAUSE: Final = 60.0
+"""Longest pause of a replay [s]; a longer one takes no time."""
+
+
+class Pace:
+    """When the messages of a replay are published; the only place where pauses are shortened.
+
+    `speed`: 2.0 takes half the time. `skipped`: number of pauses of more than a minute so far.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.skipped = 0
+        self._speed, self._last, self._due = speed, 0.0, 0.0
+
+    def publish_at(self, at: float) -> float:
+        """Return when to publish the message at a time on the axis [s], as seconds since the first message."""
+        step = at - self._last
+        if step > MAX_PAUSE:
+            self.skipped += 1
+        elif step > 0:
+            self._due += step
+        self._last = max(at, self._last)
+        return self._due / self._speed

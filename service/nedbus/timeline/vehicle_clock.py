@@ -1,0 +1,192 @@
+"""One vehicle's own time: copies, late messages, wraps, wild times, steps and reboots."""
+
+import math
+from collections import OrderedDict
+from collections.abc import Hashable
+from enum import Enum
+from typing import Final, NamedTuple
+
+from nedbus_msgs import is_unix_time
+
+_MAX_LATE: Final = 1_000_000  # us by which a message of a current stream may be older than the newest one
+_MARGIN: Final = 2_000_000  # us by which a time since boot may exceed the time that passed: delays of a link
+_MAX_STREAMS: Final = 1000  # bounds the memory that a peer can use
+_MAX_REMEMBERED: Final = 512  # times of each stream that are known, to find copies
+_MAX_DOUBT: Final = 1.0  # s without a current message after which one stream is enough
+_MAX_OTHER: Final = 10.0  # s without a current message after which another clock counts, possible or not
+_MAX_DELAY: Final = 10_000_000  # us by which a second link may be behind; the same time, later, is another boot
+_UNKNOWN_PAUSE: Final = 60_000_000  # us that may have passed if the arrival time is unknown
+
+
+class TimeKind(Enum):
+    """What the time of a message shows."""
+
+    NEW = "new"
+    LATE = "late"
+    COPY = "copy"
+    WILD = "wild"
+    REBOOT = "reboot"
+    STEP = "step"
+
+
+class Reading(NamedTuple):
+    """What a message's time shows: its kind, the time on the vehicle's clock [us], and the number of the boot."""
+
+    kind: TimeKind
+    time: int
+    boot: int
+
+
+def is_boot_possible(time: int, elapsed: float | None) -> bool:
+    """Return whether a vehicle can have booted at `time` [us since boot], if its last message came `elapsed` s ago.
+
+    A vehicle that rebooted cannot be up for longer than the time since its last message. Unix time is no time since
+    boot. `elapsed`: None if unknown.
+    """
+    if is_unix_time(time):
+        return False
+    return elapsed is None or time <= 1e6 * elapsed + _MARGIN
+
+
+class RecentTimes:
+    """The last 512 times of each stream, of up to 1000 streams."""
+
+    def __init__(self) -> None:
+        self._times: dict[Hashable, OrderedDict[int, None]] = {}
+
+    def contains(self, stream: Hashable, time: int) -> bool:
+        """Return whether a stream had this time."""
+        return time in self._times.get(stream, ())
+
+    def add(self, stream: Hashable, time: int) -> None:
+        """Add the time of a message."""
+        times = self._times.get(stream)
+        if times is None:
+            if len(self._times) >= _MAX_STREAMS:
+                return
+            times = self._times[stream] = OrderedDict()
+        times[time] = None
+        if len(times) > _MAX_REMEMBERED:
+            times.popitem(last=False)
+
+
+class VehicleClock:
+    """One vehicle's own time, from the times of its messages on any stream.
+
+    `modulus`: number of microseconds after which its times start again from 0, None if they do not.
+
+    `newest`: the vehicle's time [us]; None before the first message. `boot`: number of the boot, from 0.
+    `copies`: number of messages that came twice.
+
+    A message may have the time of an old sample, as SCALED_PRESSURE does while the barometer provides no data, so an
+    old message alone shows nothing. After a reboot, all streams are older than their own previous message, and none is
+    current. That holds if two streams in a row show it, or one that is the only one, or remains so for a second, and
+    if the new time since boot is possible. Other clocks that last for ten seconds count in any case. A time that is
+    further ahead than the vehicle can be counts once the next message confirms it.
+    """
+
+    def __init__(self, modulus: int | None = None) -> None:
+        self.newest: int | None = None
+        self.boot = self.copies = 0
+        self._modulus = modulus
+        self._arrived: float | None = None  # time at which the newest message arrived
+        self._ahead = math.inf  # time in the last message, if it was too far ahead [us]
+        self._last: dict[Hashable, int] = {}  # time of the last message of each stream [us]
+        self._older: dict[Hashable, float] = {}  # streams that went back since the last current message, and when
+        self._known = RecentTimes()
+
+    def add(self, stream: Hashable, time: int, now: float | None = None) -> Reading:
+        """Return what a message shows whose time is `time` [us]; it arrived at `now` [s], None if unknown."""
+        if self.newest is None:
+            return self._begin(stream, time, now, TimeKind.NEW)
+        time = self.unwrap(time, now)
+        if self._known.contains(stream, time) and self._is_delay(self.newest - time, now):
+            self.copies += 1
+            if time >= self.newest - _MAX_LATE:
+                self._older.clear()  # a current message: the vehicle continues to run
+            return Reading(TimeKind.COPY, time, self.boot)
+        last = self._last.get(stream, time)
+        if stream in self._last or len(self._last) < _MAX_STREAMS:
+            self._last[stream] = time
+        if time >= self.newest - _MAX_LATE:
+            return self._add_current(stream, time, self.newest, now)
+        return self._add_older(stream, time, last, self.newest, now)
+
+    def confirm(self) -> None:
+        """Discard the signs of a reboot, because something else shows that the vehicle continues to run."""
+        self._older.clear()
+
+    def _add_current(self, stream: Hashable, time: int, newest: int, now: float | None) -> Reading:
+        if self._is_wild(time, newest, now):
+            return Reading(TimeKind.WILD, time, self.boot)
+        is_step = bool(is_unix_time(time)) != bool(is_unix_time(newest))
+        self.newest = max(time, newest)
+        self._arrived = now
+        self._older.clear()
+        self._known.add(stream, time)
+        return Reading(TimeKind.STEP if is_step else TimeKind.NEW, time, self.boot)
+
+    def _add_older(self, stream: Hashable, time: int, last: int, newest: int, now: float | None) -> Reading:
+        if time < last - _MAX_LATE:
+            self._older.setdefault(stream, math.inf if now is None else now)
+        is_confirmed = len(self._older) >= min(2, len(self._last))
+        doubt = 0.0 if now is None else max(0.0, now - min(self._older.values(), default=now))
+        elapsed = self._elapsed(now)
+        is_synchronised = bool(is_unix_time(time)) and bool(is_unix_time(newest))
+        if is_synchronised or is_boot_possible(time, elapsed):
+            is_other = bool(self._older) and (is_confirmed or doubt >= _MAX_DOUBT)
+        else:
+            is_other = doubt >= _MAX_OTHER
+        if is_other:
+            kind = TimeKind.STEP if is_unix_time(time) else TimeKind.REBOOT
+            return self._begin(stream, time, now, kind)
+        self._known.add(stream, time)
+        return Reading(TimeKind.LATE, time, self.boot)
+
+    def _begin(self, stream: Hashable, time: int, now: float | None, kind: TimeKind) -> Reading:
+        if kind is TimeKind.REBOOT:
+            self.boot += 1
+            if self._modulus:
+                time %= self._modulus
+        self.newest, self._arrived = time, now
+        self._ahead = math.inf
+        self._last = {stream: time}
+        self._older.clear()
+        self._known = RecentTimes()
+        self._known.add(stream, time)
+        return Reading(kind, time, self.boot)
+
+    def _is_delay(self, late: int, now: float | None) -> bool:
+        """Return whether the delay of a link explains a message that is this late [us]."""
+        elapsed = self._elapsed(now)
+        return late + 1e6 * (elapsed or 0.0) <= _MAX_DELAY
+
+    def _elapsed(self, now: float | None) -> float | None:
+        if now is None or self._arrived is None:
+            return None
+        return max(0.0, now - self._arrived)
+
+    def unwrap(self, time: int, now: float | None = None) -> int:
+        """Return a time with the wraps before it, if it then is one that the vehicle can have."""
+        newest = self.newest
+        if self._modulus is None or newest is None:
+            return time
+        elapsed = self._elapsed(now)
+        passed = _UNKNOWN_PAUSE if elapsed is None else 1e6 * elapsed + _MARGIN
+        begin = newest - newest % self._modulus
+        same, after, before = begin + time, begin + self._modulus + time, begin - self._modulus + time
+        if after <= newest + passed:
+            return after
+        if begin and newest - before <= _UNKNOWN_PAUSE:
+            return before  # a late message from before the wrap
+        is_reboot = same > newest + passed and time <= passed
+        return time if is_reboot or same < newest - _UNKNOWN_PAUSE else same
+
+    def _is_wild(self, time: int, newest: int, now: float | None) -> bool:
+        """Return whether a time is too far ahead, and the message before does not confirm it."""
+        elapsed = self._elapsed(now)
+        passed = 0.0 if elapsed is None else 1e6 * elapsed
+        is_ahead = time > newest + passed + _UNKNOWN_PAUSE
+        is_confirmed = 0 <= time - self._ahead <= _UNKNOWN_PAUSE
+        self._ahead = time if is_ahead else math.inf
+        return is_ahead and not is_confirmed

@@ -1,0 +1,90 @@
+"""Order of a file's messages: the vehicle's clock decides, whatever the clock of the recorder does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from hypothesis import given, strategies as st
+
+from nedbus.timeline import MAX_PAUSE, Order, Pace
+from nedbus_msgs import Address
+
+STEP = 20_000  # us
+PARTS = st.lists(
+    st.tuples(st.integers(30, 80), st.sampled_from(["pause", "host", "reboot"]), st.integers(-3600, 3600)),
+    min_size=1,
+    max_size=5,
+)
+
+
+@dataclass
+class Message:
+    """A message with a timestamp and a log time [us]."""
+
+    timestamp: int
+    time: int
+    address: Address = Address("1", "vehicle_local_position")  # noqa: RUF009 - immutable
+    at: float = 0.0
+    error: str | None = None
+    logged: Any = "stream"
+
+
+@given(PARTS)
+def test_order_and_duration_are_those_of_the_vehicle(parts: list[tuple[int, str, int]]) -> None:
+    """Pauses count, steps of the recorder's clock do not, and a reboot begins with the order of the file."""
+    stamp, host, elapsed = 5_000_000, 1_760_000_000_000_000, 0
+    messages, times = list[Message](), list[float]()
+    for count, change, seconds in parts:
+        for _ in range(count):
+            messages.append(Message(stamp, stamp + host))
+            times.append(elapsed / 1e6)
+            stamp, elapsed = stamp + STEP, elapsed + STEP
+        pause = abs(seconds) * 1_000_000
+        if change == "pause":
+            stamp, elapsed = stamp + pause, elapsed + pause
+        elif change == "host":
+            host += seconds * 1_000_000
+        else:  # the vehicle was off for this time, and the recorder's clock ran on
+            pause += 5_000_000
+            before, stamp = stamp, 1_000_000
+            host, elapsed = host + before + pause - stamp, elapsed + pause
+    order = Order[Message]()
+    found = list(order.arrange(messages))
+    assert [each.timestamp for each in found] == [each.timestamp for each in messages]
+    assert [each.at for each in found] == pytest.approx(times)
+    assert not order.unordered
+
+
+def test_streams_written_in_batches_are_sorted() -> None:
+    """Batches of two streams become one sequence in the order of the timestamps, also around a step of the host."""
+    host = [0 if number < 300 else -3_000_000 for number in range(600)]
+    stamps = [1_000_000 + number * STEP for number in range(600)]
+    streams: list[list[Message]] = [
+        [Message(stamp, stamp + shift, logged=index) for stamp, shift in zip(stamps, host, strict=True)][index::2]
+        for index in range(2)
+    ]
+    messages = [each for begin in range(0, 300, 50) for own in streams for each in own[begin : begin + 50]]
+    found = [each.timestamp for each in Order[Message]().arrange(messages)]
+    assert found == stamps
+
+
+@pytest.mark.parametrize("has_log_times", [True, False])
+def test_last_message_after_a_pause_is_a_pause(*, has_log_times: bool) -> None:
+    """A last message up to a day later ends a pause; one on no clock of the vehicle is out of order."""
+    for last, duration, unordered in ((90_000_000, 89.0, 0), (10**15, 4.0, 1)):
+        stamps = [*range(1_000_000, 6_000_000, 1_000_000), last]
+        order = Order[Message](has_log_times=has_log_times)
+        times = stamps if not has_log_times else [1_760_000_000_000_000 + number for number in range(len(stamps))]
+        messages = [Message(stamp, time) for stamp, time in zip(stamps, times, strict=True)]
+        *_, end = order.arrange(messages)
+        assert end.at == pytest.approx(duration)
+        assert order.unordered.total() == unordered
+
+
+def test_pace_alone_shortens_pauses() -> None:
+    """A pause of up to a minute is kept; a longer one takes no time, and is counted."""
+    pace = Pace(speed=2.0)
+    assert [pace.publish_at(at) for at in (0.0, 1.0, 1.0 + MAX_PAUSE, 1000.0, 1001.0)] == [0.0, 0.5, 30.5, 30.5, 31.0]
+    assert pace.skipped == 1
