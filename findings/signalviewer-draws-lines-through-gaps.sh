@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # signalviewer-lite 1.14.0, 2026-11-29: `signalviewer-cli export` puts signals on one time base by interpolation: a gap of 5 s
 # in a PX4 topic becomes a straight line, and a flag such as xy_valid becomes 0.6 between false and true. `--alignment
-# nearest` keeps the flag a flag, and fills the gap as well. Only the time before the first sample is NaN.
+# nearest` keeps the flag a flag, and fills the gap as well, and the time before the first sample, which is NaN otherwise.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

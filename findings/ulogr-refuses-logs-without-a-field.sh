@@ -21,12 +21,13 @@ def record(kind, body):
 for name, ratio in (("v1_15", "mag_test_ratio"), ("v1_16", "hdg_test_ratio")):
     fields = "".join(f"float {each};" for each in (ratio, *RATIOS))
     log = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + record("B", bytes(40))
-    log += record("F", b"estimator_status:uint64_t timestamp;" + fields.encode())
+    flags = "uint32_t filter_fault_flags;uint16_t gps_check_fail_flags;"
+    log += record("F", f"estimator_status:uint64_t timestamp;{fields}{flags}".encode())
     log += record("F", b"vehicle_local_position:uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz;")
     log += record("A", struct.pack("<BH", 0, 0) + b"estimator_status")
     log += record("A", struct.pack("<BH", 0, 1) + b"vehicle_local_position")
     for number in range(1, 100):
-        log += record("D", struct.pack("<HQ7f", 0, 100_000 * number, *[0.1] * 7))
+        log += record("D", struct.pack("<HQ7fIH", 0, 100_000 * number, *[0.1] * 7, 0, 0))
         log += record("D", struct.pack("<HQ6f", 1, 100_000 * number, 0, 0, -5, 0, 0, 0))
     with open(f"{name}.ulg", "wb") as stream:
         stream.write(log)
