@@ -104,12 +104,15 @@ def different_filters(path: Path, folder: Path, columns: dict[str, tuple[float, 
                     differences.append(f"{export.name}: {query}")
             for where, compare in COMPARISONS.items():
                 query = re.sub(r"\bx\b", column, where)
-                with_parameter = query.replace("0.1::FLOAT", f"?::{kind}")
+                expected = array["timestamp"][compare(values, values.dtype.type(0.1))].tolist()
+                if export.timestamps(query.replace("0.1::FLOAT", f"?::{kind}"), 0.1) != expected:
+                    differences.append(f"{export.name}: {query}, as a parameter")
                 for limit in limits:
-                    with_text = query.replace("0.1::FLOAT", f"'{limit!r}'::{kind}")
+                    text = repr(limit) if math.isfinite(limit) else f"'{limit!r}'"
+                    with_limit = query.replace("0.1::FLOAT", f"{text}::{kind}")
                     expected = array["timestamp"][compare(values, values.dtype.type(limit))].tolist()
-                    if export.timestamps(with_parameter, limit) != expected or export.timestamps(with_text) != expected:
-                        differences.append(f"{export.name}: {with_text}")
+                    if export.timestamps(with_limit) != expected:
+                        differences.append(f"{export.name}: {with_limit}")
     return differences
 
 
