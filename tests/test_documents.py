@@ -352,6 +352,15 @@ def test_mentioned_compose_files_and_variables_exist() -> None:
         assert any(variable in text for text in stacks.values())
 
 
+def test_every_finding_is_listed() -> None:
+    """findings/README.md and the page of differences name each script of findings/, and no other."""
+    scripts = sorted(script.stem for script in (ROOT / "findings").glob("*.sh"))
+    listed = re.findall(r"^\| `([\w-]+)` \|", (ROOT / "findings" / "README.md").read_text(), re.MULTILINE)
+    assert listed == scripts
+    named = re.findall(r"^\|.*, `([\w-]+)` \|$", (DOCS / "beside-other-tools.md").read_text(), re.MULTILINE)
+    assert sorted(set(named)) == scripts
+
+
 def test_relative_links_resolve() -> None:
     """The target file and heading of every relative link exist; the site has no page from outside docs."""
     for page in (*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md"):

@@ -281,10 +281,13 @@ class Vehicle:
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
-            case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
-                self._store("heading", now + _VALUE_TIMEOUT, heading=wrap(math.radians(message.hdg / 100)))
-            case "ATTITUDE" if math.isfinite(message.yaw):
-                self._store("yaw", now + _VALUE_TIMEOUT, heading=wrap(message.yaw))
+            case "GLOBAL_POSITION_INT":
+                is_known = message.hdg != _UNKNOWN_HEADING
+                heading = {"heading": wrap(math.radians(message.hdg / 100))} if is_known else {}
+                self._store("heading", now + _VALUE_TIMEOUT, **heading)  # an unknown heading ends the earlier one
+            case "ATTITUDE":
+                yaw = {"heading": wrap(message.yaw)} if math.isfinite(message.yaw) else {}
+                self._store("yaw", now + _VALUE_TIMEOUT, **yaw)
             case "GPS_GLOBAL_ORIGIN" if _is_origin(message):
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3

@@ -296,6 +296,17 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
 
 
+def test_heading_that_becomes_unknown_is_not_provided(vehicle: Vehicle) -> None:
+    """An unknown heading or yaw ends the earlier one at once; mavkit 0.3.0 keeps it (findings)."""
+    vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
+    vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
+    assert estimate(vehicle, 1, 100.0)["heading"] == pytest.approx(math.pi / 2)
+    vehicle.handle(dialect.MAVLink_global_position_int_message(2, 0, 0, 0, 0, 0, 0, 0, 65535), 100.1)
+    assert estimate(vehicle, 3, 100.1)["heading"] == pytest.approx(1.25)
+    vehicle.handle(dialect.MAVLink_attitude_message(4, 0, 0, math.nan, 0, 0, 0), 100.2)
+    assert "heading" not in estimate(vehicle, 5, 100.2)
+
+
 def test_attitude_yaw_replaces_unknown_heading(vehicle: Vehicle) -> None:
     """If the heading in GLOBAL_POSITION_INT is unknown (65535), the heading is the yaw of ATTITUDE."""
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
