@@ -7,6 +7,7 @@ from .client import (
     LogStreamStatus,
     Monitor,
     NewestMessage,
+    PositionStatus,
     Publishers,
     RejectionReport,
     Rejections,
@@ -20,6 +21,6 @@ from .events import AccountReport, Condition, Event, VehicleReport
 
 __all__ = [
     "AccountReport", "Condition", "Event", "Health", "Histogram", "LinkCallback", "LogStreamStatus", "Monitor",
-    "NewestMessage", "Publishers", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth",
+    "NewestMessage", "PositionStatus", "Publishers", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth",
     "StreamStatus", "VehicleReport", "Vehicles",
 ]  # fmt: skip

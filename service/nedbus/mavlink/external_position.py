@@ -132,6 +132,11 @@ class ExternalPosition:
         self._changes: deque[bool] = deque(maxlen=_COUNTS_MESSAGES)
 
     @property
+    def last_sent(self) -> float:
+        """Time of the last position sent; minus infinity before the first."""
+        return self._sent_times[-1] if self._sent_times else -math.inf
+
+    @property
     def rate(self) -> float:
         """Messages sent per second, over the last ten; 0 before the second one."""
         if len(self._sent_times) < 2:
@@ -185,7 +190,9 @@ class ExternalPosition:
         """Return how long a message was under way [s], beyond the shortest way."""
         delay = self._delay.add(timestamp / 1e6, now)
         if delay is None:
-            text = f"timestamp {timestamp} is not the expected time: the clock of the sender has been stepped, or stalled"
+            text = (
+                f"timestamp {timestamp} is not the expected time: the clock of the sender has been stepped, or stalled"
+            )
             raise _RefusedError("clock", f"{text}; use a monotonic clock")
         if self._delay.was_stepped:
             self._stamp, self._last = -1, None
@@ -219,10 +226,14 @@ class ExternalPosition:
         has_changed = odometry.reset_counter != before.reset_counter
         self._changes.append(has_changed)
         if len(self._changes) == _COUNTS_MESSAGES and all(self._changes):
-            text = f"reset_counter {odometry.reset_counter} changes with each message: raise it only when position jumps"
+            text = (
+                f"reset_counter {odometry.reset_counter} changes with each message: raise it only when position jumps"
+            )
             raise _RefusedError("reset_counter", text)
         distance = math.dist(before.position, odometry.position)
-        speed = max([_MAX_SPEED, *(2 * math.hypot(*each.velocity) for each in (before, odometry) if _known(each.velocity))])
+        speed = max(
+            [_MAX_SPEED, *(2 * math.hypot(*each.velocity) for each in (before, odometry) if _known(each.velocity))]
+        )
         is_known = max(before.pose_variances[0], odometry.pose_variances[0]) < UNKNOWN_VARIANCE
         if has_changed or not is_known or distance <= _JUMP + speed * (timestamp - then) / 1e6:
             self.warnings.pop("jump", None)
@@ -300,7 +311,10 @@ def _of_odometry(position: VehicleOdometry) -> Odometry:
             text = f"velocity_frame is {position.velocity_frame}: set it to VELOCITY_FRAME_NED (1), FRD (2) or BODY_FRD (3)"
             raise _RefusedError("velocity_frame", text)
         child_frame = dialect.MAV_FRAME_BODY_FRD
-    where, variance = _vector("position", position.position), _variances("position_variance", position.position_variance)
+    where, variance = (
+        _vector("position", position.position),
+        _variances("position_variance", position.position_variance),
+    )
     if not _known(where):
         where, variance = (0.0,) * 3, (UNKNOWN_VARIANCE,) * 3
     rates = position.angular_velocity if _known(position.angular_velocity) else _NAN3
@@ -315,7 +329,9 @@ def _of_odometry(position: VehicleOdometry) -> Odometry:
 def _of_local_position(position: VehicleLocalPosition) -> Odometry:
     """Convert a position in NED, with the attitude of a level vehicle; what is not valid gets UNKNOWN_VARIANCE."""
     if not (position.xy_valid or position.z_valid or position.v_xy_valid or position.v_z_valid):
-        raise _RefusedError("validity", "xy_valid, z_valid, v_xy_valid and v_z_valid are false: there is nothing to send")
+        raise _RefusedError(
+            "validity", "xy_valid, z_valid, v_xy_valid and v_z_valid are false: there is nothing to send"
+        )
     horizontal, vertical = _square("eph", position.eph) / 2, _square("epv", position.epv)
     where, variances = _valid(
         ("x", position.x, horizontal, position.xy_valid), ("y", position.y, horizontal, position.xy_valid),
