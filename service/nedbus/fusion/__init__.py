@@ -1,7 +1,8 @@
 """Fusion: whether PX4's EKF2 uses a position that was sent into the vehicle, and why not; from messages, no I/O."""
 
-from .causes import EV_BITS, Cause
+from .causes import Cause
+from .changes import fusion_changes
 from .evidence import FUSION_TOPICS, QUANTITIES, FusionTracker
 from .report import Fusion, QuantityFusion
 
-__all__ = ["EV_BITS", "FUSION_TOPICS", "QUANTITIES", "Cause", "Fusion", "FusionTracker", "QuantityFusion"]
+__all__ = ["FUSION_TOPICS", "QUANTITIES", "Cause", "Fusion", "FusionTracker", "QuantityFusion", "fusion_changes"]

@@ -33,6 +33,7 @@ class Cause:
         " BODY_FRD (12)"
     )
     NO_VELOCITY = "the message has no velocity"
+    NO_ATTITUDE = "the message has no attitude: q is NaN"
     QUATERNION = "q is not a unit quaternion within 1e-5: normalise it in double precision, order w, x, y, z"
     QUATERNION_ORDER = "q is in another order than w, x, y, z, or its heading is of another frame than NED"
     RATE = "less than 5 messages per second: EKF2 starts only if two are within 200 ms; send 20 to 50"
@@ -82,24 +83,34 @@ def cause_of(name: str, states: Mapping[str, State], ratio: float, echo: Echo) -
     `states`: of all quantities. `ratio`: the test ratio of this one.
     """
     state = states[name]
-    if not echo.is_echoed and state != "unknown":
-        return "" if state == "fused" else _cause_without_echo(echo)
-    wrong = _wrong_field(name, echo)
-    if state == "fused" or wrong or state == "unknown":
-        return "" if state == "fused" else wrong
+    if state == "fused":
+        return ""
+    if not echo.is_echoed:
+        return "" if state == "unknown" else _cause_without_echo(echo)
+    if wrong := _wrong_field(name, echo):
+        return wrong
     if state == "rejected":
         return _cause_of_rejection(name, states, ratio)
+    return "" if state == "unknown" else _cause_of_disuse(name, states, echo)
+
+
+def _cause_of_disuse(name: str, states: Mapping[str, State], echo: Echo) -> str:
+    """Return why EKF2 neither fuses nor rejects a quantity whose fields are right."""
+    is_received = states[name] != "not received"
+    is_velocity = name == "velocity" and states["position"] != "not received"  # EKF2 reports it only while it fuses it
     if echo.ahead:
-        return Cause.AHEAD.format(echo.ahead)
-    if state == "not received" and echo.age > _OLD:
-        return Cause.OLD.format(echo.age)
-    if echo.counts_messages:
-        return Cause.COUNTER
-    if echo.rate < _MIN_RATE:
-        return Cause.RATE
-    if state == "not received" and (name != "velocity" or states["position"] == "not received"):
-        return Cause.CLOCK
-    return Cause.CONTROL.format(EV_BITS[name], echo.quality)
+        cause = Cause.AHEAD.format(echo.ahead)
+    elif not is_received and echo.age > _OLD:
+        cause = Cause.OLD.format(echo.age)
+    elif echo.counts_messages:
+        cause = Cause.COUNTER
+    elif echo.rate < _MIN_RATE:
+        cause = Cause.RATE
+    elif is_received or is_velocity:
+        cause = Cause.CONTROL.format(EV_BITS[name], echo.quality)
+    else:
+        cause = Cause.CLOCK
+    return cause
 
 
 def _cause_without_echo(echo: Echo) -> str:
@@ -120,7 +131,9 @@ def _wrong_field(name: str, echo: Echo) -> str:
         if not echo.has_velocity:
             return Cause.NO_VELOCITY
         return "" if echo.pose_frame else Cause.POSE_FRAME  # without it, a velocity in NED is refused as well
-    if name == "yaw" and not echo.norm_error <= _MAX_ERROR:
+    if name == "yaw" and math.isnan(echo.norm_error):
+        return Cause.NO_ATTITUDE
+    if name == "yaw" and echo.norm_error > _MAX_ERROR:
         return Cause.QUATERNION
     return ""
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from nedbus.samples import PositionStatus
+from nedbus.samples import PositionStatus, Sample
 from nedbus_msgs import FieldReader
 
 from .causes import USELESS_VARIANCE, Cause, Echo, cause_of
@@ -16,7 +16,9 @@ _AID: Final = "estimator_aid_src_ev_"
 _ECHO: Final = "vehicle_visual_odometry"
 _MOCAP: Final = "vehicle_mocap_odometry"
 _FLAGS: Final = "estimator_status_flags"
-_SELECTOR: Final = "estimator_selector_status"
+SELECTOR: Final = "estimator_selector_status"
+"""Topic that names the EKF in use."""
+
 _ESTIMATE: Final = "vehicle_local_position"
 _BIAS: Final = "estimator_ev_pos_bias"
 _TEXT: Final = "log_message"
@@ -24,10 +26,11 @@ QUANTITIES: Final = {"position": "pos", "height": "hgt", "velocity": "vel", "yaw
 """Quantities of an external position, with PX4's names for them."""
 
 FUSION_TOPICS: Final = (
-    *(f"{_AID}{short}" for short in QUANTITIES.values()), _ECHO, _MOCAP, _FLAGS, _SELECTOR, _ESTIMATE, _BIAS, _TEXT,
+    *(f"{_AID}{short}" for short in QUANTITIES.values()), _ECHO, _MOCAP, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
 )  # fmt: skip
 """Topics that a FusionTracker uses."""
 
+_PERIODIC: Final = frozenset(FUSION_TOPICS) - {_MOCAP, SELECTOR, _TEXT}
 _WINDOW: Final = 1_000_000  # us
 _CONFIRMED: Final = 3  # messages in a row that show what EKF2 does now
 _REJECTED_SHARE: Final = 0.2  # of the messages in the window; vision that is 0.24 s late has 0.26
@@ -35,6 +38,7 @@ _START: Final = 400_000  # us from a measurement to its fusion, in which "not us
 _SILENCE: Final = 600_000  # us without a message after which it no longer arrives
 _FLAGS_LATE: Final = 1_500_000  # us of vision after which EKF2's flags show whether it is fused
 _REBOOT: Final = 1_000_000  # us back in time
+_PAUSE: Final = 10_000_000  # us ahead, more than between any two messages
 _AHEAD: Final = 500_000  # us
 _LARGE_BIAS: Final = 1.0  # m
 _MAX_MESSAGES: Final = 400  # in the window
@@ -74,6 +78,7 @@ class FusionTracker:
     def __init__(self) -> None:
         self.primary = 0
         self.now = 0
+        self._is_odd = False  # the time of the last message did not follow
         self._reset()
 
     def _reset(self) -> None:
@@ -89,15 +94,18 @@ class FusionTracker:
         self._eph = math.nan
         self._bias = math.nan, math.nan
 
+    def add_sample(self, sample: Sample[Any]) -> bool:
+        """Add a sample; return False for one from before the subscription, of which only the EKF in use counts."""
+        if sample.retained and sample.topic != SELECTOR:
+            return False
+        self.add(sample.topic, sample.message)
+        return True
+
     def add(self, topic: str, message: object) -> None:
         """Add a message of one of FUSION_TOPICS: a model, a row, or a dict of fields."""
         time = _read_time(message)[0]
-        if not isinstance(time, int):
+        if not isinstance(time, int) or not self._follow_time(topic, time):
             return
-        if time < self.now - _REBOOT:
-            self._reset()
-            self.now = time
-        self.now = max(self.now, time)
         if topic.startswith(_AID):
             self._add_aid(topic, message)
         elif topic == _ECHO:
@@ -111,12 +119,28 @@ class FusionTracker:
             self._eph = _number(_read_estimate(message)[1])
         elif topic == _BIAS:
             self._add_bias(message)
-        elif topic == _SELECTOR:
+        elif topic == SELECTOR:
             primary = _read_primary(message)[1]
             self.primary = primary if isinstance(primary, int) else self.primary
         elif topic == _TEXT and _UNSUPPORTED in str(_read_text(message)[1]):
             self._unsupported = time
         self._update()
+
+    def _follow_time(self, topic: str, time: int) -> bool:
+        """Set the current time; return whether the message belongs to it.
+
+        Two messages in a row show a reboot, or a pause of the data: a single one may be damaged, or late.
+        """
+        is_odd = topic in _PERIODIC and not self.now - _REBOOT <= time <= self.now + _PAUSE
+        was_odd, self._is_odd = self._is_odd, is_odd and bool(self.now)
+        if not self._is_odd:
+            self.now = max(self.now, time) if topic in _PERIODIC else self.now
+            return True
+        if was_odd:
+            if time < self.now:
+                self._reset()
+            self.now = time
+        return was_odd
 
     def _add_aid(self, topic: str, message: object) -> None:
         time, fused, rejected, ratio, instance = _read_aid(message)
@@ -243,7 +267,6 @@ class FusionTracker:
         if not (echo.is_echoed or echo.is_mocap or self._has_aids):
             missing.append(f"{_ECHO}, which shows what PX4 received; {how}")
         return missing
-
 
 
 def _number(value: object) -> float:

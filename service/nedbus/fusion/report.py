@@ -27,17 +27,6 @@ class QuantityFusion:
     ratio: float = math.nan
     cause: str = ""
 
-    @property
-    def text(self) -> str:
-        """The state in one line."""
-        parts = [f"{self.name} {self.state}"]
-        if self.state == "rejected" and not math.isnan(self.ratio):
-            parts.append(f"(test ratio {self.ratio:.2g})")
-        if self.since is not None:
-            parts.append(f"since {self.since:.1f} s")
-        text = " ".join(parts)
-        return f"{text}: {self.cause}" if self.cause else text
-
 
 @dataclass(frozen=True, slots=True)
 class Fusion:
@@ -75,18 +64,49 @@ class Fusion:
 
     @property
     def lines(self) -> Sequence[str]:
-        """The report as text; parts of `sent` are untrusted."""
-        lines = []
+        """The report as text: what is sent, how quantities are used, what else is known, and missing evidence."""
+        lines = list[str]()
         if self.sent is not None:
-            lines.append(f"sent: {self.sent.text}")
-            if self.sent.age is not None and self.sent.clock == "arrival":
-                lines.append(f"delay before the link: {1000 * self.sent.age:.0f} ms; set EKF2_EV_DELAY to it, plus the sensor's")
-        if not math.isnan(self.echoed):
-            lines.append(f"echoed by PX4: {self.echoed:.1f} Hz")
-        lines += [quantity.text for quantity in self.quantities]
+            lines.append(f"sent: {self.sent.text}{self._delay_to_set}")
+        lines += self._states
+        return [*lines, self._numbers, *self.remarks, *(f"not in the data: {each}" for each in self.missing)]
+
+    @property
+    def _delay_to_set(self) -> str:
+        if self.sent is None or self.sent.age is None or self.sent.clock != "arrival":
+            return ""
+        return f"; set EKF2_EV_DELAY to {1000 * self.sent.age:.0f} ms, plus the delay of the link"
+
+    @property
+    def _states(self) -> list[str]:
+        """Quantities with the same state and cause, in one line each."""
+        groups: dict[tuple[str, str], list[QuantityFusion]] = {}
+        for quantity in self.quantities:
+            groups.setdefault((quantity.state, quantity.cause), []).append(quantity)
+        lines = list[str]()
+        for (state, cause), quantities in groups.items():
+            text = f"{', '.join(quantity.name for quantity in quantities)} {state}"
+            starts = [quantity.since for quantity in quantities if quantity.since is not None]
+            ratios = [quantity.ratio for quantity in quantities if not math.isnan(quantity.ratio)]
+            if state == "rejected" and ratios:
+                text += f" (test ratio {max(ratios):.2g})"
+            if starts:
+                text += f" since {min(starts):.1f} s"
+            lines.append(f"{text}: {cause}" if cause else text)
+        return lines
+
+    @property
+    def _numbers(self) -> str:
+        rate = (
+            "no message from PX4 shows what it received"
+            if math.isnan(self.echoed)
+            else f"PX4 receives {self.echoed:.1f} Hz"
+        )
+        parts = [rate]
+        if not math.isnan(self.variance):
+            parts.append(f"with a deviation of {math.sqrt(self.variance):.2g} m")
         if not math.isnan(self.eph):
-            of_input = "" if math.isnan(self.variance) else f"; received with {math.sqrt(self.variance):.2g} m"
-            lines.append(f"eph {self.eph:.2g} m{of_input}")
+            parts.append(f"eph {self.eph:.2g} m")
         if not math.isnan(self.bias[0]):
-            lines.append(f"bias against GNSS: {self.bias[0]:.1f} m north, {self.bias[1]:.1f} m east")
-        return [*lines, *self.remarks, *(f"not in the data: {each}" for each in self.missing)]
+            parts.append(f"bias against GNSS {self.bias[0]:.1f} m north, {self.bias[1]:.1f} m east")
+        return ", ".join(parts)

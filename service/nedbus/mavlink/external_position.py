@@ -308,7 +308,7 @@ def _of_odometry(position: VehicleOdometry) -> Odometry:
     child_frame = _VELOCITY_FRAMES.get(position.velocity_frame)
     if child_frame is None:
         if _known(velocity):
-            text = f"velocity_frame is {position.velocity_frame}: set it to VELOCITY_FRAME_NED (1), FRD (2) or BODY_FRD (3)"
+            text = f"velocity_frame is {position.velocity_frame}: set it to 1 (NED), 2 (FRD) or 3 (BODY_FRD)"
             raise _RefusedError("velocity_frame", text)
         child_frame = dialect.MAV_FRAME_BODY_FRD
     where, variance = (

@@ -1,4 +1,4 @@
-"""Status of ULog streams and of positions sent into vehicles, and the base of all status replies, which come from untrusted peers."""
+"""Status of ULog streams and of positions sent into vehicles, and the base of all untrusted status replies."""
 
 from contextlib import suppress
 from dataclasses import dataclass
