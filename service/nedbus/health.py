@@ -21,7 +21,7 @@ from .events import AccountReport, Condition, Event, VehicleReport
 from .fusion import Fusion, QuantityFusion
 
 __all__ = [
-    "AccountReport", "Condition", "Event", "Fusion", "Health", "Histogram", "LinkCallback", "LogStreamStatus", "Monitor",
-    "NewestMessage", "PositionStatus", "Publishers", "QuantityFusion", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus",
-    "StreamHealth", "StreamStatus", "VehicleReport", "Vehicles",
+    "AccountReport", "Condition", "Event", "Fusion", "Health", "Histogram", "LinkCallback", "LogStreamStatus",
+    "Monitor", "NewestMessage", "PositionStatus", "Publishers", "QuantityFusion", "RejectionReport", "Rejections",
+    "ServiceStatus", "SourceStatus", "StreamHealth", "StreamStatus", "VehicleReport", "Vehicles",
 ]  # fmt: skip

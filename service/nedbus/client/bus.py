@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, overload
 
 from nedbus.errors import ArgumentError, ClosedError, NedbusError, NoDataError
+from nedbus.fusion import FUSION_TOPICS, Fusion, FusionTracker
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import (
@@ -49,7 +50,6 @@ from .subscription import Subscription
 
 if TYPE_CHECKING:
     from nedbus.events import AccountReport
-    from nedbus.fusion import Fusion
 
 
 class Bus(AbstractContextManager["Bus"]):
@@ -230,8 +230,6 @@ class Bus(AbstractContextManager["Bus"]):
         The evidence is in topics of PX4's log stream, such as estimator_aid_src_ev_pos; `missing` lists what lacks.
         Raises NoDataError if no message of the vehicle arrives.
         """
-        from nedbus.fusion import FUSION_TOPICS, FusionTracker
-
         name, tracker, end = vehicle_name(vehicle), FusionTracker(), time.monotonic() + duration
         is_received = False
         with self.subscribe(*FUSION_TOPICS, vehicle=name, mode="every") as subscription:

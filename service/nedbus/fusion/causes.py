@@ -123,19 +123,19 @@ def _cause_without_echo(echo: Echo) -> str:
 
 def _wrong_field(name: str, echo: Echo) -> str:
     """Return which field keeps EKF2 from using a quantity, whatever else is right."""
-    if name in ("position", "height") and not echo.pose_frame:
-        return Cause.POSE_FRAME
-    if name == "velocity":
-        if not echo.velocity_frame:
-            return Cause.VELOCITY_FRAME
-        if not echo.has_velocity:
-            return Cause.NO_VELOCITY
-        return "" if echo.pose_frame else Cause.POSE_FRAME  # without it, a velocity in NED is refused as well
-    if name == "yaw" and math.isnan(echo.norm_error):
-        return Cause.NO_ATTITUDE
-    if name == "yaw" and echo.norm_error > _MAX_ERROR:
-        return Cause.QUATERNION
-    return ""
+    wrong = ""
+    if name == "yaw":
+        if math.isnan(echo.norm_error):
+            wrong = Cause.NO_ATTITUDE
+        elif echo.norm_error > _MAX_ERROR:
+            wrong = Cause.QUATERNION
+    elif name == "velocity" and not echo.velocity_frame:
+        wrong = Cause.VELOCITY_FRAME
+    elif name == "velocity" and not echo.has_velocity:
+        wrong = Cause.NO_VELOCITY
+    elif not echo.pose_frame:  # without it, a velocity in NED is refused as well
+        wrong = Cause.POSE_FRAME
+    return wrong
 
 
 def _cause_of_rejection(name: str, states: Mapping[str, State], ratio: float) -> str:

@@ -34,6 +34,7 @@ _PERIODIC: Final = frozenset(FUSION_TOPICS) - {_MOCAP, SELECTOR, _TEXT}
 _WINDOW: Final = 1_000_000  # us
 _CONFIRMED: Final = 3  # messages in a row that show what EKF2 does now
 _REJECTED_SHARE: Final = 0.2  # of the messages in the window; vision that is 0.24 s late has 0.26
+_TEXT_TIME: Final = 3_000_000  # us for which a text of PX4 explains what EKF2 does not receive
 _START: Final = 400_000  # us from a measurement to its fusion, in which "not used" is normal
 _SILENCE: Final = 600_000  # us without a message after which it no longer arrives
 _FLAGS_LATE: Final = 1_500_000  # us of vision after which EKF2's flags show whether it is fused
@@ -198,7 +199,7 @@ class FusionTracker:
     def _state_without_aid(self, name: str) -> tuple[State, int]:
         """Return the state of a quantity whose measurements EKF2 does not report."""
         is_echoed = bool(self._echo_times) and self._is_recent(self._echo_times[-1])
-        is_refused = self._is_recent(self._mocap) or self._is_recent(self._unsupported)
+        is_refused = self._is_recent(self._mocap) or self._is_recent(self._unsupported, _TEXT_TIME)
         if self._aids[name].state == "unknown" and not (is_echoed or is_refused):
             return "unknown", self.now
         if is_echoed and self.now - self._echo_times[0] < _SILENCE:
@@ -209,8 +210,8 @@ class FusionTracker:
             return ("fused" if self._flags[name] else "not used"), self.now
         return "not received", self.now
 
-    def _is_recent(self, time: int) -> bool:
-        return bool(time) and self.now - time <= _SILENCE
+    def _is_recent(self, time: int, limit: int = _SILENCE) -> bool:
+        return bool(time) and self.now - time <= limit
 
     def fusion(self, vehicle: str, sent: PositionStatus | None = None) -> Fusion:
         """Return the report; `sent`: what a service sends into the vehicle."""
@@ -233,7 +234,7 @@ class FusionTracker:
         return cause_of(name, states, self._aids[name].ratio, self._describe_echo(None))
 
     def _describe_echo(self, sent: PositionStatus | None) -> Echo:
-        is_mocap, is_unsupported = self._is_recent(self._mocap), self._is_recent(self._unsupported)
+        is_mocap, is_unsupported = self._is_recent(self._mocap), self._is_recent(self._unsupported, _TEXT_TIME)
         is_sent = None if sent is None else sent.rate > 0
         if not self._echo or not self._is_recent(self._echo_times[-1]):
             return Echo(is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent)
