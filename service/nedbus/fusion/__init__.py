@@ -2,7 +2,16 @@
 
 from .causes import Cause
 from .changes import fusion_changes
-from .evidence import FUSION_TOPICS, QUANTITIES, FusionTracker
+from .evidence import AID_TOPICS, FUSION_TOPICS, QUANTITIES, FusionTracker
 from .report import Fusion, QuantityFusion
 
-__all__ = ["FUSION_TOPICS", "QUANTITIES", "Cause", "Fusion", "FusionTracker", "QuantityFusion", "fusion_changes"]
+__all__ = [
+    "AID_TOPICS",
+    "FUSION_TOPICS",
+    "QUANTITIES",
+    "Cause",
+    "Fusion",
+    "FusionTracker",
+    "QuantityFusion",
+    "fusion_changes",
+]

@@ -25,8 +25,13 @@ _TEXT: Final = "log_message"
 QUANTITIES: Final = {"position": "pos", "height": "hgt", "velocity": "vel", "yaw": "yaw"}
 """Quantities of an external position, with PX4's names for them."""
 
+AID_TOPICS: Final = tuple(f"{_AID}{short}" for short in QUANTITIES.values())
+"""Topics in which EKF2 reports what it does with an external position."""
+
+_NAMES: Final = {_ECHO: "position"} | dict(zip(AID_TOPICS, QUANTITIES, strict=True))
+
 FUSION_TOPICS: Final = (
-    *(f"{_AID}{short}" for short in QUANTITIES.values()), _ECHO, _MOCAP, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
+    *AID_TOPICS, _ECHO, _MOCAP, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
 )  # fmt: skip
 """Topics that a FusionTracker uses."""
 
@@ -99,11 +104,13 @@ class FusionTracker:
         """Add a sample; return False for one from before the subscription, of which only the EKF in use counts."""
         if sample.retained and sample.topic != SELECTOR:
             return False
-        self.add(sample.topic, sample.message)
+        self.add(sample.topic, sample.message, sample.instance)
         return True
 
-    def add(self, topic: str, message: object) -> None:
+    def add(self, topic: str, message: object, instance: int | None = None) -> None:
         """Add a message of one of FUSION_TOPICS: a model, a row, or a dict of fields."""
+        if topic == _FLAGS and instance not in (None, self.primary):
+            return
         time = _read_time(message)[0]
         if not isinstance(time, int) or not self._follow_time(topic, time):
             return
@@ -228,10 +235,17 @@ class FusionTracker:
             tuple(self._remarks(states, variance)), tuple(self._missing(echo)),
         )  # fmt: skip
 
-    def cause(self, name: str) -> str:
-        """Return why a quantity is not fused; "" if it is, or if nothing explains it."""
+    def diagnosis(self, topic: str) -> str:
+        """Return why what a topic reports is not fused, without the remedy; "" if nothing explains it.
+
+        `topic`: that of an aid source, or the echo for the position.
+        """
+        name = _NAMES.get(topic)
+        if name is None:
+            return ""
         states: Mapping[str, State] = {each: aid.state for each, aid in self._aids.items()}
-        return cause_of(name, states, self._aids[name].ratio, self._describe_echo(None))
+        cause = cause_of(name, states, self._aids[name].ratio, self._describe_echo(None))
+        return cause.partition(": ")[0]
 
     def _describe_echo(self, sent: PositionStatus | None) -> Echo:
         is_mocap, is_unsupported = self._is_recent(self._mocap), self._is_recent(self._unsupported, _TEXT_TIME)
