@@ -86,7 +86,7 @@ def cause_of(name: str, states: Mapping[str, State], ratio: float, echo: Echo) -
     if state == "fused":
         return ""
     if not echo.is_echoed:
-        return "" if state == "unknown" else _cause_without_echo(echo)
+        return _cause_without_echo(name, states, ratio, echo)
     if wrong := _wrong_field(name, echo):
         return wrong
     if state == "rejected":
@@ -113,7 +113,13 @@ def _cause_of_disuse(name: str, states: Mapping[str, State], echo: Echo) -> str:
     return cause
 
 
-def _cause_without_echo(echo: Echo) -> str:
+def _cause_without_echo(name: str, states: Mapping[str, State], ratio: float, echo: Echo) -> str:
+    """Return what is known without the fields that PX4 received: not whether a jump had a new reset_counter."""
+    if states[name] == "rejected":
+        cause = _cause_of_rejection(name, states, ratio)
+        return "" if cause == Cause.JUMP or math.isnan(ratio) else cause
+    if states[name] != "not received":
+        return ""
     if echo.is_mocap:
         return Cause.MOCAP
     if echo.is_type_unsupported:
