@@ -132,6 +132,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
         for each in (log for source in service.sources for log in source.log_streams):
             write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
+        for position in (position for source in service.sources for position in source.positions):
+            head = f"position into vehicle {to_text(position.vehicle)}: "
+            write(fold(head, to_text(position.text, _MAX_VEHICLES)))
         if refused := service.refused:
             write(fold("vehicles refused by the router: ", to_text(", ".join(refused), _MAX_VEHICLES)))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]

@@ -15,12 +15,15 @@ from nedbus import VehicleOdometry
 from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink.position_sender import Target, choose_target
-from tests.nedbus.sources.mavlink.test_external_position import odometry
+
 from tests.peers.live_source import source_status
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
-from tests.peers.px4_vision import SYNC_ANSWERS, Px4OnLink
+
 from tests.waits import wait_for
+
+from .px4_vision import SYNC_ANSWERS, Px4OnLink
+from .test_external_position import odometry
 
 ALL = dict.fromkeys(("position", "height", "velocity", "yaw"), "fused")
 TOPIC = "vehicle_visual_odometry"
