@@ -15,11 +15,9 @@ from nedbus import VehicleOdometry
 from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink.position_sender import Target, choose_target
-
 from tests.peers.live_source import source_status
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
-
 from tests.waits import wait_for
 
 from .px4_vision import SYNC_ANSWERS, Px4OnLink
