@@ -191,7 +191,7 @@ class FusionTracker:
             aid.recent.popleft()
         if not aid.recent or self.now - aid.recent[-1][0] > _SILENCE:
             return self._state_without_aid(name)
-        last = [*aid.recent][-_CONFIRMED:]
+        last = [*aid.recent][-_CONFIRMED:]  # what EKF2 does now
         rejected = [time for time, _, is_rejected in aid.recent if is_rejected]
         if len(rejected) >= max(_CONFIRMED, _REJECTED_SHARE * len(aid.recent)):
             return "rejected", rejected[0]
@@ -291,7 +291,9 @@ def _number(value: object) -> float:
 def _largest(ratio: object) -> float:
     """Return the largest test ratio of all axes; NaN if one is NaN."""
     values = [_number(each) for each in ratio] if isinstance(ratio, tuple | list) else [_number(ratio)]
-    return math.nan if any(map(math.isnan, values)) else max(values)
+    if any(map(math.isnan, values)):
+        return math.nan
+    return max(values, default=math.nan)
 
 
 def _is_known(values: object) -> bool:
