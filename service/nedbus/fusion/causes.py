@@ -39,10 +39,10 @@ class Cause:
     RATE = "less than 5 messages per second: EKF2 starts only if two are within 200 ms; send 20 to 50"
     COUNTER = "reset_counter changes with each message: raise it only when the position jumps"
     OLD = (
-        "time_usec is {0:.1f} s old when it arrives, after time synchronisation: use one monotonic clock for it and for"
+        "time_usec is {0:.1f} s old: after time synchronisation it counts; use one monotonic clock for it and for the"
         " answers to TIMESYNC, or answer none"
     )
-    AHEAD = "a message was stamped {0:.0f} s ahead, so EKF2 takes none until then: reboot PX4, and do not stamp ahead"
+    AHEAD = "a message was stamped {0:.0f} s ahead: EKF2 takes none until then; reboot PX4, and do not stamp ahead"
     CONTROL = "bit {0} of EKF2_EV_CTRL is not set, or quality {1} is below EKF2_EV_QMIN"
     UP = "z points up: it must point down in NED and FRD"
     ENU = "the axes are wrong, as with ENU sent as NED: x must be north or forward, y east or right, z down"
