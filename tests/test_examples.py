@@ -33,7 +33,11 @@ PRINTS = {
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",
     "health.py": "1/vehicle_local_position: ",
     "alarm.py": "vehicle 1: good",
+    "mocap.py": "publishing mocap/vehicle_visual_odometry at 50 Hz",
 }
+
+RARE = {"fleet.py", "fastest.py", "alarm.py", "mocap.py"}
+"""Examples that print rarely, or once."""
 
 
 def run_example(start: Start, name: str, endpoint: str, folder: Path) -> Process:
@@ -63,7 +67,7 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("name", sorted(PRINTS.keys() - {"fleet.py", "fastest.py", "alarm.py"}))  # these print rarely
+@pytest.mark.parametrize("name", sorted(PRINTS.keys() - RARE))
 def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path: Path, name: str) -> None:
     """An example whose reader leaves, as in `| head -1`, prints no traceback.
 

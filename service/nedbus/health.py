@@ -7,6 +7,7 @@ from .client import (
     LogStreamStatus,
     Monitor,
     NewestMessage,
+    PositionStatus,
     Publishers,
     RejectionReport,
     Rejections,
@@ -17,9 +18,10 @@ from .client import (
     Vehicles,
 )
 from .events import AccountReport, Condition, Event, VehicleReport
+from .fusion import Fusion, QuantityFusion
 
 __all__ = [
-    "AccountReport", "Condition", "Event", "Health", "Histogram", "LinkCallback", "LogStreamStatus", "Monitor",
-    "NewestMessage", "Publishers", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "StreamHealth",
-    "StreamStatus", "VehicleReport", "Vehicles",
+    "AccountReport", "Condition", "Event", "Fusion", "Health", "Histogram", "LinkCallback", "LogStreamStatus",
+    "Monitor", "NewestMessage", "PositionStatus", "Publishers", "QuantityFusion", "RejectionReport", "Rejections",
+    "ServiceStatus", "SourceStatus", "StreamHealth", "StreamStatus", "VehicleReport", "Vehicles",
 ]  # fmt: skip

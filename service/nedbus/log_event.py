@@ -53,6 +53,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "duplicate": Event("another process publishes the same vehicle, or two MAVLink senders share a system id"),
     "rebooted": Event("a vehicle rebooted, or its publisher restarted"),
     "log_stream": Event("the ULog stream of a vehicle starts, ends or is refused, or its file is opened or abandoned"),
+    "position": Event("a source sends positions from the bus into its vehicle", limited=False),
     "unsupported": Event("a vehicle, a publisher or ROS 2 does not support a requested message or rate"),
     "bridge_loop": Event("a topic published by `nedbus ros2` is ignored, because it would loop back"),
     # a reader

@@ -99,7 +99,7 @@ absent()
 nedbus.read(path), nedbus.align(path), nedbus.utc_of(path), nedbus.addresses_of(path)
 absent()
 from nedbus.cli import main
-for arguments in ("convert", path, path + ".mcap"), ("plot", path), ("events", path), ("why", path):
+for arguments in ("convert", path, path + ".mcap"), ("plot", path), ("events", path), ("why", path), ("fusion", path):
     sys.argv = ["nedbus", *arguments]
     try:
         main()

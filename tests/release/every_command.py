@@ -34,6 +34,7 @@ RUNS: Final[dict[str, tuple[tuple[str, ...], str]]] = {
     "info": (("-c", _CLOSED), ""),
     "events": (("none.ulg",), ""),
     "why": (("none.mcap",), "mcap"),
+    "fusion": (("none.ulg",), ""),
     "health": (("-c", _CLOSED), ""),
     "doctor": (("-c", _CLOSED), ""),
     "check": ((), ""),

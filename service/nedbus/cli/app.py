@@ -32,6 +32,10 @@ _COMMANDS: Final[Mapping[str, _Command]] = {
         "events",
         "Show the verdict on each vehicle, live or from a file: usable or not, since when, for how long, and why.",
     ),
+    "fusion": _Command(
+        "fusion",
+        "Show whether a position that is sent into a vehicle is used, and why not, live or from a file.",
+    ),
     "health": _Command("checks", "Check services, sources, messages and vehicles; exit with 0 if healthy."),
     "doctor": _Command("checks", "Diagnose why no messages arrive."),
     "check": _Command("checks", "Check settings and router files."),

@@ -10,6 +10,7 @@ from nedbus.transport import Publishers
 from .bus import Bus, connect
 from .discovery import (
     LogStreamStatus,
+    PositionStatus,
     RejectionReport,
     Rejections,
     ServiceStatus,

@@ -146,6 +146,7 @@ class AsyncBus:
     publishers = _awaited(Bus.publishers)
     services = _awaited(Bus.services)
     accounts = _awaited(Bus.accounts)
+    fusion = _awaited(Bus.fusion)
     rejections = _awaited(Bus.rejections)
 
     async def publisher(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
@@ -10,7 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, overload
 
-from nedbus.errors import ArgumentError, ClosedError, NedbusError
+from nedbus.errors import ArgumentError, ClosedError, NedbusError, NoDataError
+from nedbus.fusion import FUSION_TOPICS, Fusion, FusionTracker
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import (
@@ -221,6 +223,23 @@ class Bus(AbstractContextManager["Bus"]):
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
         """Query the event reports of all nedbus services: events of the last `within` seconds, and vehicle states."""
         return find_reports(self._session, prefix=self.prefix, within=within, timeout=timeout)
+
+    def fusion(self, vehicle: str | int, *, duration: float = 2.0) -> Fusion:
+        """Return whether PX4 uses the position that is sent into a vehicle, and why not, after `duration` seconds.
+
+        The evidence is in topics of PX4's log stream, such as estimator_aid_src_ev_pos; `missing` lists what lacks.
+        Raises NoDataError if no message of the vehicle arrives.
+        """
+        name, tracker, end = vehicle_name(vehicle), FusionTracker(), time.monotonic() + duration
+        is_received = False
+        with self.subscribe(*FUSION_TOPICS, vehicle=name, mode="every") as subscription:
+            while (left := end - time.monotonic()) > 0:
+                with suppress(NoDataError):
+                    is_received = tracker.add_sample(subscription.receive(left)) or is_received
+        if not is_received:
+            raise NoDataError(f"{name}: topics {', '.join(FUSION_TOPICS)}", duration)
+        positions = [each for service in self.services() for source in service.sources for each in source.positions]
+        return tracker.fusion(name, next((each for each in positions if each.vehicle == name), None))
 
     def rejections(self) -> Rejections:
         """Subscribe to reports of the messages that services on this network reject."""

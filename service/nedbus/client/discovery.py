@@ -19,7 +19,7 @@ from nedbus.client.closing import Finalizer
 from nedbus.client.health import Health
 from nedbus.errors import AddressError
 from nedbus.log_event import about
-from nedbus.samples import LogStreamStatus, UntrustedReply
+from nedbus.samples import LogStreamStatus, PositionStatus, UntrustedReply
 from nedbus.transport import MAX_REPLY_BYTES, RawSample, Session, query, translate_zenoh_errors
 from nedbus_msgs import REJECTED, Address, all_status_keys, parse_status_key
 
@@ -68,6 +68,7 @@ class SourceStatus(UntrustedReply):
     `rejections`: the number of rejected messages by rule.
     `retries`: restarts after a failure. `error`: the reason of the last failure.
     `streams`: the health of the first 100 published streams. `log_streams`: the ULog stream of each vehicle.
+    `positions`: what is sent into vehicles.
     """
 
     source: str = ""
@@ -92,6 +93,7 @@ class SourceStatus(UntrustedReply):
     not_carried: tuple[str, ...] = ()
     silent: tuple[str, ...] = ()
     log_streams: tuple[LogStreamStatus, ...] = ()
+    positions: tuple[PositionStatus, ...] = ()
 
     @property
     def vehicles(self) -> set[str]:
@@ -112,6 +114,7 @@ class SourceStatus(UntrustedReply):
             silent=tuple(filter(is_about, self.silent)),
             streams=tuple(each for each in self.streams if is_about(each.address)),
             log_streams=tuple(each for each in self.log_streams if each.vehicle in vehicles),
+            positions=tuple(each for each in self.positions if each.vehicle in vehicles),
         )
 
     @property

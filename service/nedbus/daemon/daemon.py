@@ -49,7 +49,7 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
     for index, given in enumerate(settings.source):
         try:
             spec = parse_source(given)
-            source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls)
+            source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls, prefix=settings.prefix)
         except ConfigError as exc:
             mistakes.append(locate_source(settings, index, exc))
         else:

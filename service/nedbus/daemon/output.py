@@ -9,7 +9,15 @@ from itertools import islice
 from typing import Any, Final
 
 from nedbus import clock
-from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
+from nedbus.client import (
+    Histogram,
+    LogStreamStatus,
+    PositionStatus,
+    Publisher,
+    PublisherRegistry,
+    StreamHealth,
+    StreamStatus,
+)
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.events import EventLog
 from nedbus.log_event import about
@@ -62,6 +70,7 @@ class SourceOutput:
         self.rejections: Counter[str] = Counter()  # messages by violated rule
         self.unavailable = UnavailableTopics()  # topics that vehicles publish but a live source does not deliver now
         self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
+        self.positions: dict[str, PositionStatus] = {}  # by address of the positions that are sent into a vehicle
         self.load = LinkLoad()  # of a live source
         self.copies = 0  # messages that a live source left out
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message, of every 16th one

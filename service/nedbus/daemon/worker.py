@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
 
-from nedbus.client import Histogram, PublisherRegistry, SourceStatus, stream_state
+from nedbus.client import Histogram, PositionStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.events import EventLog
 from nedbus.log_event import about
@@ -147,6 +147,7 @@ class Worker:
             not_carried=output.unavailable.unsupported,
             silent=output.unavailable.silent,
             log_streams=tuple(output.log_streams.values()),
+            positions=tuple(output.positions.values()),
         )
 
     def run(self) -> None:
@@ -269,6 +270,8 @@ class Worker:
                     self._output.note_load(item)
                 elif isinstance(item, LinkCopies):
                     self._output.copies = item.count
+                elif isinstance(item, PositionStatus):
+                    self._output.positions[item.address] = item
                 elif item is not None:
                     self._output.log_streams[item.vehicle] = item
                 if now >= next_poll:

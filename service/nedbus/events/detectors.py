@@ -126,12 +126,13 @@ class AidDetector(ChangeDetector):
     """Detector for a topic of AID_SOURCES: measurements that the primary EKF rejects, or does not use.
 
     Single messages vary: a state counts once all of AID_COUNT messages in AID_HOLD agree.
+    `explain`: returns the cause as the end of a sentence, or "".
     """
 
-    def __init__(self, topic: str, is_primary: Callable[[object], bool]) -> None:
+    def __init__(self, topic: str, is_primary: Callable[[object], bool], explain: Callable[[], str]) -> None:
         super().__init__(("fused", "innovation_rejected", "estimator_instance"), (), detect_nothing)
         self.topic, self.kind = topic, ""  # of the condition that it began
-        self._is_primary = is_primary
+        self._is_primary, self._explain = is_primary, explain
         self.reset()
 
     def reset(self) -> None:
@@ -182,21 +183,20 @@ class AidDetector(ChangeDetector):
         if kind and before != kind:
             severity: Severity | None = "info" if self.topic in KINDS[kind].minor else None
             initial = kind == "aid_unused" and self._is_first
-            yield Finding(
-                kind, "begin", KINDS[kind].begin.format(self._label), (self.topic,), severity=severity,
-                initial=initial, age=age,
-            )  # fmt: skip
+            text = KINDS[kind].begin.format(self._label) + self._explain()
+            yield Finding(kind, "begin", text, (self.topic,), severity=severity, initial=initial, age=age)
 
 
 class VisionDetector(ChangeDetector):
     """Detector for positions sent into the vehicle that its EKF does not fuse at all, by PX4's timestamps alone.
 
     `is_fused`: returns whether the EKF fuses any vision, None if unknown, and PX4's time of this state [us].
+    `explain`: returns the cause as the end of a sentence, or "".
     """
 
-    def __init__(self, is_fused: Callable[[], tuple[bool | None, int]]) -> None:
+    def __init__(self, is_fused: Callable[[], tuple[bool | None, int]], explain: Callable[[], str]) -> None:
         super().__init__((), (), detect_nothing)
-        self._is_fused = is_fused
+        self._is_fused, self._explain = is_fused, explain
         self.is_unused = False
         self._arriving = 0  # first message after a pause [us]
         self._refused = 0  # first flags that say that no vision is fused [us]
@@ -230,7 +230,8 @@ class VisionDetector(ChangeDetector):
     def _begin(self, age: float) -> Iterator[Finding]:
         if not self.is_unused and age >= rules.VISION_HOLD:
             self.is_unused = True
-            yield Finding("vision_unused", "begin", "vision arrives, but the EKF does not fuse it", age=age)
+            text = f"vision arrives, but the EKF does not fuse it{self._explain()}"
+            yield Finding("vision_unused", "begin", text, age=age)
 
     def _end(self, text: str, *, age: float = 0.0) -> Iterator[Finding]:
         self._refused = 0

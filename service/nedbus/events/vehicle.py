@@ -10,6 +10,7 @@ from functools import partial
 from statistics import median
 from typing import Final
 
+from nedbus.fusion import AID_TOPICS, FusionTracker
 from nedbus.timeline import is_boot_possible
 from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
 
@@ -39,6 +40,7 @@ _GROUPS: Final = (rules.POSITIONS, rules.EVIDENCE["GPS"])
 _EVIDENCE_OF: Final = {topic: name for name, topics in rules.EVIDENCE.items() for topic in topics}
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = FieldReader(_SAMPLE)
+_FUSION_TOPICS: Final = {*AID_TOPICS, *rules.VISION, _EKF}
 _VISION_FLAGS: Final = ("cs_ev_pos", "cs_ev_vel", "cs_ev_hgt", "cs_ev_yaw")
 _NEW: Final = ChangeDetector((), (), detectors.detect_nothing)  # in place of the detector of a new stream
 
@@ -86,6 +88,7 @@ class Vehicle:
         self._suppressed: Counter[tuple[str, object]] = Counter()  # number of suppressed events, by the same keys
         self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
         self._ekf = 0  # instance of the primary EKF
+        self._fusion = FusionTracker()  # explains why vision is not fused
         self._vision: tuple[bool | None, int] = (None, 0)  # whether it fuses vision, None if unknown; since when [us]
         self._position: PositionDetector | None = None  # of `main`
         self._comparison = Comparison()
@@ -112,6 +115,8 @@ class Vehicle:
             return
         if detector.pause:
             detector.resumes_at = time + detector.pause
+        if address.topic in _FUSION_TOPICS:
+            self._fusion.add(address.topic, message, address.instance)
         self._before, detector.time = detector.time, time
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
@@ -239,6 +244,10 @@ class Vehicle:
                 if silence > rules.AID_PAUSE:
                     for found in detector.stop():
                         self.emit(found, address.topic, self._main_time - silence)
+
+    def _explain(self, topic: str) -> str:
+        """Return why the measurements of a topic are not fused, as the end of a sentence; "" if it is unknown."""
+        return f": {cause}" if (cause := self._fusion.diagnosis(topic)) else ""
 
     def _is_vision_fused(self) -> tuple[bool | None, int]:
         """Return whether the primary EKF fuses any vision, None if unknown, and since when [us]."""
@@ -411,9 +420,9 @@ class Vehicle:
         """Return a detector for a topic other than the positions, None if it has no events."""
         own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
         if topic in rules.AID_SOURCES:
-            return AidDetector(topic, lambda primary: primary == self._ekf)
+            return AidDetector(topic, lambda primary: primary == self._ekf, partial(self._explain, topic))
         if topic in rules.VISION:
-            return VisionDetector(self._is_vision_fused)
+            return VisionDetector(self._is_vision_fused, partial(self._explain, topic))
         if topic in REFERENCES:
             return ReferenceDetector(topic, self._comparison, own)
         if topic == MAGNETOMETER:
@@ -450,7 +459,7 @@ class Vehicle:
         old, self._ekf = self._ekf, instance
         if old == instance:
             return
-        self._vision = None, 0
+        self._vision, self._fusion.primary = (None, 0), instance
         stream, message = Address(self.name, _EKF, instance), BY_TOPIC[_EKF].name
         self._end(stream, lambda kind, flag: KINDS[kind].message == message or flag.startswith(f"{instance}:"))
         for each in (old, instance):

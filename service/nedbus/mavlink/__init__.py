@@ -9,6 +9,7 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .boot_time import new_clock, read_time
+    from .external_position import MAX_AGE, MAX_RATE, MIN_RATE, UNKNOWN_VARIANCE, ExternalPosition
     from .fields import CONVERSIONS, HIGH_LATENCY
     from .log_reassembly import Chunk, Reassembly
     from .parser import Received, new_parser, parse
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
     from .vehicle import Vehicle
 else:
     _NAMES = {
-        "boot_time": "new_clock read_time", "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
+        "boot_time": "new_clock read_time",
+        "external_position": "ExternalPosition MAX_AGE MAX_RATE MIN_RATE UNKNOWN_VARIANCE",
+        "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
         "parser": "Received new_parser parse", "senders": "AUTOPILOT NO_HEARTBEAT Senders",
         "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",
     }  # fmt: skip

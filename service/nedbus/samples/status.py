@@ -1,4 +1,4 @@
-"""Status of ULog streams, and the base of all status replies, which come from untrusted peers."""
+"""Status of ULog streams and of positions sent into vehicles, and the base of all untrusted status replies."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -70,3 +70,40 @@ class LogStreamStatus(UntrustedReply):
             f"{self.unsaved} bytes not saved" if self.unsaved else "",
         )
         return ", ".join(filter(None, parts))
+
+
+@dataclass(frozen=True, slots=True)
+class PositionStatus(UntrustedReply):
+    """The positions that a source with `position=` sends into one vehicle.
+
+    `address`: where they come from. `sender`: their publisher. `clock`: the value of `position_clock`.
+    `sent`: number so far; `rate`: per second, 0 while none is sent. `age`: of the last one when it was sent [s].
+    `left_out`: numbers of positions not sent, by kind of refusal; `reasons`: their newest texts.
+    `warnings`: why the vehicle may not use what is sent.
+    """
+
+    vehicle: str = ""
+    address: str = ""
+    sender: str = ""
+    sent: int = 0
+    rate: float = 0.0
+    age: float | None = None
+    clock: str = ""
+    left_out: tuple[tuple[str, int], ...] = ()
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """All values except the vehicle, in one line; sender, reasons and warnings are untrusted text."""
+        counts = ", ".join(f"{count} {kind}" for kind, count in self.left_out)
+        parts = [f"{self.sent} positions of {self.address} sent"]
+        if self.sender:
+            parts.append(f"from {self.sender}")
+        if self.rate:
+            parts.append(f"{self.rate:.1f} Hz")
+        if self.age is not None:
+            parts.append(f"age {1000 * self.age:.0f} ms")
+        if counts:
+            parts.append(f"left out: {counts}")
+        return "; ".join([", ".join(parts), *self.warnings, *self.reasons])

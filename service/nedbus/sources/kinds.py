@@ -14,6 +14,7 @@ from nedbus.errors import AddressError, ConfigError
 from nedbus.extras import import_optional
 from nedbus.flights import find_format
 from nedbus.transport import Tls
+from nedbus_msgs import DEFAULT_PREFIX
 
 from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, RecordingOptions, SimulatorOptions
 from .source import LiveSource, ReplaySource, Source
@@ -57,7 +58,9 @@ class SourceSpec:
     target: str
     options: Options
 
-    def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
+    def open_source(
+        self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None, prefix: str = DEFAULT_PREFIX
+    ) -> Source:
         """Create the source for a service; raise ConfigError for an invalid target or file, or a missing extra."""
         kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
         # A pipe, socket or device may block forever, and cannot be read twice.
@@ -66,7 +69,7 @@ class SourceSpec:
         make = getattr(import_optional(kind.extra, kind.module), kind.name)
         if isinstance(self.options, RecordedOptions | SimulatorOptions):
             return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
-        return cast("LiveSource", make(self.target, self.options, vehicle, routers, tls))
+        return cast("LiveSource", make(self.target, self.options, vehicle, routers, tls, prefix))
 
 
 def parse_source(source: str | Mapping[str, object]) -> SourceSpec:

@@ -7,7 +7,8 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from nedbus.flights import parse_topics, topics_of
-from nedbus_msgs import DEFAULT, RELEASES, check_vehicle
+from nedbus_msgs import DEFAULT, RELEASES, Address, check_vehicle
+from nedbus_msgs.messages import VehicleLocalPosition, VehicleOdometry
 
 
 def _parse_vehicles(text: str) -> Mapping[str, str]:
@@ -37,6 +38,17 @@ _Origin = tuple[
     Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
     Annotated[float, Field(ge=-500, le=1e4)],
 ]  # fmt: skip
+POSITION_TOPICS: Final = (
+    "vehicle_visual_odometry",
+    *(
+        topic.name
+        for topic in VehicleOdometry.TOPICS
+        if topic.name != "vehicle_visual_odometry" and not topic.instances
+    ),
+    *(topic.name for topic in VehicleLocalPosition.TOPICS if not topic.instances),
+)
+"""Topics of positions that can be sent into a vehicle."""
+
 _LAYOUTS: Final = tuple(dict.fromkeys((*RELEASES, *DEFAULT.layouts)))
 _Layout = Annotated[str, Field(pattern=f"^({'|'.join(map(re.escape, _LAYOUTS))})$")]
 Vehicle = Annotated[str, AfterValidator(check_vehicle)]
@@ -111,6 +123,16 @@ class Px4ZenohOptions(Options):
     msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
 
 
+def _parse_address(text: object) -> object:
+    """Parse VEHICLE/TOPIC; raise ValueError for a topic without a position, AddressError for an invalid name."""
+    if not isinstance(text, str):
+        return text
+    vehicle, _, topic = text.partition("/")
+    if topic not in POSITION_TOPICS:
+        raise ValueError(text)
+    return Address(vehicle, topic)
+
+
 def _check_save(folder: str, info: ValidationInfo) -> str:
     if folder and not info.data.get("log"):
         raise ValueError(folder)
@@ -147,6 +169,17 @@ class MavlinkOptions(Options):
     )
     save: Annotated[str, AfterValidator(_check_save)] = Field(
         "", description="a folder in which each ULog stream is saved as a .ulg file; requires log="
+    )
+
+    position: Annotated[Address | None, BeforeValidator(_parse_address)] = Field(
+        None,
+        description="VEHICLE/TOPIC of a position on the bus that is sent into the vehicle on this link, as in"
+        f" mocap/vehicle_visual_odometry; topics: {', '.join(POSITION_TOPICS)}",
+    )
+    position_clock: Literal["arrival", "timesync"] = Field(
+        "arrival",
+        description="arrival: PX4 stamps positions on arrival; timesync: answer PX4's TIMESYNC, so that PX4 uses the"
+        " time of each measurement",
     )
 
     @property

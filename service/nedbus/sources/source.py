@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from nedbus.samples import LogStreamStatus, Rejection, SourceMessage
+from nedbus.samples import LogStreamStatus, PositionStatus, Rejection, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import Address
 
@@ -86,7 +86,9 @@ class ReplaySource:
         return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
 
-LiveItem = SourceMessage | Rejection | UnavailableTopics | LinkLoad | LinkCopies | LogStreamStatus | None
+LiveItem = (
+    SourceMessage | Rejection | UnavailableTopics | LinkLoad | LinkCopies | LogStreamStatus | PositionStatus | None
+)
 
 
 @runtime_checkable

@@ -1,7 +1,7 @@
 """Commands that query the network once: list, get, info, schema."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
 from typing import Annotated, Any, Final
@@ -137,8 +137,8 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         _write_left_out(service)
         for text in (each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]):
             write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
-        for each in (log for source in service.sources for log in source.log_streams):
-            write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
+        for head, text in _links_of(service):
+            write(fold(f"{head}: ", to_text(text, _MAX_VEHICLES)))
         if refused := service.refused:
             write(fold("vehicles refused by the router: ", to_text(", ".join(refused), _MAX_VEHICLES)))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
@@ -149,6 +149,15 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(counted(len(services) - _MAX_ROWS, "more service"))
     if not services:
         write_stderr("no nedbus service answers: start one with 'nedbus serve', or run 'nedbus doctor'")
+
+
+def _links_of(service: ServiceStatus) -> Iterator[tuple[str, str]]:
+    """Yield head and text of each ULog stream that a service receives, and of the positions that it sends."""
+    for source in service.sources:
+        for log in source.log_streams:
+            yield f"ULog stream of vehicle {to_text(log.vehicle)}", log.text
+        for position in source.positions:
+            yield f"position into vehicle {to_text(position.vehicle)}", position.text
 
 
 @command

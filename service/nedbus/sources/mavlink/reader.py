@@ -36,6 +36,7 @@ _MAX_VEHICLES: Final = 100  # per link
 _MIN_SILENCE: Final = 5.0  # s without a message until a vehicle can be removed in favour of another one
 _TICK: Final = 0.05  # s, the longest wait of the thread
 _PAUSE: Final = 0.02  # s between two reads during a stream: several messages at once need less processor time
+_ANSWER_PAUSE: Final = 0.002  # ... while TIMESYNC is answered: PX4 discards answers that take over 10 ms
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
@@ -118,7 +119,7 @@ class LogReceiver:
 
     def _step(self) -> None:
         if any(vehicle.client.status.state == "streaming" for vehicle in self.vehicles.values()):
-            time.sleep(_PAUSE)
+            time.sleep(_ANSWER_PAUSE if self._answers_timesync else _PAUSE)
         items = list[Received | Rejection]()
         try:
             for item in self._reader.read(_TICK):
@@ -142,11 +143,28 @@ class LogReceiver:
             vehicle = self.vehicles[system] = _Vehicle(system, client, PeerChoice(received.peer, now), now)
         vehicle.last = now
         vehicle.peers.add(received.peer, now)
+        if self._answers_timesync:
+            self._answer_timesync(received, vehicle)
         lost = vehicle.sequence.add(received.sequence, now)
         link = vehicle.sequence.link
         if lost or link:
             received = received._replace(lost=lost, link=link)
         return self._follow_stream(vehicle, received) if self._options.log else received
+
+    @property
+    def _answers_timesync(self) -> bool:
+        return self._options.position is not None and self._options.position_clock == "timesync"
+
+    def _answer_timesync(self, received: Received, vehicle: _Vehicle) -> None:
+        """Answer PX4's request with the clock of ODOMETRY's time_usec.
+
+        PX4 takes the answer as the middle of the round trip, so it names the middle of the time that it waited here.
+        """
+        message = received.message
+        if message.get_type() != "TIMESYNC" or message.tc1 or received.peer != vehicle.peers.peer:
+            return
+        middle = (received.time + time.monotonic()) / 2
+        self._send(dialect.MAVLink_timesync_message(int(1e9 * middle), message.ts1), received.peer)
 
     def _evict(self, now: float) -> bool:
         """Remove the vehicle that has been silent longest; return False if none has been silent for long enough."""

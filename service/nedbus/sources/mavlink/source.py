@@ -15,12 +15,13 @@ from nedbus.mavlink import AUTOPILOT, CONVERSIONS, Received, Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import LinkCopies, LiveItem, Rejection, SourceMessage
 from nedbus.timings import TIMINGS
-from nedbus.transport import Session
+from nedbus.transport import Session, Tls
 from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .link import DuplicateIds, Link, Peer, name_of, open_link, parse_link
 from .log_stream import LogStream
+from .position_sender import TIMESYNC_TOPIC, BusAccess, PositionSender, Target, choose_target
 from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from .saved_stream import StreamFile, state_path
 
@@ -43,7 +44,9 @@ class MavlinkSource:
     Validity is approximated from ESTIMATOR_STATUS, because vehicles send LOCAL_POSITION_NED even while it is invalid.
     """
 
-    def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
+    def __init__(
+        self, link: str, options: MavlinkOptions, _: str, routers: tuple[str, ...], tls: Tls | None, prefix: str
+    ) -> None:
         if parse_link(link).kind != "serial" and "baud" in options.model_fields_set:
             raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
@@ -52,12 +55,13 @@ class MavlinkSource:
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
+        self._access = BusAccess(routers, tls, prefix)
 
     def listen(self, _: Session | None) -> Iterator[LiveItem]:
         """Receive messages; raise SourceError if the link cannot be opened or fails."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                with closing(_LinkSession(link, self._options, name=self._link)) as session:
+                with closing(_LinkSession(link, self._options, name=self._link, access=self._access)) as session:
                     yield from session.run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
@@ -67,7 +71,7 @@ class MavlinkSource:
 class _LinkSession:
     """One open link: request and convert messages, send heartbeats; with `log=`, decode the ULog streams."""
 
-    def __init__(self, link: Link, options: MavlinkOptions, *, name: str) -> None:
+    def __init__(self, link: Link, options: MavlinkOptions, *, name: str, access: BusAccess | None = None) -> None:
         self._link, self._options, self._name = link, options, name
         self._sender = dialect.MAVLink(None, SYSTEM, COMPONENT)
         self._sending = threading.Lock()
@@ -80,6 +84,10 @@ class _LinkSession:
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
         self._receiver = LogReceiver(LinkReader(link, name=name), options, self._send)
+        self._positions: PositionSender | None = None
+        if options.position is not None and access is not None:
+            find, send = self._find_target, self._send_position
+            self._positions = PositionSender(name, options, access, find_target=find, send=send)
 
     def run(self) -> Iterator[LiveItem]:
         next_requests = next_status = 0.0
@@ -111,9 +119,14 @@ class _LinkSession:
                     if self._vehicles[system].is_high_latency:
                         continue
                     self._send_to(system, dialect.MAVLink_timesync_message(0, log.request_time()))
+                if self._positions is not None:
+                    yield from self._positions.rejections()
+                    yield self._positions.status()
 
     def close(self) -> None:
         """Stop the ULog streams, and close their files."""
+        if self._positions is not None:
+            self._positions.close()
         for log in self._logs.values():
             log.leave()
         self._receiver.close()
@@ -146,6 +159,8 @@ class _LinkSession:
             if not isinstance(each, SourceMessage):
                 yield each
                 continue
+            if self._positions is not None and each.address.topic == TIMESYNC_TOPIC:
+                self._positions.on_foreign_timesync(now)
             item = vehicle.report(each, log) if vehicle.lost or vehicle.rebooted else each
             if log is not None and not is_measured:
                 is_measured = True
@@ -240,6 +255,19 @@ class _LinkSession:
         """Send a message to a vehicle, unless it was removed."""
         if (known := self._receiver.vehicles.get(system)) is not None:
             self._send(message, known.peers.peer)
+
+    def _find_target(self) -> Target:
+        """Return the vehicle for positions; called on the thread of PositionSender."""
+        known = [*self._receiver.vehicles.values()]  # changed on another thread
+        return choose_target({each.system: (self._name_of(each.system), each.peers.peer) for each in known})
+
+    def _send_position(self, message: Any, encoder: Any, peer: Peer) -> bool:
+        frame = message.pack(encoder)
+        encoder.seq = (encoder.seq + 1) % 256
+        try:
+            return self._link.send(frame, peer)
+        except OSError:  # the link breaks; the thread that reads it reports that
+            return False
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread of LogReceiver also sends

@@ -42,7 +42,7 @@ class Px4ZenohSource:
     """All publishers of px4_msgs on the router at `endpoint`, by default the service's own router at `routers`."""
 
     def __init__(
-        self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
+        self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None, *_: str
     ) -> None:
         if endpoint:
             transport.check_endpoints([endpoint], where="px4-zenoh")

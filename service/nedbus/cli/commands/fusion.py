@@ -1,0 +1,88 @@
+"""The command fusion: whether a position that is sent into a vehicle is used, live or from a file."""
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Final
+
+import nedbus
+from nedbus.cli.options import DurationOption, FilesArgument, JsonOption, OpenBus, VehiclesOption, command
+from nedbus.cli.output.streams import to_text, write, write_stderr
+from nedbus.cli.output.table import fold
+from nedbus.errors import ConfigError, NoDataError
+from nedbus.fusion import FUSION_TOPICS, Fusion, fusion_changes
+from nedbus_msgs import ANY
+
+if TYPE_CHECKING:
+    from nedbus.client import Bus
+    from nedbus.samples import PositionStatus, Sample
+
+_MAX_TEXT: Final = 1000  # characters of a report, parts of which peers wrote
+_STATUS_INTERVAL: Final = 1.0  # s between two queries of what is sent
+
+
+@command
+def fusion(
+    open_bus: OpenBus,
+    files: FilesArgument = None,
+    *,
+    vehicle: VehiclesOption = None,
+    json_output: JsonOption = False,
+    duration: DurationOption = None,
+) -> None:
+    """Show whether a position that is sent into a vehicle is used, and why not, live or from a file.
+
+    One report for each change: position, height, velocity and yaw are fused, rejected, not used or not received, since
+    when, and which mistake explains it. Times are seconds since the boot of the vehicle.
+    """
+    if files:
+        if duration is not None:
+            raise ConfigError("--duration", "needs live vehicles, not a file")
+        for path in files:
+            with nedbus.open(path) as flight:
+                topics = {address.topic for address in flight.addresses} & {*FUSION_TOPICS}
+                if not topics:
+                    raise NoDataError(f"{path}: topics {', '.join(FUSION_TOPICS)}", 0.0)
+                samples = flight(*sorted(topics), vehicle=vehicle or ANY)
+                _show(fusion_changes(samples), json_output=json_output)
+        return
+    with open_bus() as bus:
+        sent: dict[str, PositionStatus] = {}
+        _show(fusion_changes(_follow(bus, vehicle, duration, sent), sent), json_output=json_output)
+
+
+def _follow(
+    bus: "Bus", vehicles: list[str] | None, duration: float | None, sent: "dict[str, PositionStatus]"
+) -> "Iterator[Sample[Any]]":
+    """Yield live samples, and update what is sent."""
+    start, next_status = time.monotonic(), 0.0
+    end = start + (math.inf if duration is None else duration)
+    has_data = False
+    with bus.subscribe(*FUSION_TOPICS, vehicle=vehicles or ANY, mode="every") as subscription:
+        while (now := time.monotonic()) < end:
+            if now >= next_status:
+                next_status = now + _STATUS_INTERVAL
+                statuses = [status for service in bus.services(timeout=0.5) for status in service.sources]
+                sent.update({each.vehicle: each for status in statuses for each in status.positions})
+            with suppress(NoDataError):
+                sample = subscription.receive(min(_STATUS_INTERVAL, max(0.0, end - now)))
+                has_data = True
+                yield sample
+    if not has_data:
+        raise NoDataError(
+            f"{', '.join(vehicles or ['all vehicles'])}: topics {', '.join(FUSION_TOPICS)}", duration or 0.0
+        )
+
+
+def _show(changes: Iterator[tuple[float, Fusion]], *, json_output: bool) -> None:
+    for seconds, report in changes:
+        if json_output:
+            write(json.dumps({"time": seconds} | asdict(report)))
+            continue
+        for line in report.lines:
+            write(fold(f"{report.vehicle}: {seconds:.1f} s: ", to_text(line, _MAX_TEXT)))
+    if not json_output:
+        write_stderr("times: seconds since the boot of the vehicle")

@@ -1,0 +1,305 @@
+"""FusionTracker: collects what PX4 publishes about an external position; times are the vehicle's own [us]."""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from nedbus.samples import PositionStatus, Sample
+from nedbus_msgs import FieldReader
+
+from .causes import USELESS_VARIANCE, Cause, Echo, cause_of
+from .report import Fusion, QuantityFusion, State
+
+_AID: Final = "estimator_aid_src_ev_"
+_ECHO: Final = "vehicle_visual_odometry"
+_MOCAP: Final = "vehicle_mocap_odometry"
+_FLAGS: Final = "estimator_status_flags"
+SELECTOR: Final = "estimator_selector_status"
+"""Topic that names the EKF in use."""
+
+_ESTIMATE: Final = "vehicle_local_position"
+_BIAS: Final = "estimator_ev_pos_bias"
+_TEXT: Final = "log_message"
+QUANTITIES: Final = {"position": "pos", "height": "hgt", "velocity": "vel", "yaw": "yaw"}
+"""Quantities of an external position, with PX4's names for them."""
+
+AID_TOPICS: Final = tuple(f"{_AID}{short}" for short in QUANTITIES.values())
+"""Topics in which EKF2 reports what it does with an external position."""
+
+_NAMES: Final = {_ECHO: "position"} | dict(zip(AID_TOPICS, QUANTITIES, strict=True))
+
+FUSION_TOPICS: Final = (
+    *AID_TOPICS, _ECHO, _MOCAP, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
+)  # fmt: skip
+"""Topics that a FusionTracker uses."""
+
+_PERIODIC: Final = frozenset(FUSION_TOPICS) - {_MOCAP, SELECTOR, _TEXT}
+_WINDOW: Final = 1_000_000  # us
+_CONFIRMED: Final = 3  # messages in a row that show what EKF2 does now
+_REJECTED_SHARE: Final = 0.2  # of the messages in the window; vision that is 0.24 s late has 0.26
+_TEXT_TIME: Final = 3_000_000  # us for which a text of PX4 explains what EKF2 does not receive
+_START: Final = 400_000  # us from a measurement to its fusion, in which "not used" is normal
+_SILENCE: Final = 600_000  # us without a message after which it no longer arrives
+_FLAGS_LATE: Final = 1_500_000  # us of vision after which EKF2's flags show whether it is fused
+_REBOOT: Final = 1_000_000  # us back in time
+_PAUSE: Final = 10_000_000  # us ahead, more than between any two messages
+_AHEAD: Final = 500_000  # us
+_LARGE_BIAS: Final = 1.0  # m
+_MAX_MESSAGES: Final = 400  # in the window
+_UNSUPPORTED: Final = "ODOMETRY: unsupported"  # PX4's text
+
+_read_aid: Final = FieldReader(("timestamp", "fused", "innovation_rejected", "test_ratio", "estimator_instance"))
+_read_echo: Final = FieldReader((
+    "timestamp", "timestamp_sample", "pose_frame", "velocity_frame", "velocity", "q", "position_variance",
+    "reset_counter", "quality",
+))  # fmt: skip
+_FLAG_NAMES: Final = {name: f"cs_ev_{short}" for name, short in QUANTITIES.items()}
+_read_flags: Final = FieldReader(("timestamp", *_FLAG_NAMES.values()))
+_read_estimate: Final = FieldReader(("timestamp", "eph"))
+_read_bias: Final = FieldReader(("timestamp", "bias"))
+_read_primary: Final = FieldReader(("timestamp", "primary_instance"))
+_read_text: Final = FieldReader(("timestamp", "text"))
+_read_time: Final = FieldReader(("timestamp",))
+
+
+@dataclass(slots=True)
+class _Aid:
+    """Messages of one quantity in the window: (time, fused, rejected); and its state."""
+
+    recent: deque[tuple[int, bool, bool]] = field(default_factory=lambda: deque(maxlen=_MAX_MESSAGES))
+    ratio: float = math.nan
+    first: int = 0  # of the messages that follow a silence [us]
+    state: State = "unknown"
+    since: int = 0
+
+
+class FusionTracker:
+    """The use of the external position of one vehicle; `add` its messages, and ask for `fusion`.
+
+    `primary`: instance of the EKF in use. `now`: the vehicle's newest time [us].
+    """
+
+    def __init__(self) -> None:
+        self.primary = 0
+        self.now = 0
+        self._is_odd = False  # the time of the last message did not follow
+        self._reset()
+
+    def _reset(self) -> None:
+        self._aids = {name: _Aid() for name in QUANTITIES}
+        self._echo_times: deque[int] = deque(maxlen=_MAX_MESSAGES)
+        self._changes: deque[int] = deque(maxlen=_CONFIRMED)  # times at which reset_counter changed
+        self._echo: tuple[Any, ...] = ()
+        self._mocap = self._unsupported = 0  # time of the last one
+        self._newest_sample = 0  # the largest timestamp_sample since boot
+        self._ahead = 0.0  # how far it was ahead when it arrived [s]
+        self._flags: dict[str, bool] = {}
+        self._has_aids = False
+        self._eph = math.nan
+        self._bias = math.nan, math.nan
+
+    def add_sample(self, sample: Sample[Any]) -> bool:
+        """Add a sample; return False for one from before the subscription, of which only the EKF in use counts."""
+        if sample.retained and sample.topic != SELECTOR:
+            return False
+        self.add(sample.topic, sample.message, sample.instance)
+        return True
+
+    def add(self, topic: str, message: object, instance: int | None = None) -> None:
+        """Add a message of one of FUSION_TOPICS: a model, a row, or a dict of fields."""
+        if topic == _FLAGS and instance not in (None, self.primary):
+            return
+        time = _read_time(message)[0]
+        if not isinstance(time, int) or not self._follow_time(topic, time):
+            return
+        if topic.startswith(_AID):
+            self._add_aid(topic, message)
+        elif topic == _ECHO:
+            self._add_echo(message)
+        elif topic == _MOCAP:
+            self._mocap = time
+        elif topic == _FLAGS:
+            values = dict(zip(QUANTITIES, _read_flags(message)[1:], strict=True))
+            self._flags = {name: bool(value) for name, value in values.items() if value is not None}
+        elif topic == _ESTIMATE:
+            self._eph = _number(_read_estimate(message)[1])
+        elif topic == _BIAS:
+            self._add_bias(message)
+        elif topic == SELECTOR:
+            primary = _read_primary(message)[1]
+            self.primary = primary if isinstance(primary, int) else self.primary
+        elif topic == _TEXT and _UNSUPPORTED in str(_read_text(message)[1]):
+            self._unsupported = time
+        self._update()
+
+    def _follow_time(self, topic: str, time: int) -> bool:
+        """Set the current time; return whether the message belongs to it.
+
+        Two messages in a row show a reboot, or a pause of the data: a single one may be damaged, or late.
+        """
+        is_odd = topic in _PERIODIC and not self.now - _REBOOT <= time <= self.now + _PAUSE
+        was_odd, self._is_odd = self._is_odd, is_odd and bool(self.now)
+        if not self._is_odd:
+            self.now = max(self.now, time) if topic in _PERIODIC else self.now
+            return True
+        if was_odd:
+            if time < self.now:
+                self._reset()
+            self.now = time
+        return was_odd
+
+    def _add_aid(self, topic: str, message: object) -> None:
+        time, fused, rejected, ratio, instance = _read_aid(message)
+        name = next((name for name, short in QUANTITIES.items() if topic == f"{_AID}{short}"), None)
+        if name is None or (instance is not None and instance != self.primary):
+            return
+        self._has_aids = True
+        aid = self._aids[name]
+        if not aid.recent or time - aid.recent[-1][0] > _SILENCE:
+            aid.recent.clear()
+            aid.first = time
+        aid.recent.append((time, bool(fused), bool(rejected)))
+        aid.ratio = _largest(ratio)
+
+    def _add_echo(self, message: object) -> None:
+        before, self._echo = self._echo, _read_echo(message)
+        time, sample = self._echo[:2]
+        if self._echo_times and time - self._echo_times[-1] > _SILENCE:
+            self._echo_times.clear()
+        self._echo_times.append(time)
+        if before and before[7] != self._echo[7]:
+            self._changes.append(time)
+        if isinstance(sample, int) and sample > self._newest_sample:
+            self._newest_sample, self._ahead = sample, (sample - time) / 1e6
+
+    def _add_bias(self, message: object) -> None:
+        bias = _read_bias(message)[1]
+        if isinstance(bias, tuple | list) and len(bias) >= 2:
+            self._bias = _number(bias[0]), _number(bias[1])
+
+    def _update(self) -> None:
+        """Set the state of each quantity, and since when it holds."""
+        for name, aid in self._aids.items():
+            state, since = self._state_of(name, aid)
+            if state != aid.state:
+                aid.state, aid.since = state, since
+
+    def _state_of(self, name: str, aid: _Aid) -> tuple[State, int]:
+        while aid.recent and aid.recent[0][0] < self.now - _WINDOW:
+            aid.recent.popleft()
+        if not aid.recent or self.now - aid.recent[-1][0] > _SILENCE:
+            return self._state_without_aid(name)
+        last = [*aid.recent][-_CONFIRMED:]  # what EKF2 does now
+        rejected = [time for time, _, is_rejected in aid.recent if is_rejected]
+        if len(rejected) >= max(_CONFIRMED, _REJECTED_SHARE * len(aid.recent)):
+            return "rejected", rejected[0]
+        if last[-1][1]:
+            return "fused", next(time for time, is_fused, _ in aid.recent if is_fused)
+        if any(is_fused for _, is_fused, _ in last):
+            return aid.state, aid.since
+        if aid.recent[-1][0] - aid.first < _START and aid.state in ("unknown", "not received"):
+            return "unknown", self.now
+        return "not used", aid.first
+
+    def _state_without_aid(self, name: str) -> tuple[State, int]:
+        """Return the state of a quantity whose measurements EKF2 does not report."""
+        is_echoed = bool(self._echo_times) and self._is_recent(self._echo_times[-1])
+        is_refused = self._is_recent(self._mocap) or self._is_recent(self._unsupported, _TEXT_TIME)
+        if self._aids[name].state == "unknown" and not (is_echoed or is_refused):
+            return "unknown", self.now
+        if is_echoed and self.now - self._echo_times[0] < _SILENCE:
+            return "unknown", self.now
+        if is_echoed and not self._has_aids:
+            if name not in self._flags or self.now - self._echo_times[0] < _FLAGS_LATE:
+                return "unknown", self.now
+            return ("fused" if self._flags[name] else "not used"), self.now
+        return "not received", self.now
+
+    def _is_recent(self, time: int, limit: int = _SILENCE) -> bool:
+        return bool(time) and self.now - time <= limit
+
+    def fusion(self, vehicle: str, sent: PositionStatus | None = None) -> Fusion:
+        """Return the report; `sent`: what a service sends into the vehicle."""
+        states: dict[str, State] = {name: aid.state for name, aid in self._aids.items()}
+        echo = self._describe_echo(sent)
+        quantities = []
+        for name, aid in self._aids.items():
+            cause = cause_of(name, states, aid.ratio, echo)
+            since = aid.since / 1e6 if aid.since and aid.state != "unknown" else None
+            quantities.append(QuantityFusion(name, aid.state, since, aid.ratio, cause))
+        variance = _number(self._echo[6][0]) if echo.is_echoed and self._echo[6] else math.nan
+        return Fusion(
+            vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias,
+            tuple(self._remarks(states, variance)), tuple(self._missing(echo)),
+        )  # fmt: skip
+
+    def diagnosis(self, topic: str) -> str:
+        """Return why what a topic reports is not fused, without the remedy; "" if nothing explains it.
+
+        `topic`: that of an aid source, or the echo for the position.
+        """
+        name = _NAMES.get(topic)
+        if name is None:
+            return ""
+        states: Mapping[str, State] = {each: aid.state for each, aid in self._aids.items()}
+        cause = cause_of(name, states, self._aids[name].ratio, self._describe_echo(None))
+        return cause.partition(": ")[0]
+
+    def _describe_echo(self, sent: PositionStatus | None) -> Echo:
+        is_mocap, is_unsupported = self._is_recent(self._mocap), self._is_recent(self._unsupported, _TEXT_TIME)
+        is_sent = None if sent is None else sent.rate > 0
+        if not self._echo or not self._is_recent(self._echo_times[-1]):
+            return Echo(is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent)
+        time, sample, pose_frame, velocity_frame, velocity, q, _, _, quality = self._echo
+        times = [each for each in self._echo_times if each >= self.now - _WINDOW - _SILENCE]
+        rate = (len(times) - 1) / max(1e-6, (times[-1] - times[0]) / 1e6) if len(times) > 1 else math.nan
+        is_ahead = self._newest_sample > self.now + _AHEAD
+        is_counting = len(self._changes) == _CONFIRMED and self._changes[0] > self.now - _WINDOW
+        return Echo(
+            is_echoed=True, is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent, rate=rate,
+            pose_frame=pose_frame, velocity_frame=velocity_frame, has_velocity=_is_known(velocity),
+            norm_error=_norm_error(q), age=(time - sample) / 1e6 if sample else 0.0,
+            ahead=self._ahead if is_ahead else 0.0, counts_messages=is_counting, quality=quality,
+        )  # fmt: skip
+
+    def _remarks(self, states: Mapping[str, State], variance: float) -> list[str]:
+        remarks = []
+        if states["position"] == "fused" and variance >= USELESS_VARIANCE:
+            remarks.append(Cause.VARIANCES)
+        bias = math.hypot(*self._bias)
+        if states["position"] == "fused" and bias > _LARGE_BIAS:
+            remarks.append(f"with GNSS, EKF2 gives vision a bias of {bias:.1f} m: the estimate follows GNSS")
+        return remarks
+
+    def _missing(self, echo: Echo) -> list[str]:
+        """Return the evidence that the data lacks."""
+        missing = []
+        how = "add it to etc/logging/logger_topics.txt on the SD card and use log=1 (docs/external-position.md)"
+        if not self._has_aids:
+            missing.append(f"{_AID}*, which alone shows rejected measurements; {how}")
+        if not (echo.is_echoed or echo.is_mocap or self._has_aids):
+            missing.append(f"{_ECHO}, which shows what PX4 received; {how}")
+        return missing
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _largest(ratio: object) -> float:
+    """Return the largest test ratio of all axes; NaN if one is NaN."""
+    values = [_number(each) for each in ratio] if isinstance(ratio, tuple | list) else [_number(ratio)]
+    if any(map(math.isnan, values)):
+        return math.nan
+    return max(values, default=math.nan)
+
+
+def _is_known(values: object) -> bool:
+    return isinstance(values, tuple | list) and all(map(math.isfinite, values))
+
+
+def _norm_error(q: object) -> float:
+    """Return the error of the norm of q, NaN if it is unknown."""
+    return abs(math.hypot(*q) - 1) if isinstance(q, tuple | list) else math.nan
