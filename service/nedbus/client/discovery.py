@@ -81,7 +81,6 @@ class SourceStatus(UntrustedReply):
     dropped: int = 0
     overload: str = ""
     reboots: int = 0
-    copies: int = 0
     done: int = 0
     total: int | None = None
     retries: int = 0
@@ -92,6 +91,7 @@ class SourceStatus(UntrustedReply):
     not_carried: tuple[str, ...] = ()
     silent: tuple[str, ...] = ()
     log_streams: tuple[LogStreamStatus, ...] = ()
+    copies: int = 0
 
     @property
     def vehicles(self) -> set[str]:
