@@ -13,6 +13,7 @@ from pydantic_core import CoreSchema, core_schema
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
+YEAR_2000: Final = 946_684_800_000_000  # us since 1970; for scripts that know it from earlier releases
 FIRST_UNIX_TIME: Final = 1_234_567_890_000_000  # us since 1970, 2009-02-13: PX4 sets no clock to an earlier time
 _YEAR_2100: Final = 4_102_444_800_000_000
 _MAX_ARRAY: Final = 1024  # elements; PX4's longest array has 512

@@ -82,7 +82,6 @@ class SourceStatus(UntrustedReply):
     dropped: int = 0
     overload: str = ""
     reboots: int = 0
-    copies: int = 0
     done: int = 0
     total: int | None = None
     retries: int = 0
@@ -94,6 +93,7 @@ class SourceStatus(UntrustedReply):
     silent: tuple[str, ...] = ()
     log_streams: tuple[LogStreamStatus, ...] = ()
     positions: tuple[PositionStatus, ...] = ()
+    copies: int = 0
 
     @property
     def vehicles(self) -> set[str]:

@@ -67,7 +67,7 @@ class FlightFile:
         found = [*self.reader.warnings]
         for address, count in self.order.unordered.items():
             if address.topic != LOG_MESSAGE.name and count:  # PX4 queues log messages
-                found.append(f"timestamps of {address} are out of order ({count}); the order of the file is kept")
+                found.append(f"timestamps of {address} are out of order ({count})")
         return [*found, *self.order.remarks]
 
     @cached_property

@@ -464,4 +464,6 @@ def _is_old(first: _Item[M], second: _Item[M]) -> bool:
     """Return whether the first message of a stream was sent long before its recording began."""
     if first.log is None or second.log is None:
         return False
+    if second.log < first.log:
+        return False  # the recorder's clock was set back
     return (second.stamp - first.stamp) - (second.log - first.log) > _NEAR

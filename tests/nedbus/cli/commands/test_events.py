@@ -190,7 +190,7 @@ def test_why_prints_a_long_reason_in_full(tmp_path: Path) -> None:
     """A long reason is in the verdict as a whole, and leaves room for less else."""
     writer = UlogWriter()
     writer.define([VLP])
-    for timestamp in range(0, 2_000_000, 100_000):
+    for timestamp in range(100_000, 2_100_000, 100_000):
         writer.add(VLP, message(timestamp), xy_valid=True, dist_bottom_valid=True)
     [verdict] = run_command("why", str(writer.write(tmp_path / "a.ulg"))).out.splitlines()
     assert verdict.startswith(f"1: {VLP} rejected: x: must be finite while xy_valid is true")
