@@ -3,6 +3,7 @@
 from typing import Any, Final
 
 from nedbus.timeline import Reading, VehicleClock
+from nedbus_msgs import FIRST_UNIX_TIME
 
 _MODULUS: Final = 1000 << 32  # us until `time_boot_ms` starts from 0 again, after 49.7 days
 
@@ -10,6 +11,14 @@ _MODULUS: Final = 1000 << 32  # us until `time_boot_ms` starts from 0 again, aft
 def new_clock() -> VehicleClock:
     """Return the clock of a vehicle whose messages have `time_boot_ms`."""
     return VehicleClock(_MODULUS)
+
+
+def time_since_boot(message: Any) -> int | None:
+    """Return the `time_usec` of a message [us since boot]; None if it has none, or a Unix time."""
+    microseconds: int = getattr(message, "time_usec", 0)
+    if 0 < microseconds < FIRST_UNIX_TIME:
+        return microseconds
+    return None
 
 
 def read_time(clock: VehicleClock, message: Any, now: float) -> Reading | None:

@@ -13,10 +13,10 @@ from nedbus.log_event import about
 from nedbus.samples import Rejection, SourceMessage
 from nedbus.timeline import RecentTimes, TimeKind
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
-from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, FIRST_UNIX_TIME, TOPICS, Address, decode_text, is_unix_time
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
-from .boot_time import new_clock, read_time
+from .boot_time import new_clock, read_time, time_since_boot
 from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
 from .senders import text_source
 from .sequence import REPEATED
@@ -269,6 +269,8 @@ class Vehicle:
         if timestamp < last and link != self._link:  # a second link's times need not be equal to those of the first
             self.copies += 1
             return None
+        if timestamp < last and self.clock.is_doubtful:
+            return None  # probably the first messages after a reboot, which is not certain yet
         if timestamp < last:
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
@@ -349,13 +351,16 @@ class Vehicle:
         self._kind = None if reading is None else reading.kind
         if self._kind in (TimeKind.NEW, TimeKind.REBOOT, TimeKind.STEP):
             self._follow_link(now)
-        if self._kind is TimeKind.REBOOT:
+        sampled = time_since_boot(message)
+        is_reboot = self._kind is TimeKind.REBOOT
+        if sampled is not None:  # a sample may be old: it shows a reboot, and nothing else
+            is_reboot = self.clock.add(message.get_type(), sampled, now).kind is TimeKind.REBOOT
+        if is_reboot:
             self.rebooted = True
             self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
             self._reset(now)
-        microseconds: int = getattr(message, "time_usec", 0)
-        if 0 < microseconds < FIRST_UNIX_TIME:
-            return microseconds
+        if sampled is not None:
+            return sampled
         ms: int | None = getattr(message, "time_boot_ms", None)
         if reading is not None:
             return reading.time

@@ -112,6 +112,11 @@ class VehicleClock:
             return self._add_current(stream, time, self.newest, now)
         return self._add_older(stream, time, last, self.newest, now)
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the last messages look like those of another boot, which is not certain yet."""
+        return bool(self._older)
+
     def confirm(self) -> None:
         """Discard the signs of a reboot, because something else shows that the vehicle continues to run."""
         self._older.clear()

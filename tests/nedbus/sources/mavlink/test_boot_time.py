@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.mavlink import new_clock, read_time
+from nedbus.mavlink import SequenceCounter, Vehicle, new_clock, read_time
 from nedbus.mavlink.parser import new_parser
+from nedbus.samples import Rejection, SourceMessage
 from nedbus.timeline import TimeKind, VehicleClock
 from tests.peers.px4_log_stream import STREAMS, datagrams
 
@@ -127,3 +129,52 @@ def test_recorded_reboots_are_found_within_two_seconds(recording: str, expected:
             found += [when] * is_reboot(clock, message, when)
     assert len(found) == len(starts) == expected
     assert all(0 <= when - start < 2 for when, start in zip(found, starts, strict=True))
+
+
+def handled(vehicle: Vehicle, messages: Iterable[Any], interval: float = 0.01) -> list[SourceMessage | Rejection]:
+    return [
+        item for number, message in enumerate(messages) for item in vehicle.handle_all(message, 100 + interval * number)
+    ]
+
+
+def odometry(ms: int) -> Any:
+    position, velocity, rates = [0.0] * 3, [0.0] * 3, [0.0] * 3
+    covariance = [0.0] * 21
+    level = [1.0, 0.0, 0.0, 0.0]
+    return dialect.MAVLink_odometry_message(
+        1000 * ms, 1, 12, *position, level, *velocity, *rates, covariance, covariance, 0
+    )
+
+
+def test_reboot_rejects_nothing() -> None:
+    """The time of a sample confirms a reboot; what came before it is certain is neither used nor rejected."""
+    before = [message for ms in range(10_000, 11_000, 20) for message in (position(ms), odometry(ms))]
+    after = [position(250), odometry(252), position(270), odometry(272)]
+    items = handled(Vehicle("1", ["vehicle_local_position"]), [*before, *after])
+    assert not [item for item in items if isinstance(item, Rejection)]
+    reboots = [item.timestamp for item in items if isinstance(item, SourceMessage) and item.rebooted]
+    assert reboots == [270_000]
+
+
+@pytest.mark.logs
+@pytest.mark.slow
+@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4: {STREAMS} does not exist")
+@pytest.mark.parametrize("recording", ["ulog_stream_session", "ulog_stream_session_second"])
+def test_recorded_reboots_lose_and_reject_nothing(recording: str) -> None:
+    """The first second after each reboot of a real PX4 (SITL) has no rejected message, and no loss is counted."""
+    vehicle, parser, sequence = Vehicle("1"), new_parser(), SequenceCounter()
+    reboots, rejections, lost = 0, 0, 0
+    certain = 0.0  # time of the last reboot
+    for when, from_vehicle, frame in datagrams(STREAMS / f"{recording}.bin.gz"):
+        for message in parser.parse_buffer(frame) or [] if from_vehicle else []:
+            vehicle.count_lost(sequence.add(message.get_msgbuf()[4], when), when)
+            for item in vehicle.handle_all(message, when):
+                if isinstance(item, Rejection):
+                    rejections += 1
+                    continue
+                if item.rebooted:
+                    certain = when
+                    reboots += 1
+                if when - certain < 1:
+                    lost += item.lost
+    assert (reboots, rejections, lost) == (2, 0, 0)
