@@ -24,7 +24,7 @@ from pyulog import ULog
 from tests.flights.ulogs import LOGS
 
 from nedbus.flights import ReadOptions
-from nedbus.tables import FlightArrays
+from nedbus.tables import open_arrays
 
 _TIMESTAMP = 5  # offset in a record with a message
 REPLAY = """
@@ -52,7 +52,7 @@ def main() -> None:
     for path in logs:
         ours, theirs = [], []
         for _ in range(options.repeat):
-            ours.append(seconds(partial(FlightArrays, path, ReadOptions(topics=None), lambda _: True)))
+            ours.append(seconds(partial(open_arrays, [path], ReadOptions(topics=None), lambda _: True)))
             theirs.append(seconds(partial(ULog, str(path))))
         medians = [statistics.median(ours), statistics.median(theirs)]
         total = [so_far + median for so_far, median in zip(total, medians, strict=True)]

@@ -49,11 +49,12 @@ class Columns:
     """The messages of one address in file order.
 
     `times`: their log times [us], empty for a log. `reason`: why the first unusable one is.
+    `skipped`: how many invalid ones were left out, as text; "" if there are none, or before they are read.
     """
 
     def __init__(self) -> None:
         self.times = array("q")
-        self.reason = ""
+        self.reason = self.skipped = ""
         self._parts: dict[FileStream, _Part] = {}
         self._runs = array("q"), array("q")  # the number of the part, and of the messages, of each run
         self._decoded: Decoded | None = None

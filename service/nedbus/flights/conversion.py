@@ -13,6 +13,7 @@ from nedbus.log_event import about
 from nedbus.samples import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
 
+from .flight import Flight, boot_utc_of
 from .readers import check_recording
 from .writer import RecordingWriter
 
@@ -22,6 +23,22 @@ _MAX_START: Final = 2**63  # ns; leaves room for later times in 64 bits
 _CHUNK: Final = 1024  # messages per write
 _CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses a few seconds of a typical flight
 _MAX_LOGGED: Final = 5  # rejected messages logged per file
+
+
+def convert_flight(flight: Flight, path: Path, *, on_progress: Callable[[int, int], object]) -> str:
+    """Write the messages of a flight to a new MCAP file as `convert` does, and return a summary.
+
+    `on_progress`: called with the number of bytes read so far, and that of the files.
+    """
+    readers = flight._readers
+    total = sum(reader.total for reader in readers)
+    return convert(
+        flight._messages(),
+        path,
+        boot_utc=boot_utc_of(readers),
+        starts=flight._first_stamps,
+        on_progress=lambda _: on_progress(sum(reader.position for reader in readers), total),
+    )
 
 
 def convert(

@@ -11,7 +11,7 @@ from nedbus.errors import InvalidMessageError
 from nedbus.events import EVENT_TOPICS, EventLog, Times
 from nedbus.samples import SourceMessage
 
-from .merge import MergedFlights
+from .flight import Flight, open_messages
 from .readers import ReadOptions
 
 MAX_FILE_EVENTS: Final = 100_000
@@ -36,19 +36,19 @@ class FileEvents:
 
 
 def read_file_events(*paths: Path) -> FileEvents:
-    """Detect the events in files; raise the errors of `MergedFlights` and its `messages`."""
-    event_log, due = EventLog(MAX_FILE_EVENTS), 0.0
-    with MergedFlights(paths, EVENT_OPTIONS) as flights:
-        for message, _, _ in follow(flights.messages(), event_log, ended=flights.ended):
-            due = message.at
+    """Detect the events in files; raise the errors of `nedbus.open` and its samples."""
+    event_log = EventLog(MAX_FILE_EVENTS)
+    with open_messages(paths, EVENT_OPTIONS) as flight:
+        for _ in follow_flight(flight, event_log):
+            pass
         event_log.label_first_events()
-        return FileEvents(event_log, times_of(flights), due, flights.warnings)
+        return FileEvents(event_log, times_of(flight), flight.duration, flight.warnings)
 
 
-def times_of(flights: MergedFlights) -> Times:
-    """Return the clocks of the vehicles of flights, with remarks on them; reads the files."""
+def times_of(flight: Flight) -> Times:
+    """Return the clocks of the vehicles of a flight, with remarks on them; reads the files."""
     offsets, remarks = dict[str, float](), dict[str, str]()
-    for name, utc in flights.utc.items():
+    for name, utc in flight._utc_by_name.items():
         remark = utc
         if not isinstance(utc, str):
             offsets[name] = utc.offset_us / 1e6
@@ -57,6 +57,11 @@ def times_of(flights: MergedFlights) -> Times:
         if remark:
             remarks[name] = str(remark)
     return Times(offsets=offsets, remarks=remarks)
+
+
+def follow_flight(flight: Flight, event_log: EventLog) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
+    """Detect the events in a flight; yield each message with its rejection reason or its payload."""
+    return follow(flight._messages(), event_log, ended=flight._ended)
 
 
 def follow(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypedDict, Unpack, overload
 from weakref import WeakSet
 
 from nedbus.errors import ArgumentError, ClosedError, InvalidMessageError, SourceError
-from nedbus.samples import M_co, Sample
-from nedbus.timeline import UtcOffset, to_unix_ns
+from nedbus.samples import M_co, Sample, SourceMessage
+from nedbus.timeline import UtcOffset, provides_utc, to_unix_ns
 from nedbus_msgs import (
     ANY,
     BY_TOPIC,
@@ -32,15 +33,18 @@ from nedbus_msgs import (
     vehicle_name,
 )
 
-from .merge import MergedFlights, Survey, require_files
-from .readers import ReadOptions
+from .merge import Names, distinct_names, merge_messages, no_utc, renamed, require_files
+from .readers import FileStream, FlightReader, ReadOptions, open_reader
 from .selection import matching
+from .utc import FileUtc, read_utc, utc_of_columns
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
 
+    from .columns import Columns
+
 _BATCH: Final = 4096  # messages per batch at most, of all types
-_ALL: Final = ReadOptions(topics=None)
+_BUILT_IN: Final = ReadOptions()
 
 
 class Select(TypedDict, total=False):
@@ -70,7 +74,17 @@ def open_flight(
     it is not installed, ArgumentError without files.
     """
     paths = [path] if isinstance(path, str | Path) else path
-    return Flight([Path(each).expanduser() for each in paths], vehicle=vehicle_name(vehicle), layout=layout)
+    options = ReadOptions(topics=None, layout=layout)
+    flight = Flight([Path(each).expanduser() for each in paths], options, vehicle=vehicle_name(vehicle))
+    flight._begin(watches_utc=True)
+    return flight
+
+
+def open_messages(paths: Sequence[Path], options: ReadOptions = _BUILT_IN) -> Flight:
+    """Open files for one pass over their messages; raise the errors of `nedbus.open`."""
+    flight = Flight(paths, options)
+    flight._begin()
+    return flight
 
 
 class Flight(AbstractContextManager["Flight"]):
@@ -80,12 +94,18 @@ class Flight(AbstractContextManager["Flight"]):
     reads the files once. The properties read them once, on first use.
     """
 
-    def __init__(self, paths: Sequence[Path], *, vehicle: str, layout: str | None) -> None:
-        self._paths, self._vehicle = require_files(paths), vehicle
-        self._options, self._is_closed = replace(_ALL, layout=layout), False
+    # All readers of files in nedbus use a Flight, through the functions of this package. The first pass over the files
+    # yields messages or columns, as the caller needs; what it has shown is kept.
+
+    def __init__(self, paths: Sequence[Path], options: ReadOptions = _BUILT_IN, *, vehicle: str = ANY) -> None:
+        self._paths, self._options, self._vehicle = require_files(paths), options, vehicle
         self._selection = Selection(vehicle=vehicle)
+        self._readers: list[FlightReader] = []  # of the first pass, one for each file
+        self._watches: list[FileUtc] = []  # the UTC of each file, from the first pass
+        self._columns: list[dict[Address, Columns]] = []  # of each file, if the first pass is one of columns
+        self._ended: set[str] = set()  # vehicles without further messages in the first pass
         self._samples = WeakSet[FlightSamples[Any]]()  # open ones, which `close` closes
-        self._unread: MergedFlights | None = self._open(_ALL.topics, surveys=True)  # raises errors of unreadable files
+        self._is_complete = self._is_closed = False
 
     @overload
     def __call__(
@@ -123,7 +143,7 @@ class Flight(AbstractContextManager["Flight"]):
         selection = Selection(names, chosen, instance)
         topics = None if selection.topics == (ANY,) else set(selection.topics)
         period = self._seconds(start, "start"), None if end is None else self._seconds(end, "end")
-        samples = FlightSamples[Any](self._open(topics), selection, period, rows=rows)
+        samples = FlightSamples[Any](self, self._open(topics), selection, period, rows=rows)
         self._samples.add(samples)
         return samples
 
@@ -135,60 +155,197 @@ class Flight(AbstractContextManager["Flight"]):
     @property
     def definitions(self) -> dict[Address, Definition[Any]]:
         """The definition of each address."""
-        found = self._survey[0].definitions
-        return {address: known for address, known in found.items() if self._selection.matches(address)}
+        self._complete()
+        known = self._definitions_of(self._readers)
+        return {address: definition for address, definition in known.items() if self._selection.matches(address)}
 
     @property
     def duration(self) -> float:
         """Seconds from the first to the last message, by the vehicle's clock, pauses included."""
-        flights, surveys = self._survey
-        return flights.duration(surveys)
+        self._complete()
+        durations = [reader.order.duration for reader in self._readers]
+        if len(durations) == 1:
+            return durations[0]
+        ends = [start + duration for start, duration in zip(self._starts, durations, strict=True)]
+        return max(ends) - min(self._starts)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Damage of the files, and what was left out."""
-        return self._survey[0].warnings
+        self._complete()
+        return self._warnings_of(self._readers)
 
     @property
     def damaged(self) -> bool:
         """True if messages are lost to damage."""
-        return self._survey[0].damaged
+        self._complete()
+        return any(reader.damaged for reader in self._readers)
 
     @property
     def utc(self) -> UtcOffset | None:
         """The offset from time since boot to UTC; None if it is unknown, or differs between several vehicles."""
-        found = [utc for name, utc in self._utc.items() if self._vehicle in (ANY, name)]
-        return found[0] if len(found) == 1 else None
+        self._complete()
+        known = []
+        for name, utc in self._utc_by_name.items():
+            if isinstance(utc, UtcOffset) and self._vehicle in (ANY, name):
+                known.append(utc)
+        return known[0] if len(known) == 1 else None
 
     def close(self) -> None:
         """Close the flight and its samples, which then raise ClosedError; a second call does nothing."""
         self._is_closed = True
-        if self._unread is not None:
-            self._unread.close()
+        for reader in self._readers:
+            reader.close()
         for samples in list(self._samples):
             samples.abort()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @cached_property
-    def _survey(self) -> tuple[MergedFlights, list[Survey]]:
-        """The files after one pass, and what it shows of each."""
-        flights, self._unread = self._unread, None
-        if flights is None:
-            flights = self._open(_ALL.topics, surveys=True)
-        return flights, flights.survey()
+    def _begin(self, *, watches_utc: bool = False) -> None:
+        """Begin the first pass with messages; raise the errors of unreadable files.
 
-    @property
-    def _utc(self) -> dict[str, UtcOffset]:
-        flights, _ = self._survey
-        return {name: utc for name, utc in flights.utc.items() if isinstance(utc, UtcOffset)}
+        `watches_utc`: note the UTC of the messages on the way, so that it needs no further pass.
+        """
+        self._readers = [open_reader(path, self._options) for path in self._paths]
+        for reader in self._readers:
+            if watches_utc:
+                watch = FileUtc()
+                self._watches.append(watch)
+                reader.begin(watch=watch.watch)
+            else:
+                reader.begin()
 
-    def _open(self, topics: Any, *, surveys: bool = False) -> MergedFlights:
+    def _complete(self) -> None:
+        """Read the rest of the first pass."""
+        if self._is_complete:
+            return
         if self._is_closed:
             raise ClosedError
-        known = self.__dict__.get("_survey", (None, ()))[1]
-        return MergedFlights(self._paths, replace(self._options, topics=topics), known=known, surveys=surveys)
+        for reader in self._readers:
+            deque(reader.messages(), maxlen=0)
+            reader.close()
+        self._is_complete = True
+
+    def _messages(self) -> Iterator[SourceMessage]:
+        """Yield the messages of the first pass in chronological order, also those that are not valid.
+
+        Raises SourceError if one of several files has no UTC.
+        """
+        yield from self._merge(self._readers, lambda names: self._ended.update(names.values()))
+        self._is_complete = True
+
+    def _read_columns(self, selects: Callable[[Address], bool]) -> None:
+        """Make the first pass one of columns: read the records of selected addresses, and those with UTC."""
+        from .columns import Columns
+
+        for path in self._paths:
+            reader = open_reader(path, self._options)
+            self._readers.append(reader)
+            columns = defaultdict[Address, Columns](Columns)
+            is_kept = dict[FileStream, bool]()
+            with reader:
+                for run in reader.runs():
+                    stream = run.stream
+                    if stream not in is_kept:
+                        is_kept[stream] = selects(stream.address) or provides_utc(stream.definition)
+                    if is_kept[stream]:
+                        columns[stream.address].add(run)
+            self._columns.append(columns)
+        self._is_complete = True
+
+    def _open(self, topics: Collection[str] | None) -> list[FlightReader]:
+        """Begin another pass, over some topics or all (None), on the axis of the first one."""
+        if self._is_closed:
+            raise ClosedError
+        readers = []
+        for path, first in zip(self._paths, self._readers, strict=True):
+            reader = open_reader(path, replace(self._options, topics=topics))
+            reader.begin(whole=first.order.axis)
+            readers.append(reader)
+        return readers
+
+    def _merge(self, readers: Sequence[FlightReader], on_end: Callable[[Names], object]) -> Iterator[SourceMessage]:
+        """Return the messages of a pass in chronological order; raise SourceError if one of several has no UTC."""
+        if len(readers) == 1:
+            return readers[0].messages()
+        starts = self._starts
+        offsets = [start - min(starts) for start in starts]
+        return merge_messages(readers, self._names, offsets, on_end)
+
+    @cached_property
+    def _utc(self) -> list[Mapping[str, UtcOffset | str]]:
+        """The UTC offset of each vehicle of each file, by its own name, or why it is unknown."""
+        if self._columns:
+            return [utc_of_columns(own, reader) for own, reader in zip(self._columns, self._readers, strict=True)]
+        if self._watches and self._is_complete:
+            return [watch.results(reader) for watch, reader in zip(self._watches, self._readers, strict=True)]
+        topics = None if self._options.topics is None else _BUILT_IN.topics  # a file may have other topics only
+        found: list[Mapping[str, UtcOffset | str]] = []
+        for path in self._paths:
+            with open_reader(path, replace(self._options, topics=topics)) as reader:
+                found.append(read_utc(reader))
+        return found
+
+    @property
+    def _utc_by_name(self) -> dict[str, UtcOffset | str]:
+        """The UTC offset of each vehicle, or why it is unknown."""
+        found = dict[str, UtcOffset | str]()
+        for own, names in zip(self._utc, self._names, strict=True):
+            found |= {names.get(vehicle, vehicle): utc for vehicle, utc in own.items()}
+        return found
+
+    @cached_property
+    def _names(self) -> list[Names]:
+        """The name of each vehicle of each of several files, by its own name."""
+        if len(self._readers) == 1:
+            return [{}]
+        files = []
+        for reader, utc in zip(self._readers, self._utc, strict=True):
+            files.append((reader.path, utc.keys() | {address.vehicle for address in reader.definitions}))
+        return [*distinct_names(files)]
+
+    @cached_property
+    def _starts(self) -> list[float]:
+        """The Unix time of the first message of each file [s]; raise SourceError if it is unknown."""
+        return [_start_of(reader, utc) for reader, utc in zip(self._readers, self._utc, strict=True)]
+
+    def _find(self, address: Address) -> tuple[int, Address]:
+        """Return the number of the file that has an address, and the address in this file."""
+        for number, names in enumerate(self._names):
+            for own, name in names.items():
+                if name == address.vehicle:
+                    return number, renamed(address, {name: own})
+        return 0, address
+
+    @property
+    def _first_stamps(self) -> dict[str, int]:
+        """The timestamp of each vehicle at the first message of its file [us]."""
+        found = dict[str, int]()
+        for reader, names in zip(self._readers, self._names, strict=True):
+            for own in {address.vehicle for address in reader.definitions}:
+                stamp = reader.order.axis.stamp_at(own, 0.0)
+                if stamp is not None and stamp > 0:
+                    found[names.get(own, own)] = stamp
+        return found
+
+    def _definitions_of(self, readers: Sequence[FlightReader]) -> dict[Address, Definition[Any]]:
+        """Return the definition of each stream that a pass has met so far."""
+        found = dict[Address, Definition[Any]]()
+        for reader, names in zip(readers, self._names, strict=True):
+            found |= {renamed(address, names): known for address, known in [*reader.definitions.items()]}
+        return found
+
+    def _warnings_of(self, readers: Sequence[FlightReader]) -> tuple[str, ...]:
+        """Return damage, omissions and renamed vehicles that a pass has met so far, each with its file."""
+        found = []
+        for reader, names in zip(readers, self._names, strict=True):
+            texts = [*reader.warnings, *reader.remarks]
+            for own, name in names.items():
+                if own != name:
+                    texts.insert(0, f"vehicle {own} is named {name} here, because several files have a vehicle {own}")
+            found += [f"{reader.path}: {text}" for text in texts]
+        return tuple(found)
 
     def _seconds(self, time: float | datetime, name: str) -> float:
         """Return seconds since the first message."""
@@ -197,8 +354,9 @@ class Flight(AbstractContextManager["Flight"]):
         if time.tzinfo is None:
             expected = "seconds, or a datetime with a time zone, such as datetime(2025, 10, 9, 8, 53, tzinfo=UTC)"
             raise ArgumentError(name, str(time), expected, problem="has no time zone, so it names no moment")
+        self._complete()
         try:
-            start = self._survey[0].start()
+            start = min(self._starts)
         except SourceError as exc:
             expected = "seconds since the first message, because this flight has no UTC"
             raise ArgumentError(name, str(time), expected) from exc
@@ -212,9 +370,15 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
     """
 
     def __init__(
-        self, flights: MergedFlights, selection: Selection, period: tuple[float, float | None], *, rows: bool
+        self,
+        flight: Flight,
+        readers: Sequence[FlightReader],
+        selection: Selection,
+        period: tuple[float, float | None],
+        *,
+        rows: bool,
     ) -> None:
-        self._flights, self._selection, self._rows = flights, selection, rows
+        self._flight, self._readers, self._selection, self._rows = flight, readers, selection, rows
         self._start, self._end = period
         self.skipped: Counter[Address] = Counter()
         self._reasons: dict[Address, str] = {}
@@ -229,12 +393,12 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         invalid = [
             f"skipped {count[each]} messages of {each} as invalid ({text})" for each, text in self._reasons.items()
         ]
-        return [*self._flights.warnings, *invalid]
+        return [*self._flight._warnings_of(self._readers), *invalid]
 
     @property
     def damaged(self) -> bool:
         """True if messages were lost to damage so far."""
-        return self._flights.damaged
+        return any(reader.damaged for reader in self._readers)
 
     def rows(self) -> Iterator[Sample[M_co]]:
         """Iterate over samples whose message is a Row, as `subscription.rows` does."""
@@ -260,7 +424,8 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
     def close(self) -> None:
         """Close the files; a second call does nothing."""
         self._messages.close()
-        self._flights.close()
+        for reader in self._readers:
+            reader.close()
 
     def __iter__(self) -> Self:
         return self
@@ -283,9 +448,9 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
     def _select(self) -> Generator[tuple[Address, Definition[Any], Encoded, int, Provenance]]:
         """Yield address, definition, payload, log time [ns] and provenance of the selected messages."""
-        flights, is_found = self._flights, False
+        flight, readers, is_found = self._flight, self._readers, False
         try:
-            for message in flights.messages():
+            for message in flight._merge(readers, lambda _: None):
                 is_late = self._end is not None and message.at > self._end
                 if is_late and is_found:
                     return
@@ -304,16 +469,34 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
                     self._reasons.setdefault(address, exc.reason)
                     continue
                 definition = message.definition or BY_TOPIC[address.topic]
-                time = to_unix_ns(message.time, flights.boot_utc)
+                time = to_unix_ns(message.time, boot_utc_of(readers))
                 yield address, definition, encoded, time, _provenance(message.source, encoded.missing)
         finally:
-            flights.close()
+            for reader in readers:
+                reader.close()
         if not is_found:
-            files = flights.files
-            where = files[0].path if len(files) == 1 else f"any of the {len(files)} files"
-            matching(where, sorted(flights.definitions), self._selection)  # raises an AddressError
+            where = readers[0].path if len(readers) == 1 else f"any of the {len(readers)} files"
+            matching(where, sorted(flight._definitions_of(readers)), self._selection)  # raises an AddressError
 
 
-@lru_cache(1024)
 def _provenance(source: str | None, missing: frozenset[str]) -> Provenance:
     return Provenance(source, missing)
+
+
+def boot_utc_of(readers: Sequence[FlightReader]) -> int:
+    """Return the Unix time of the boot in the metadata of the only file [us]; 0 if unknown, or for several files."""
+    return readers[0].boot_utc if len(readers) == 1 else 0
+
+
+def _start_of(reader: FlightReader, utc: Mapping[str, UtcOffset | str]) -> float:
+    """Return the Unix time of the first message of a file [s]; raise SourceError if it is unknown."""
+    starts = []
+    for message in reader.ahead:
+        offset = utc.get(message.address.vehicle)
+        stamp = None if message.error else message.timestamp
+        if isinstance(offset, UtcOffset) and stamp is not None:
+            starts.append(int(offset.unix_us(stamp)) / 1e6 - message.at)
+    if not starts:
+        reasons = [reason for reason in utc.values() if isinstance(reason, str)]
+        raise no_utc(reader.path, reasons[0] if reasons else "")
+    return median(starts)

@@ -89,6 +89,17 @@ def read_utc(reader: FlightReader) -> dict[str, UtcOffset | str]:
     return found.results(reader)
 
 
+def utc_of_columns(columns: Mapping[Address, Columns], reader: FlightReader) -> dict[str, UtcOffset | str]:
+    """Return the UTC offset of each vehicle of a file from columns that were read, or why it is unknown."""
+    from nedbus.timeline import UtcEstimate
+
+    estimates = {address.vehicle: UtcEstimate() for address in reader.definitions}
+    for address in sorted(columns):
+        decoded = columns[address].decode(reader.definitions[address])
+        estimates[address.vehicle].add(address.stream, decoded.utc_columns())
+    return {vehicle: estimate.result(reader.boot_utc) for vehicle, estimate in estimates.items()}
+
+
 class FileUtc:
     """The UTC of the vehicles of a file, from its records."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from nedbus.flights import FlightFile, FlightReader, ReadOptions, absent_topics
+from nedbus.flights import FlightReader, ReadOptions, absent_topics, open_reader
 from nedbus.samples import SourceMessage
 from nedbus_msgs import DEFAULT
 
@@ -14,30 +14,27 @@ from .source import ReplayRun
 def open_replay(file: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:
     """Read the start of a file; raise SourceError if it cannot be read, or has none of the requested topics."""
     path, layout = Path(file).expanduser(), options.layout if isinstance(options, RecordingOptions) else None
-    flight = FlightFile(path, ReadOptions(options.chosen_topics, options.vehicle, default_vehicle, layout))
-    reader = flight.reader
-    run = ReplayRun(iter(()), reader.definitions, reader.total, "", position=lambda: reader.position)
-    run.messages = _read(flight, run, options)
-    run.boot_utc, run.summary = reader.boot_utc, _summary(reader)
-    _update(run, flight, ())
+    reader = open_reader(path, ReadOptions(options.chosen_topics, options.vehicle, default_vehicle, layout))
+    reader.begin()
+    run = ReplayRun(iter(()), reader.definitions, reader.total, _summary(reader), position=lambda: reader.position)
+    run.messages = _read(reader, run, options)
+    run.boot_utc = reader.boot_utc
+    _update(run, reader, ())
     return run
 
 
-def _read(flight: FlightFile, run: ReplayRun, options: RecordedOptions) -> Iterator[SourceMessage]:
+def _read(reader: FlightReader, run: ReplayRun, options: RecordedOptions) -> Iterator[SourceMessage]:
     """Yield the messages of a file, and update its run."""
-    reader = flight.reader
-    try:
-        yield from flight.messages
-    finally:
-        reader.close()
+    with reader:
+        yield from reader.messages()
     absent = absent_topics(options.topics, {address.topic for address in reader.definitions}, "this file")
-    _update(run, flight, absent)
+    _update(run, reader, absent)
 
 
-def _update(run: ReplayRun, flight: FlightFile, absent: Iterable[str]) -> None:
-    run.warnings = (*flight.warnings, *absent)
-    if flight.reader.damaged:
-        run.damage = f"{flight.path}: some messages are lost to damage; {'; '.join(flight.reader.warnings)}"
+def _update(run: ReplayRun, reader: FlightReader, absent: Iterable[str]) -> None:
+    run.warnings = (*reader.warnings, *reader.remarks, *absent)
+    if reader.damaged:
+        run.damage = f"{reader.path}: some messages are lost to damage; {'; '.join(reader.warnings)}"
 
 
 def _summary(reader: FlightReader) -> str:

@@ -15,8 +15,8 @@ from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray, derive_column
 from nedbus_msgs.frames import DERIVED, derived_from
 
-from .arrays import Library, Pandas, Polars, Streams, missing_of, to_dataframe
-from .reading import FlightPath, read_streams
+from .arrays import Library, Pandas, Polars, Streams, missing_of, recording_start, to_dataframe, utc_offset_of
+from .reading import FlightPath, ReadStreams, read_streams
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,14 +87,13 @@ def align(
         raise ArgumentError("method", method, f"one of {', '.join(_METHODS)}")
     reference = [on] if isinstance(on, str) else []
     topics = [topics] if isinstance(topics, str) else topics
-    names, start = [*reference, *(topics or ())], 0
-    streams: Streams
-    offset: UtcOffset | None = None
+    names = [*reference, *(topics or ())]
+    found: ReadStreams | None = None
     if isinstance(flight, Mapping):
         streams = _choose_streams(flight, topics, names)
     else:
-        wanted = names if topics else None
-        streams, start, offset = read_streams(flight, wanted, vehicle=vehicle, layout=layout, utc=utc)
+        found = read_streams(flight, names if topics else None, vehicle=vehicle, layout=layout, utc=utc)
+        streams = found.streams
     if isinstance(on, str):
         if not _streams_named(on, streams) and not isinstance(flight, Mapping):  # not a topic known to nedbus
             streams |= read_streams(flight, [on], vehicle=vehicle, layout=layout).streams
@@ -102,12 +101,10 @@ def align(
         reference = [on]
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
-    times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
+    times = stamps[on] if isinstance(on, str) else _times(on, stamps, _start_of(found))
     columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
     if utc:
-        if not isinstance(flight, FlightPath):  # several files have Unix times
-            offset = utc_of({name: messages for name, (messages, _) in streams.items()})
-        columns["utc"] = _to_utc(times, offset)
+        columns["utc"] = _to_utc(times, _offset_of(found, streams))
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     requested = {field.rpartition(".")[2] for field in fields or ()}
     for name, (messages, lacking) in streams.items():
@@ -149,6 +146,20 @@ def _choose_streams(arrays: Mapping[str, MessageArray], topics: Sequence[str] | 
     if unknown := [name for name in topics or () if name not in (ANY, *arrays)]:
         raise AddressError("topic", unknown[0], f"one of {', '.join(arrays)}", problem="is not among these arrays")
     return {name: (array, {}) for name, array in arrays.items() if not topics or ANY in topics or name in names}
+
+
+def _start_of(found: ReadStreams | None) -> int:
+    """Return when recording began, on the clock of the timestamps [us]; 0 if it is unknown."""
+    if found is None:
+        return 0
+    return recording_start(found.flight, found.addresses, unix_times=found.unix_times)
+
+
+def _offset_of(found: ReadStreams | None, streams: Streams) -> UtcOffset | None:
+    """Return the UTC offset of the streams; None if it is unknown."""
+    if found is None or found.unix_times:
+        return utc_of({name: messages for name, (messages, _) in streams.items()})
+    return utc_offset_of(found.flight, found.addresses[0].vehicle)
 
 
 def _to_utc(times: _Ints, offset: UtcOffset | None) -> npt.NDArray[np.datetime64]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,9 +11,9 @@ import numpy.typing as npt
 
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.extras import import_optional
-from nedbus.flights import Columns, Decoded, FileStream, ReadOptions, open_reader
-from nedbus.timeline import UtcEstimate, UtcOffset, provides_utc
-from nedbus_msgs import Address, decode_text
+from nedbus.flights import Flight, ReadOptions, no_utc
+from nedbus.timeline import UtcOffset
+from nedbus_msgs import DEFAULT_TOPIC, Address, decode_text
 from nedbus_msgs.arrays import MessageArray
 
 Absent = Mapping[str, npt.NDArray[np.bool_]]  # masks of the messages that lack a field, by field
@@ -39,84 +38,114 @@ def addresses_of(path: str | Path) -> list[Address]:
 
     It includes messages that only the file defines.
     """
-    with open_reader(Path(path).expanduser(), ReadOptions(topics=None)) as reader:
-        for _ in reader.runs():
-            pass
-        return sorted(reader.definitions)
+    with open_arrays([Path(path).expanduser()], ReadOptions(topics=None), lambda _: False) as flight:
+        return flight.addresses
 
 
-class FlightArrays:
-    """The messages of one file, read once, as arrays on request.
+def open_arrays(paths: Sequence[Path], options: ReadOptions, selects: Callable[[Address], bool]) -> Flight:
+    """Read files once, to return the messages of selected addresses as arrays on request.
 
-    `selects`: whether an address may be requested. `definitions`: the definition of each address.
-    `start`: when recording began, on the clock of the timestamps [us], 0 if unknown.
-
-    Raises SourceError if the file cannot be read.
+    Raises SourceError if a file cannot be read.
     """
+    flight = Flight(paths, options)
+    flight._read_columns(selects)
+    return flight
 
-    def __init__(self, path: Path, options: ReadOptions, selects: Callable[[Address], bool]) -> None:
-        self.path = path
-        self._columns = defaultdict[Address, Columns](Columns)
-        self._utc = dict[str, UtcOffset | str]()
-        self._invalid: dict[Address, str] = {}
-        with open_reader(path, options) as reader:
-            is_kept = dict[FileStream, bool]()
-            for run in reader.runs():
-                if (stream := run.stream) not in is_kept:
-                    is_kept[stream] = selects(stream.address) or provides_utc(stream.definition)
-                if is_kept[stream]:
-                    self._columns[stream.address].add(run)
-            self._warnings, self.damaged, self._boot_utc = reader.warnings, reader.damaged, reader.boot_utc
-            self.definitions = reader.definitions
-        self.start = reader.start or self._find_start(selects)
-        self.addresses = sorted(self.definitions)
 
-    @property
-    def warnings(self) -> list[str]:
-        """Damage found and messages skipped so far."""
-        return [*self._warnings, *self._invalid.values()]
+def array_of(flight: Flight, address: Address, *, unix_times: bool = False) -> tuple[MessageArray, Absent]:
+    """Return the valid messages of an address, with a mask of the messages that lack a field, by field.
 
-    def read(self, address: Address) -> tuple[MessageArray, Absent]:
-        """Return the valid messages of an address, with a mask of the messages that lack a field, by field.
+    The dtype has the names of these fields. `unix_times`: their timestamps become Unix times [us].
 
-        The dtype has the names of these fields. Raises SourceError if all messages have another layout than the file
-        says.
-        """
-        messages, valid, absent = self._decode(address)
-        if not valid.all():
-            reason = self._columns[address].reason
-            if reason and not valid.any():
-                raise SourceError(str(self.path), f"no message of {address.stream} can be read: {reason}")
-            skipped = f"skipped {np.sum(~valid)} of {len(valid)} messages of {address.stream} as invalid"
-            self._invalid[address] = f"{skipped} ({reason})" if reason else skipped
-            messages, absent = messages[valid], absent[valid]
-        masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
-        if masks:
-            types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
-            messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
-        return messages, masks
+    Raises SourceError if all messages have another layout than the file says, or if UTC is required, but unknown.
+    """
+    number, own = flight._find(address)
+    reader, columns = flight._readers[number], flight._columns[number][own]
+    definition = reader.definitions[own]
+    messages, valid, absent = columns.decode(definition)
+    if not valid.all():
+        reason = columns.reason
+        if reason and not valid.any():
+            raise SourceError(str(reader.path), f"no message of {own.stream} can be read: {reason}")
+        skipped = f"skipped {np.sum(~valid)} of {len(valid)} messages of {own.stream} as invalid"
+        columns.skipped = f"{skipped} ({reason})" if reason else skipped
+        messages, absent = messages[valid], absent[valid]
+    masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
+    if masks:
+        types = [(name, messages.dtype[name]) for name in definition.names]
+        messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
+    if unix_times:
+        utc = require_utc(flight, address.vehicle)
+        messages["timestamp"] = utc.unix_us(messages["timestamp"].astype(np.int64))
+    return messages, masks
 
-    def utc(self, vehicle: str) -> UtcOffset | str:
-        """Return the UTC offset of a vehicle, or why it is unknown."""
-        if vehicle not in self._utc:
-            estimate = UtcEstimate()
-            for address in self.addresses:
-                if address.vehicle == vehicle and address in self._columns:
-                    estimate.add(address.stream, self._decode(address).utc_columns())
-            self._utc[vehicle] = estimate.result(self._boot_utc)
-        return self._utc[vehicle]
 
-    def _decode(self, address: Address) -> Decoded:
-        return self._columns[address].decode(self.definitions[address])
+def vehicles_of(flight: Flight) -> list[str]:
+    """Return the vehicles of a flight, file by file."""
+    found = []
+    for reader, names in zip(flight._readers, flight._names, strict=True):
+        own = sorted({address.vehicle for address in reader.definitions})
+        found += [names.get(vehicle, vehicle) for vehicle in own]
+    return found
 
-    def _find_start(self, selects: Callable[[Address], bool]) -> int:
-        """Return the first log time on the clock of the timestamps [us]; 0 without log times."""
-        firsts, ages = list[int](), list[npt.NDArray[np.float64]]()
-        for address, columns in self._columns.items():
-            if columns.times and selects(address):
-                firsts.append(min(columns.times))
-                ages.append(np.array(columns.times, float) - self._decode(address).messages["timestamp"].astype(float))
-        return max(0, min(firsts) - round(np.median(np.concatenate(ages)))) if ages else 0
+
+def path_of(flight: Flight, vehicle: str) -> Path:
+    """Return the file of a vehicle."""
+    number, _ = flight._find(Address(vehicle, DEFAULT_TOPIC))
+    return flight._paths[number]
+
+
+def require_utc(flight: Flight, vehicle: str) -> UtcOffset:
+    """Return the UTC offset of a vehicle; raise SourceError if it is unknown."""
+    utc = flight._utc_by_name[vehicle]
+    if isinstance(utc, str):
+        raise no_utc(path_of(flight, vehicle), utc)
+    return utc
+
+
+def utc_offset_of(flight: Flight, vehicle: str) -> UtcOffset | None:
+    """Return the UTC offset of a vehicle; None if it is unknown."""
+    utc = flight._utc_by_name[vehicle]
+    return utc if isinstance(utc, UtcOffset) else None
+
+
+def array_warnings(flight: Flight) -> list[tuple[Path, str]]:
+    """Return damage and skipped messages so far, each with its file."""
+    found = []
+    for reader, columns in zip(flight._readers, flight._columns, strict=True):
+        found += [(reader.path, text) for text in reader.warnings]
+        found += [(reader.path, own.skipped) for own in columns.values() if own.skipped]
+    return found
+
+
+def recording_start(flight: Flight, addresses: Sequence[Address], *, unix_times: bool = False) -> int:
+    """Return when the recording of these addresses began, on the clock of their timestamps [us], 0 if it is unknown.
+
+    `unix_times`: as in `array_of`.
+    """
+    starts = []
+    for vehicle in {address.vehicle for address in addresses}:
+        start = _start_of_vehicle(flight, [each for each in addresses if each.vehicle == vehicle])
+        if start and unix_times:
+            start = int(require_utc(flight, vehicle).unix_us(start))
+        starts.append(start)
+    return min(starts, default=0)
+
+
+def _start_of_vehicle(flight: Flight, addresses: Sequence[Address]) -> int:
+    number, _ = flight._find(addresses[0])
+    reader = flight._readers[number]
+    if reader.start:
+        return reader.start
+    firsts, ages = list[int](), list[npt.NDArray[np.float64]]()
+    for address in addresses:
+        _, own = flight._find(address)
+        columns = flight._columns[number][own]
+        if columns.times:
+            stamps = columns.decode(reader.definitions[own]).messages["timestamp"]
+            firsts.append(min(columns.times))
+            ages.append(np.array(columns.times, float) - stamps.astype(float))
+    return max(0, min(firsts) - round(np.median(np.concatenate(ages)))) if ages else 0
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:

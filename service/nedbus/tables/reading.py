@@ -8,25 +8,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
 
-import numpy as np
-
 from nedbus.errors import AddressError, SourceError
-from nedbus.flights import (
-    ReadOptions,
-    distinct_names,
-    matching,
-    no_utc,
-    renamed,
-    require_files,
-    require_one_vehicle,
-    single_match,
-)
+from nedbus.flights import Flight, ReadOptions, matching, require_one_vehicle, single_match
 from nedbus.log_event import about
-from nedbus.timeline import UtcOffset, provides_utc
+from nedbus.timeline import provides_utc
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name
 from nedbus_msgs.arrays import MessageArray
 
-from .arrays import Absent, FlightArrays, Library, Pandas, Polars, Streams, to_dataframe
+from .arrays import (
+    Library,
+    Pandas,
+    Polars,
+    Streams,
+    array_of,
+    array_warnings,
+    open_arrays,
+    path_of,
+    to_dataframe,
+    vehicles_of,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -94,11 +94,15 @@ def read(
 
 
 class ReadStreams(NamedTuple):
-    """Streams by name; `start`: when recording began [us], 0 if unknown; `utc`: of the vehicle, if requested."""
+    """Streams by name, and their addresses in the flight from which they were read.
+
+    `unix_times`: their timestamps are Unix times, because they are from several files.
+    """
 
     streams: Streams
-    start: int
-    utc: UtcOffset | None
+    flight: Flight
+    addresses: list[Address]
+    unix_times: bool
 
 
 def read_streams(
@@ -112,129 +116,86 @@ def read_streams(
 ) -> ReadStreams:
     """Return the streams of one vehicle or several files.
 
-    `topics`: None selects the streams of all topics known to nedbus. `utc`: also find the UTC of a single file.
+    `topics`: None selects the streams of all topics known to nedbus. `utc`: also read what provides UTC.
     """
     names, vehicle = [topics] if isinstance(topics, str) else topics, vehicle_name(vehicle)
+    is_one_file = isinstance(path, FlightPath)
     if isinstance(path, FlightPath):
         select = single_match if isinstance(topics, str) else matching
         selections = [_selection(name, vehicle, instance) for name in names or [ANY]]
-        return _read_one(Path(path).expanduser(), _topics(names), selections, select, layout=layout, utc=utc)
-    paths = require_files([Path(each).expanduser() for each in path])
-    return _read_several(paths, names, vehicle, layout)
+        options = _options(names, layout, utc=utc)
+        flight, chosen = _choose_in_one(Path(path).expanduser(), options, selections, select)
+    else:
+        flight, chosen = _choose_in_several([Path(each).expanduser() for each in path], names, vehicle, layout)
+    streams = Streams()
+    for address in chosen:
+        name = address.stream if is_one_file else f"{address.vehicle}/{address.stream}"
+        streams[name] = array_of(flight, address, unix_times=not is_one_file)
+    for file, text in array_warnings(flight):
+        _log.warning("%s: %s", file, text, extra=about("damaged", source=str(file), reason=text))
+    return ReadStreams(streams, flight, chosen, unix_times=not is_one_file)
 
 
-class FlightSet:
-    """Files whose vehicles have distinct names; with `unix_times`, their timestamps become Unix times [us].
-
-    `vehicles`: the file of each vehicle, by its name in the set, and its name in the file.
-    `addresses`: with the names in the set.
-    """
-
-    def __init__(self, flights: Sequence[FlightArrays], *, unix_times: bool) -> None:
-        self._flights, self._unix_times = flights, unix_times
-        names = distinct_names([(each.path, {one.vehicle for one in each.addresses}) for each in flights])
-        self.vehicles: dict[str, tuple[FlightArrays, str]] = {}
-        self.addresses: list[Address] = []
-        for flight, known in zip(flights, names, strict=True):
-            self.vehicles |= {name: (flight, own) for own, name in known.items()}
-            self.addresses += [renamed(each, known) for each in flight.addresses]
-
-    def read(self, address: Address) -> tuple[MessageArray, Absent]:
-        """Return what `FlightArrays.read` does; raise SourceError if Unix times are required, but UTC is unknown."""
-        flight, own = self.vehicles[address.vehicle]
-        messages, absent = flight.read(renamed(address, {address.vehicle: own}))
-        if self._unix_times:
-            messages["timestamp"] = self.utc(address.vehicle).unix_us(messages["timestamp"].astype(np.int64))
-        return messages, absent
-
-    def utc(self, vehicle: str) -> UtcOffset:
-        """Return the UTC offset of a vehicle; raise SourceError if it is unknown."""
-        flight, own = self.vehicles[vehicle]
-        if isinstance(utc := flight.utc(own), str):
-            raise no_utc(flight.path, utc)
-        return utc
-
-    @property
-    def warnings(self) -> list[str]:
-        """Damage found and messages skipped so far."""
-        return [f"{each.path}: {warning}" for each in self._flights for warning in each.warnings]
-
-    @property
-    def damaged(self) -> bool:
-        """True if messages are lost to damage."""
-        return any(each.damaged for each in self._flights)
-
-
-class Positions(FlightSet):
-    """The streams of positions of one or more files, for a plot; those of several files have Unix times.
+def read_positions(paths: Sequence[Path], selection: Selection) -> tuple[Flight, list[Address]]:
+    """Read the positions of one or more files for a plot; return the addresses that a selection chooses.
 
     Raises the errors of `read`.
     """
-
-    def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
-        topics, is_single = DEFAULT.topics.keys(), len(paths) == 1
-        options = ReadOptions(topics if is_single else topics | _UTC_TOPICS)
-        selects = Selection(selection.topics, instance=selection.instance).matches  # the set may rename a vehicle
-        super().__init__(
-            [FlightArrays(path, options, selects) for path in require_files(paths)], unix_times=not is_single
-        )
-        found = matching(paths[0], sorted(self.addresses), selection)
-        self.addresses = [address for address in found if address.topic in topics]
+    topics = DEFAULT.topics.keys()
+    options = ReadOptions(topics if len(paths) == 1 else topics | _UTC_TOPICS)
+    selects = Selection(selection.topics, instance=selection.instance).matches  # a vehicle may have another name here
+    flight = open_arrays(paths, options, selects)
+    found = matching(paths[0], flight.addresses, selection)
+    return flight, [address for address in found if address.topic in topics]
 
 
-def _read_one(
-    path: Path,
-    topics: Set[str] | None,
-    selections: Sequence[Selection],
-    select: _Select,
-    *,
-    layout: str | None,
-    utc: bool,
-) -> ReadStreams:
-    options = ReadOptions(topics if topics is None or not utc else topics | _UTC_TOPICS, layout=layout)
+def _options(names: Sequence[str] | None, layout: str | None, *, utc: bool) -> ReadOptions:
+    topics = _topics(names)
+    if utc and topics is not None:
+        topics = topics | _UTC_TOPICS
+    return ReadOptions(topics, layout=layout)
+
+
+def _choose_in_one(
+    path: Path, options: ReadOptions, selections: Sequence[Selection], select: _Select
+) -> tuple[Flight, list[Address]]:
+    """Read a file; return the addresses of one vehicle that are selected."""
     try:
-        flight = FlightArrays(path, options, lambda each: any(one.matches(each) for one in selections))
+        flight = open_arrays([path], options, lambda address: any(one.matches(address) for one in selections))
         chosen = dict.fromkeys(each for one in selections for each in select(path, flight.addresses, one))
     except (AddressError, SourceError) as exc:
         raise _explain_absent(path, options, selections, select) or exc from None
     require_one_vehicle(path, chosen, selections[0].vehicles[0])
-    streams = {address.stream: flight.read(address) for address in chosen}
-    _log_warnings(flight)
-    found = flight.utc(next(iter(chosen)).vehicle) if utc else None
-    return ReadStreams(streams, flight.start, found if isinstance(found, UtcOffset) else None)
+    return flight, [*chosen]
 
 
-def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: str, layout: str | None) -> ReadStreams:
-    """Return the messages of several files by vehicle and stream, with Unix times."""
+def _choose_in_several(
+    paths: Sequence[Path], topics: Sequence[str] | None, vehicle: str, layout: str | None
+) -> tuple[Flight, list[Address]]:
+    """Read several files; return the selected addresses, vehicle by vehicle."""
     wanted = _topics(topics)
     for topic in wanted or ():
         Selection(topic)  # raises AddressError for a name that no topic can have
-    options = ReadOptions(wanted if wanted is None else wanted | _UTC_TOPICS, layout=layout)
-    flights = [_open_for_merge(path, options, wanted) for path in paths]
-    found, streams, starts = FlightSet(flights, unix_times=True), Streams(), list[int]()
-    if vehicle not in (ANY, *found.vehicles):
-        raise AddressError("vehicle", vehicle, f"one of {', '.join(sorted(found.vehicles))}")
-    for name, (flight, _) in found.vehicles.items():
-        others = found.vehicles.keys() - {name}
-        chosen = [each.removeprefix(f"{name}/") for each in topics or [ANY] if each.partition("/")[0] not in others]
-        if vehicle not in (ANY, name) or not chosen:
-            continue
-        available = [each for each in found.addresses if each.vehicle == name and (not wanted or each.topic in wanted)]
-        selections = [_selection(each, name, None) for each in chosen]
-        for address in dict.fromkeys(each for one in selections for each in matching(flight.path, available, one)):
-            streams[f"{name}/{address.stream}"] = found.read(address)
-        starts.append(int(found.utc(name).unix_us(flight.start)) if flight.start else 0)
-    for flight in flights:
-        _log_warnings(flight)
-    return ReadStreams(streams, min(starts, default=0), None)
-
-
-def _open_for_merge(path: Path, options: ReadOptions, wanted: Set[str] | None) -> FlightArrays:
+    options = _options(topics, layout, utc=True)
     try:
-        return FlightArrays(path, options, lambda each: wanted is None or each.topic in wanted)
+        flight = open_arrays(paths, options, lambda address: wanted is None or address.topic in wanted)
     except SourceError as exc:
         selections = [Selection(topic) for topic in sorted(wanted or ())]
-        raise _explain_absent(path, options, selections, matching) or exc from None
+        raise _explain_absent(Path(exc.source), options, selections, matching) or exc from None
+    vehicles = vehicles_of(flight)
+    if vehicle not in (ANY, *vehicles):
+        raise AddressError("vehicle", vehicle, f"one of {', '.join(sorted(vehicles))}")
+    chosen: list[Address] = []
+    for name in vehicles:
+        others = {*vehicles} - {name}
+        own = [each.removeprefix(f"{name}/") for each in topics or [ANY] if each.partition("/")[0] not in others]
+        if vehicle not in (ANY, name) or not own:
+            continue
+        available = [each for each in flight.addresses if each.vehicle == name and (not wanted or each.topic in wanted)]
+        selections = [_selection(each, name, None) for each in own]
+        path = path_of(flight, name)
+        chosen += dict.fromkeys(each for one in selections for each in matching(path, available, one))
+    return flight, chosen
 
 
 def _explain_absent(
@@ -243,19 +204,13 @@ def _explain_absent(
     """Return an error with the streams of a file if it lacks a selected one; None if that was not the fault."""
     if options.topics is None or TOPICS.keys() <= {*options.topics}:
         return None
-    known = FlightArrays(path, replace(options, topics={*options.topics, *TOPICS}), lambda _: False).addresses
+    flight = open_arrays([path], replace(options, topics={*options.topics, *TOPICS}), lambda _: False)
     for one in selections:
         try:
-            select(path, known, one)
+            select(path, flight.addresses, one)
         except AddressError as exc:
             return exc
     return None
-
-
-def _log_warnings(flight: FlightArrays) -> None:
-    for warning in flight.warnings:
-        extra = about("damaged", source=str(flight.path), reason=warning)
-        _log.warning("%s: %s", flight.path, warning, extra=extra)
 
 
 def _selection(name: str, vehicle: str, instance: int | None) -> Selection:

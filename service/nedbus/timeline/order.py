@@ -273,11 +273,13 @@ class Order(Generic[M]):
     `start_of`: returns when the recording of a vehicle began, on its clock [us], 0 if unknown.
     `has_log_times`: False for a log that has only timestamps: its order is that of the file.
 
+    `whole`: the axis of all messages of the file, if these are only some of them: their axis begins with that one.
     `axis`: the places of the vehicles' clocks. `unordered`: messages whose timestamps are out of order, by address.
     """
 
     def __init__(self, start_of: Callable[[str], int] = _unknown, *, has_log_times: bool = True) -> None:
         self.axis = Axis()
+        self.whole: Axis | None = None
         self.unordered: Counter[Address] = Counter()
         self._start_of, self._has_log_times = start_of, has_log_times
         self._zero: int | None = None
@@ -294,6 +296,11 @@ class Order(Generic[M]):
             if track.changes:
                 found.append(f"the clock of vehicle {name} was set ({track.changes}); the order of the file decides")
         return found
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first message to the last one so far."""
+        return 0.0 if self._place_of_last is None else (self._place_of_last - self.axis.zero) / 1e6
 
     def arrange(self, messages: Iterable[M]) -> Iterator[M]:
         """Yield the messages in order, each with `at`, which does not decrease."""
@@ -385,11 +392,22 @@ class Order(Generic[M]):
                 self._anchors[0].append(first.number)
                 self._anchors[1].append(0)
         if self._zero is None and firsts:
-            self._zero = self.axis.zero = min(track.base + track.newest for track in self._tracks.values())
+            self._zero = self.axis.zero = self._find_zero()
         placed: _Placed[M] = []
         for item in opening:
             placed += self._tracks[item.message.address.vehicle].add(item)
         return placed
+
+    def _find_zero(self) -> int:
+        """Return the place of the first message, or where the axis of all messages of the file begins."""
+        tracks = sorted(self._tracks.items(), key=lambda each: each[1].base + each[1].newest)
+        if self.whole is not None:
+            for name, track in tracks:
+                seconds = self.whole.seconds_of(name, track.newest)
+                if seconds is not None:
+                    return track.base + track.newest - round(seconds * 1e6)
+        _, first = tracks[0]
+        return first.base + first.newest
 
     def _offset_at(self, number: int) -> int:
         numbers, offsets = self._anchors

@@ -14,7 +14,7 @@ from bokeh.models.widgets import Select, Slider, Toggle
 from nedbus.client import RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import EventLog, Times, state_at
-from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, MergedFlights, follow, times_of
+from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, follow_flight, open_messages, times_of
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
@@ -48,7 +48,7 @@ class Recording:
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
-        self._flights = MergedFlights(paths, EVENT_OPTIONS)
+        self._flight = open_messages(paths, EVENT_OPTIONS)
         self.indices: dict[Address, list[int]] = {}  # in `entries`, by stream
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
@@ -58,10 +58,10 @@ class Recording:
         return self.dues[-1] if self.dues else 0.0
 
     def _read(self) -> None:
-        flights, event_log = self._flights, self.timeline.event_log
+        flight, event_log = self._flight, self.timeline.event_log
         try:
-            self.timeline.times = times_of(flights)
-            for message, reason, payload in follow(flights.messages(), event_log, ended=flights.ended):
+            self.timeline.times = times_of(flight)
+            for message, reason, payload in follow_flight(flight, event_log):
                 address, stamp = message.address, message.timestamp or 0
                 entry: bytes | str | int = stamp if reason is None else reason
                 if payload is not None and (is_position(address) or address.topic in _STATUS_TOPICS):
@@ -74,7 +74,7 @@ class Recording:
                 self.indices.setdefault(address, []).append(len(self.entries))
                 self.entries.append((address, entry))
                 self.dues.append(message.at)
-            for warning in flights.warnings:
+            for warning in flight.warnings:
                 _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=self.name, reason=str(exc)))

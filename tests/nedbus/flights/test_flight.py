@@ -13,10 +13,11 @@ from hypothesis import example, given, strategies as st
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ClosedError
 from nedbus.events import EventLog
-from nedbus.flights import follow, merge, read_file_events
+from nedbus.flights import flight as flight_module, follow, read_file_events
 from nedbus.samples import SourceMessage
 from nedbus.timeline import Order
-from tests.flights.ulogs import write_log
+from nedbus_msgs import VehicleLocalPosition
+from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
 
 BOOT: Final = 1_700_000_000_000_000
@@ -44,6 +45,33 @@ def test_start_and_end_count_pauses(tmp_path: Path) -> None:
         assert flight.duration == pytest.approx(609.9)
 
 
+def two_topics(path: Path, begin: int) -> Path:
+    """Write 20 s of one topic at 10 Hz, and the last 12 s of them of another one."""
+    writer = UlogWriter()
+    writer.define(["vehicle_local_position", "external_ins_local_position"])
+    for number, stamp in enumerate(steps(begin, 200)):
+        message = VehicleLocalPosition.model_validate({"timestamp": stamp})
+        writer.add("vehicle_local_position", message)
+        if number >= 80:
+            writer.add("external_ins_local_position", message)
+    return writer.write(path)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_start_and_end_mean_the_same_for_every_topic(tmp_path: Path, *, several: bool) -> None:
+    """The axis begins with the first message of the files, also for a topic that begins later."""
+    path = two_topics(tmp_path / "a.ulg", BOOT)
+    files = [path, two_topics(tmp_path / "b.ulg", BOOT + 1_000_000)] if several else path
+    begin = datetime.fromtimestamp(BOOT / 1e6 + 10, UTC)
+    with nedbus.open(files) as flight:
+        for topic in ("vehicle_local_position", "external_ins_local_position"):
+            for start in (10.0, begin):
+                samples = list(flight(topic, start=start, end=12.0))
+                assert samples[0].message.timestamp == BOOT + 10_000_000
+                assert samples[-1].message.timestamp == BOOT + 12_000_000
+                assert len(samples) == (42 if several else 21)
+
+
 @pytest.mark.parametrize("option", ["start", "end"])
 def test_datetime_without_a_time_zone_is_an_error(tmp_path: Path, option: str) -> None:
     """A naive datetime would mean another period in Tokyo than in London; the error shows the remedy."""
@@ -62,13 +90,13 @@ def test_utc_in_a_flight_without_utc_is_an_error(tmp_path: Path) -> None:
 def test_file_is_opened_twice_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Duration, UTC and warnings come from one pass, the samples from another one."""
     opened: list[Path] = []
-    real = merge.open_reader
+    real = flight_module.open_reader
 
-    def count(path: Path, options: merge.ReadOptions) -> object:
+    def count(path: Path, options: flight_module.ReadOptions) -> object:
         opened.append(path)
         return real(path, options)
 
-    monkeypatch.setattr(merge, "open_reader", count)
+    monkeypatch.setattr(flight_module, "open_reader", count)
     path = paused(tmp_path / "a.ulg")
     with nedbus.open(path) as flight:
         assert flight.utc is not None

@@ -14,7 +14,7 @@ import pytest
 import nedbus
 from nedbus.errors import SourceError
 from nedbus.flights import read_file_events
-from nedbus.tables import Positions
+from nedbus.tables import array_of, read_positions
 from nedbus.web.playback import Recording
 from nedbus_msgs import Selection
 from tests.flights.messages import VALID, VLP, message
@@ -92,9 +92,9 @@ def test_files_of_one_name_have_distinct_vehicles(tmp_path: Path) -> None:
 
 def test_plot_of_one_vehicle_among_several_files(swarm: list[str], tmp_path: Path) -> None:
     """A vehicle that several files have is plotted by the name that the warnings and `read` give it."""
-    positions = Positions([Path(path) for path in swarm], Selection(VLP, vehicle="b"))
-    assert [str(address) for address in positions.addresses] == [f"b/{VLP}"]
-    (messages, _) = positions.read(positions.addresses[0])
+    flight, addresses = read_positions([Path(path) for path in swarm], Selection(VLP, vehicle="b"))
+    assert [str(address) for address in addresses] == [f"b/{VLP}"]
+    (messages, _) = array_of(flight, addresses[0], unix_times=True)
     assert messages["timestamp"][0] == EPOCH + 60_000_000
     shown = run_command("plot", *swarm, "-v", "b", "-o", str(tmp_path / "b.png"))
     assert shown.exit_code == 0, shown.err

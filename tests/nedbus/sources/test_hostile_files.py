@@ -34,8 +34,8 @@ for module in ("nedbus.flights.readers.mcap", "nedbus.flights.writer"):
     __import__(module)
 
 def convert():
-    with nedbus.flights.MergedFlights([path], nedbus.flights.ReadOptions(topics=None)) as flights:
-        nedbus.flights.convert(flights.messages(), path.with_name("converted.mcap"), on_progress=lambda _: None)
+    with nedbus.flights.open_messages([path], nedbus.flights.ReadOptions(topics=None)) as flight:
+        nedbus.flights.convert_flight(flight, path.with_name("converted.mcap"), on_progress=lambda *_: None)
 
 def play():
     recording = nedbus.web.playback.Recording(path)

@@ -29,23 +29,18 @@ def convert(
 
     Validates every message, and converts the topics of all built-in messages unless --topics selects others.
     """
-    write_recording = flights.convert  # raises ConfigError without the extra, before the files are read
+    write_recording = flights.convert_flight  # raises ConfigError without the extra, before the files are read
     names = flights.parse_topics(topics or "")
     if vehicle is not None:
         check_vehicle(vehicle)
     options = flights.ReadOptions(flights.topics_of(names), vehicle)
-    with flights.MergedFlights(sources, options) as merged, show_progress() as show:
-        readers = [each.reader for each in merged.files]
-        total = sum(each.total for each in readers)
-        on_progress = lambda _: show(f"{output}", sum(each.position for each in readers), total)  # noqa: E731
-        report = write_recording(
-            merged.messages(), output, boot_utc=merged.boot_utc, starts=merged.starts, on_progress=on_progress
-        )
-        absent = flights.absent_topics(names, {address.topic for address in merged.definitions}, "this file")
-    for warning in (*merged.warnings, *(f"{sources[0]}: {text}" for text in absent)):
+    with flights.open_messages(sources, options) as flight, show_progress() as show:
+        report = write_recording(flight, output, on_progress=lambda done, total: show(f"{output}", done, total))
+        absent = flights.absent_topics(names, {address.topic for address in flight.definitions}, "this file")
+    for warning in (*flight.warnings, *(f"{sources[0]}: {text}" for text in absent)):
         write_stderr(warning)
     write_stderr(f"{output}: {report}")
-    _require_undamaged(merged.damaged, sources, "converted")
+    _require_undamaged(flight.damaged, sources, "converted")
 
 
 @command
@@ -63,13 +58,16 @@ def plot(
     if topic not in (ANY, *DEFAULT.topics):
         table = f'nedbus.read("{sources[0]}", "{topic}", dataframe="pandas")'
         raise ConfigError("--topic", f"{topic} has no track; plot {' or '.join(DEFAULT.topics)}, or read it: {table}")
-    positions = tables.Positions(sources, selection)
-    selected = positions.addresses
+    flight, selected = tables.read_positions(sources, selection)
     if len(selected) > limit:
         write_stderr(f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i")
-    streams = [(address, messages) for address in selected[:limit] if len(messages := positions.read(address)[0])]
-    for warning in positions.warnings:
-        write_stderr(warning)
+    streams = []
+    for address in selected[:limit]:
+        messages, _ = tables.array_of(flight, address, unix_times=len(sources) > 1)
+        if len(messages):
+            streams.append((address, messages))
+    for path, text in tables.array_warnings(flight):
+        write_stderr(f"{path}: {text}")
     if not streams:
         raise SourceError(name, "nothing to plot: the selected streams have no valid message")
     target = output or sources[0].with_suffix(".png")
@@ -78,7 +76,7 @@ def plot(
     events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.event_log.events_since(0)[0]]
     draw(streams, target, title=", ".join(each.name for each in sources), events=events, times=read.times)
     write(str(target))
-    _require_undamaged(positions.damaged, sources, "plotted")
+    _require_undamaged(flight.damaged, sources, "plotted")
 
 
 def _require_undamaged(is_damaged: bool, sources: list[Path], what: str) -> None:

@@ -1,18 +1,21 @@
 """The protocol of flight files: one reader per format yields records, each with its stream and log time."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import groupby, islice
+from itertools import chain, groupby, islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol, Self
 
 from nedbus.errors import ConfigError
 from nedbus.samples import RecordStream, SourceMessage
+from nedbus.timeline import Axis, Order
+from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import TOPICS, Address, Definition
 
 _PART: Final = 256  # records from which runs are formed
+_LOOKAHEAD: Final = 1000  # messages that show the first streams of a file and the start of its clocks
 
 
 class FileStream(RecordStream, Protocol):
@@ -77,13 +80,14 @@ class ReadOptions:
 
 
 class FlightReader(ABC):
-    """One pass over a file, with memory independent of its size.
+    """One pass over a file, with memory independent of its size: its messages in order, or its records.
 
     `definitions`: the streams so far; those of an indexed file at once. `start`: when recording began, on the clock
     of the timestamps [us], 0 if unknown; `starts`: the same for each vehicle that has its own.
     `boot_utc`: Unix time of the boot [us], 0 if unknown.
     `position`, `total`: bytes read so far, and of the file. `damaged`: True if messages were lost so far.
     `kind`: the format, which becomes `sample.source`. `has_log_times`: False if messages have only timestamps.
+    `order`: places the messages on the axis. `ahead`: the first messages, once `begin` has read them.
     """
 
     kind = ""
@@ -95,6 +99,10 @@ class FlightReader(ABC):
         self.starts: dict[str, int] = {}
         self.start = self.boot_utc = self.position = self.total = 0
         self.damaged, self._dropout = False, 0.0  # s lost by the logger before the next message
+        self.order = Order[SourceMessage](self.start_of, has_log_times=self.has_log_times)
+        self.ahead: list[SourceMessage] = []
+        self._messages: Iterator[SourceMessage] = iter(())
+        self._is_begun = False
         self._vehicles: set[str] = set()
         self._resources: list[Any] = []  # open files
 
@@ -115,9 +123,38 @@ class FlightReader(ABC):
                 _, payloads, times, _ = zip(*own, strict=True)
                 yield Run(stream, list(payloads), [time for time in times if time is not None])
 
+    @property
+    def remarks(self) -> list[str]:
+        """What is unusual about the times of the messages so far."""
+        found = []
+        for address, count in self.order.unordered.items():
+            if address.topic != LOG_MESSAGE.name and count:  # PX4 queues log messages
+                found.append(f"timestamps of {address} are out of order ({count})")
+        return found + self.order.remarks
+
+    def begin(self, *, watch: Callable[[Iterator[Record]], Iterator[Record]] = iter, whole: Axis | None = None) -> None:
+        """Read the first messages; raise SourceError, with the file closed, if there are none of these topics.
+
+        `watch`: passes on the records, for another use of them. `whole`: the axis of all topics of the file.
+        """
+        self.order.whole = whole
+        messages = self.order.arrange(map(self.message_of, watch(self.records())))
+        try:
+            self.ahead = list(islice(messages, _LOOKAHEAD))
+        except BaseException:
+            self.close()
+            raise
+        self._messages = chain(self.ahead, messages)
+        self._is_begun = True
+
     def messages(self) -> Iterator[SourceMessage]:
-        """Yield the messages in file order, once; raise SourceError if there are none of these topics."""
-        return map(self.message_of, self.records())
+        """Return the iterator over the messages in order, each with its time on the axis of the file.
+
+        Raises SourceError if there are none of these topics.
+        """
+        if not self._is_begun:
+            self.begin()
+        return self._messages
 
     def message_of(self, record: Record) -> SourceMessage:
         """Return a record as a message, which is decoded when it is used."""
