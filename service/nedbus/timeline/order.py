@@ -134,8 +134,9 @@ class _Track(Generic[M]):
         if not agrees and self._goes_on_like_doubtful(item):
             return None  # the new clock has reached the time of the old one
         if agrees or -_NEAR <= distance <= _NEAR:
-            if is_back and log is None:
+            if before is not None and is_back and log is None:
                 self.unordered[item.message.address] += 1
+                return self.base + before  # a log keeps the order of each stream, in which the vehicle wrote it
             self._follow(item)
             return self.base + stamp
         is_batched = before is not None and before < stamp <= min(before + _MAX_LATE, self.newest)
@@ -185,14 +186,21 @@ class _Track(Generic[M]):
         found: _Placed[M] = []
         for item in items:
             before = self.last.get(item.stream)
-            if before is not None and before != item.stamp:
-                self.unordered[item.message.address] += item.log is None or abs(item.stamp - before) > _MAX_LATE
+            is_same_clock = is_unix_time(item.stamp) == self.is_unix
+            is_next = before is None or before < item.stamp
+            is_old = is_next and is_same_clock and item.stamp < newest  # a stream may begin with old messages
             is_late = False
             if item.log is not None and self.lag is not None and before != item.stamp:
                 is_late = item.stamp < newest and item.log - item.stamp - self.lag <= _MAX_LATE
+            if before is not None and before != item.stamp and not is_old:
+                self.unordered[item.message.address] += item.log is None or abs(item.stamp - before) > _MAX_LATE
+            if item.log is None and before is not None and item.stamp < before:
+                found.append((self.base + before, item))  # a log keeps the order of each stream
+                continue
             if not is_late and item.stamp <= newest:
                 self.last[item.stream] = item.stamp
-            found.append((self.base + (item.stamp if is_late else newest), item))
+            place = item.stamp if is_late or is_old else newest
+            found.append((self.base + place, item))
         return found
 
     def _has_gone_on(self) -> bool:
