@@ -47,14 +47,14 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
 quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
-	$(BIN)/pytest -q -n 2 -m "quick or not (slow or router or process or compose)"
+	$(BIN)/pytest -q -n 2 -m "quick or not (slow or router or process or compose)" --junitxml=build/tests.xml
 
 test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two idle cores
 
 behaviour: $(DEV)
 	$(BIN)/pytest -q -n 6 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
 
-slow: $(DEV)  ## run the slow tests, and the property tests with four times as many examples
+slow: $(DEV)  ## run the slow tests, and the property tests with three times as many examples
 	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not compose" --hypothesis-profile=all --junitxml=build/slow-tests.xml
 
 test-all: SECONDS = 60

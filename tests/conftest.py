@@ -26,7 +26,7 @@ from .sync_adapter import sync_adapter
 hypothesis.settings.register_profile(
     "nedbus", max_examples=25, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
-hypothesis.settings.register_profile("all", hypothesis.settings.get_profile("nedbus"), max_examples=100)
+hypothesis.settings.register_profile("all", hypothesis.settings.get_profile("nedbus"), max_examples=75)
 hypothesis.settings.load_profile("nedbus")
 
 
