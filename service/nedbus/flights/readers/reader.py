@@ -99,7 +99,7 @@ class FlightReader(ABC):
         self.starts: dict[str, int] = {}
         self.start = self.boot_utc = self.position = self.total = 0
         self.damaged, self._dropout = False, 0.0  # s lost by the logger before the next message
-        self.order = Order[SourceMessage](self.start_of, has_log_times=self.has_log_times)
+        self.order = Order[SourceMessage]()
         self.ahead: list[SourceMessage] = []
         self._messages: Iterator[SourceMessage] = iter(())
         self._is_begun = False
@@ -137,6 +137,8 @@ class FlightReader(ABC):
 
         `watch`: passes on the records, for another use of them. `whole`: the axis of all topics of the file.
         """
+        # Not in the constructor: a reader of records alone is freed at once, because nothing refers back to it.
+        self.order = Order[SourceMessage](self.start_of, has_log_times=self.has_log_times)
         self.order.whole = whole
         messages = self.order.arrange(map(self.message_of, watch(self.records())))
         try:
@@ -179,7 +181,8 @@ class FlightReader(ABC):
         return self.starts.get(vehicle, self.start)
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
+        """Close the file, and discard the messages that were read ahead; a second call does nothing."""
+        self._messages = iter(())
         for each in self._resources:
             each.close()
 
