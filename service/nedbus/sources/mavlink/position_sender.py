@@ -5,20 +5,20 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.client import Bus, Sample, Subscription, connect
-from nedbus.errors import NedbusError
-from nedbus.log_event import about
+from nedbus.errors import ClosedError, DecodeError, NedbusError
+from nedbus.log_event import UnexpectedErrors, about
 from nedbus.mavlink import ExternalPosition
 from nedbus.samples import PositionStatus, Rejection
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import TIMINGS
-from nedbus.transport import Tls
-from nedbus_msgs import Address
+from nedbus.transport import KeyReader, RawSample, Session, Tls, open_client
+from nedbus_msgs import BY_TOPIC, Address, codec_of, provenance_of
 
 from .link import Peer
 
@@ -30,21 +30,32 @@ TIMESYNC_TOPIC: Final = "timesync_status"
 
 _CONNECT_TIMEOUT: Final = 0.5  # s
 _DOWNSAMPLED: Final = "rate"  # kind of refusal that is no fault of the publisher
+_MAX_ENCODING: Final = 512  # characters of an encoding; those of nedbus have at most 250
 _SHORT_ID: Final = 8  # characters of the id of a session
 _EVIDENCE_TIMEOUT: Final = 10.0  # s for which an answer of another client to TIMESYNC counts
 
 
 @dataclass(frozen=True, slots=True)
 class BusAccess:
-    """What is needed to subscribe to the bus of a service."""
+    """What is needed to read the bus of a service; `router`: its session if it is a router, else `routers` has one."""
 
+    router: Session | None
     routers: tuple[str, ...]
     tls: Tls | None
     prefix: str
 
-    def open(self) -> Bus:
-        """Connect; raise NedbusError."""
-        return connect(self.routers, timeout=_CONNECT_TIMEOUT, prefix=self.prefix, tls=self.tls)
+    @contextmanager
+    def read(self, address: Address) -> Iterator[KeyReader]:
+        """Receive the messages of an address inside a `with` block; raise NedbusError if no router answers.
+
+        A second session to the own router would double the processor time.
+        """
+        with ExitStack() as opened:
+            session = self.router
+            if session is None:
+                session = open_client(self.routers, timeout=_CONNECT_TIMEOUT, tls=self.tls)
+                opened.callback(session.close)
+            yield opened.enter_context(closing(KeyReader(session, address.key(prefix=self.prefix))))
 
 
 class Target(NamedTuple):
@@ -80,7 +91,10 @@ class PositionSender:
         self._encoder = dialect.MAVLink(None, 0, COMPONENT)
         self._reported = Counter[str]()
         self._answered = -float("inf")  # time of an answer to TIMESYNC by another client
-        self._stop, self._subscription = threading.Event(), cast("Subscription[Any] | None", None)
+        self._decode = codec_of(BY_TOPIC[self._address.topic]).decode
+        self._sender = SenderName(self._address.topic)
+        self._stop, self._reader = threading.Event(), cast("KeyReader | None", None)
+        self._errors = UnexpectedErrors(_log, "%s: unexpected error, left out a position (logged once)", name)
         text = "PX4 stamps them on arrival" if self._clock == "arrival" else "PX4's TIMESYNC is answered"
         extra = about("position", source=name)
         _log.info("%s: positions of %s are sent into the vehicle; %s", name, self._address, text, extra=extra)
@@ -90,8 +104,8 @@ class PositionSender:
     def close(self) -> None:
         """Stop sending."""
         self._stop.set()
-        if self._subscription is not None:
-            self._subscription.close()
+        if (reader := self._reader) is not None:
+            reader.close()
         self._thread.join()
 
     def on_foreign_timesync(self, now: float) -> None:
@@ -131,42 +145,44 @@ class PositionSender:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                with self._access.open() as bus:
-                    self._follow(bus)
-            except NedbusError as exc:  # the router is not up yet, or closed the session
+                with self._access.read(self._address) as self._reader:
+                    self._follow(self._reader)
+            except NedbusError as exc:  # the router is not up yet, or its session was closed
                 _log.debug("%s: no positions: %s", self._name, exc)
                 self._stop.wait(TIMINGS.source_tick)
 
-    def _follow(self, bus: Bus) -> None:
-        """Send what arrives until `close`: of several unread positions, only the newest.
-
-        Without a timeout the samples are received on this thread: no other thread has to hand them over.
-        """
-        topic, vehicle = self._address.topic, self._address.vehicle
-        with bus.subscribe(topic, vehicle=vehicle, mode="latest") as subscription:
-            self._subscription = subscription
-            if self._stop.is_set():  # before `close` could see the subscription
+    def _follow(self, reader: KeyReader) -> None:
+        """Send what arrives until `close`: of several unread positions, only the newest."""
+        before = 0
+        while not self._stop.is_set():
+            try:
+                raw = reader.receive()
+            except ClosedError:
+                self._stop.wait(TIMINGS.source_tick)  # unless this object was closed
                 return
-            for sample in subscription:
-                if not (sample.retained or sample.stored):  # it is older than this subscription
-                    self._handle(sample)
-            self._note_unread(subscription.counts.dropped)
+            with self._errors:
+                self._handle(raw, reader.superseded - before)
+            before = reader.superseded
 
-    def _note_unread(self, count: int) -> None:
+    def _handle(self, raw: RawSample, superseded: int) -> None:
+        now, target = time.monotonic(), self._find_target()
         with self._lock:
-            self._core.left_out["superseded"] += count
-
-    def _handle(self, sample: Sample[Any]) -> None:
-        target = self._find_target()
-        with self._lock:
+            core = self._core
+            if superseded:
+                core.left_out["superseded"] += superseded
             if target.obstacle:
-                self._core.refuse("vehicle", target.obstacle)
+                core.refuse("vehicle", target.obstacle)
                 return
             if target.name == self._address.vehicle:
                 text = f"{self._address} is the vehicle's own name, so its echo would be sent back: publish another one"
-                self._core.refuse("address", text)
+                core.refuse("address", text)
                 return
-            outcome = self._core.add(sample.message, sender_of(sample), time.monotonic())
+            try:
+                position = self._decode(raw.payload.to_bytes())
+            except DecodeError as exc:
+                core.refuse("invalid", f"the message cannot be decoded: {exc}; use the same version of nedbus")
+                return
+            outcome = core.add(position, self._sender.of(raw), now)
         if outcome.message is None:
             return
         self._encoder.srcSystem = target.system
@@ -175,12 +191,26 @@ class PositionSender:
                 self._core.refuse("link", "the link did not accept it: it is too slow, or broken")
 
 
-def sender_of(sample: Sample[Any]) -> str:
-    """Return the publisher of a sample: its source, and the id of its session."""
-    name = sample.source or "a publisher"
-    if sample.stamp is None:
-        return name
-    return f"{name} (session {str(sample.stamp.get_id())[:_SHORT_ID]})"
+class SenderName:
+    """The publisher of samples as text: its source, and the id of its session; described again when it changes."""
+
+    def __init__(self, topic: str) -> None:
+        self._definition = BY_TOPIC[topic]
+        self._session: object = None
+        self._encoding: object = None
+        self._name = ""
+
+    def of(self, raw: RawSample) -> str:
+        """Return the publisher of a sample."""
+        session = None if raw.timestamp is None else raw.timestamp.get_id()
+        encoding = raw.encoding
+        if session != self._session or encoding != self._encoding or not self._name:
+            self._session, self._encoding = session, encoding
+            source = provenance_of(self._definition, str(encoding)[:_MAX_ENCODING]).source
+            self._name = source or "a publisher"
+            if session is not None:
+                self._name += f" (session {str(session)[:_SHORT_ID]})"
+        return self._name
 
 
 def choose_target(vehicles: Mapping[int, tuple[str, Peer]]) -> Target:

@@ -55,13 +55,14 @@ class MavlinkSource:
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
-        self._access = BusAccess(routers, tls, prefix)
+        self._routers, self._tls, self._prefix = routers, tls, prefix
 
-    def listen(self, _: Session | None) -> Iterator[LiveItem]:
+    def listen(self, router: Session | None) -> Iterator[LiveItem]:
         """Receive messages; raise SourceError if the link cannot be opened or fails."""
+        access = BusAccess(router, self._routers, self._tls, self._prefix)
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                with closing(_LinkSession(link, self._options, name=self._link, access=self._access)) as session:
+                with closing(_LinkSession(link, self._options, name=self._link, access=access)) as session:
                     yield from session.run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
