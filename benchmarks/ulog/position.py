@@ -34,11 +34,12 @@ with nedbus.connect(sys.argv[1], timeout=30) as bus:
         publisher.publish({"timestamp": stamp, "timestamp_sample": stamp, **pose})
 print(json.dumps(sent), flush=True)
 """
+POSITION: Final = "&position=mocap/vehicle_visual_odometry"
 HEADER: Final = 4.0  # s
 
 
 class Setup:
-    """A service with a vehicle and a script, inside the ExitStack; `odometry`: arrival on the link, by number."""
+    """A service with a vehicle, until the ExitStack closes; `odometry`: arrival on the link, by number."""
 
     def __init__(self, recording: Recording, options: str, closing: ExitStack) -> None:
         self.port, self.endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
@@ -63,11 +64,8 @@ def measure(seconds: float) -> str:
     """Run both services and return the result."""
     recording = read_recording(FLIGHT)
     with ExitStack() as closing:
-        without = Setup(recording, "", closing)
-        routing = Setup(recording, "", closing)
-        sending = Setup(recording, "&position=mocap/vehicle_visual_odometry", closing)
-        setups = without, routing, sending
-        scripts = [start("-c", SCRIPT, each.endpoint) for each in (routing, sending)]
+        setups = [Setup(recording, options, closing) for options in ("", POSITION)]
+        scripts = [start("-c", SCRIPT, each.endpoint) for each in setups]
         for script in scripts:
             closing.callback(end, script, timeout=2.0)
             expect(script)
@@ -79,17 +77,14 @@ def measure(seconds: float) -> str:
         for script in scripts:
             resume(script)
         published = json.loads(expect(scripts[1]))
-    used = [(late - early) / passed for early, late in zip(before, after, strict=True)]
-    delays = sorted(
-        1e3 * (sending.odometry[number] - at)
-        for number, at in enumerate(published, 1)
-        if number in sending.odometry and at > began
-    )
+    without, sending = [(late - early) / passed for early, late in zip(before, after, strict=True)]
+    arrivals = setups[1].odometry
+    measured = {number: at for number, at in enumerate(published, 1) if at > began}
+    delays = sorted(1e3 * (arrivals[number] - at) for number, at in measured.items() if number in arrivals)
     return (
-        f"CPU of serve: {used[0]:.1%} without a position, {used[1]:.1%} as its router, {used[2]:.1%} sending it:"
-        f" ratios {used[1] / used[0]:.2f}, {used[2] / used[0]:.2f}, {used[2] / used[1]:.2f};\n"
-        f"{len(delays)} ODOMETRY: delay p50 {delays[len(delays) // 2]:.1f} ms, p99 {delays[int(0.99 * len(delays))]:.1f}"
-        f" ms, max {delays[-1]:.1f} ms"
+        f"CPU of serve: {without:.1%} without position=, {sending:.1%} with it, ratio {sending / without:.2f};"
+        f" {len(delays)} of {len(measured)} positions: delay p50 {delays[len(delays) // 2]:.1f} ms,"
+        f" p99 {delays[int(0.99 * len(delays))]:.1f} ms, max {delays[-1]:.1f} ms"
     )
 
 

@@ -1,15 +1,14 @@
 """PositionSender: send positions from the bus into the vehicle on a link, on a thread of its own."""
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, cast
-
-from pymavlink.dialects.v20 import common as dialect
+from typing import Final, NamedTuple, cast
 
 from nedbus.errors import ClosedError, DecodeError, NedbusError
 from nedbus.log_event import UnexpectedErrors, about
@@ -24,13 +23,13 @@ from .link import Peer
 
 _log = logging.getLogger(__name__)
 
-COMPONENT: Final = dialect.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 TIMESYNC_TOPIC: Final = "timesync_status"
 """Topic that PX4 publishes while a client answers its TIMESYNC; nedbus does so only with `position_clock=timesync`."""
 
 _CONNECT_TIMEOUT: Final = 0.5  # s
 _DOWNSAMPLED: Final = "rate"  # kind of refusal that is no fault of the publisher
 _MAX_ENCODING: Final = 512  # characters of an encoding; those of nedbus have at most 250
+_TARGET_INTERVAL: Final = 0.1  # s between two looks for the vehicle, whose address changes after 3 s of silence
 _SHORT_ID: Final = 8  # characters of the id of a session
 _EVIDENCE_TIMEOUT: Final = 10.0  # s for which an answer of another client to TIMESYNC counts
 
@@ -70,8 +69,8 @@ class Target(NamedTuple):
 class PositionSender:
     """Send each position of one address as ODOMETRY to the vehicle on a link, as the component of a VIO.
 
-    `find_target`: returns the vehicle. `send`: sends a message with the ids of an encoder; returns whether the link
-    accepted it. Both are called on this object's thread.
+    `find_target`: returns the vehicle. `send`: sends a frame; returns whether the link accepted it. Both are called on
+    this object's thread.
     """
 
     def __init__(
@@ -81,17 +80,18 @@ class PositionSender:
         access: BusAccess,
         *,
         find_target: Callable[[], Target],
-        send: Callable[[Any, Any, Peer], bool],
+        send: Callable[[bytes, Peer], bool],
     ) -> None:
         self._name, self._access = name, access
         self._address = cast("Address", options.position)
         self._clock = options.position_clock
         self._find_target, self._send = find_target, send
         self._core, self._lock = ExternalPosition(), threading.Lock()
-        self._encoder = dialect.MAVLink(None, 0, COMPONENT)
+        self._sequence = 0  # of MAVLink
         self._reported = Counter[str]()
-        self._answered = -float("inf")  # time of an answer to TIMESYNC by another client
+        self._answered = -math.inf  # time of an answer to TIMESYNC by another client
         self._decode = codec_of(BY_TOPIC[self._address.topic]).decode
+        self._target, self._target_due = Target(), -math.inf
         self._sender = SenderName(self._address.topic)
         self._stop, self._reader = threading.Event(), cast("KeyReader | None", None)
         self._errors = UnexpectedErrors(_log, "%s: unexpected error, left out a position (logged once)", name)
@@ -160,12 +160,18 @@ class PositionSender:
             except ClosedError:
                 self._stop.wait(TIMINGS.source_tick)  # unless this object was closed
                 return
-            with self._errors:
+            try:
                 self._handle(raw, reader.superseded - before)
+            except BaseException as exc:  # a panic of Zenoh is not an Exception
+                if not self._errors.survives(exc):
+                    raise
             before = reader.superseded
 
     def _handle(self, raw: RawSample, superseded: int) -> None:
-        now, target = time.monotonic(), self._find_target()
+        now = time.monotonic()
+        if now >= self._target_due:
+            self._target, self._target_due = self._find_target(), now + _TARGET_INTERVAL
+        target = self._target
         with self._lock:
             core = self._core
             if superseded:
@@ -183,10 +189,11 @@ class PositionSender:
                 core.refuse("invalid", f"the message cannot be decoded: {exc}; use the same version of nedbus")
                 return
             outcome = core.add(position, self._sender.of(raw), now)
-        if outcome.message is None:
+        if outcome.odometry is None:
             return
-        self._encoder.srcSystem = target.system
-        if not self._send(outcome.message, self._encoder, target.peer):
+        frame = outcome.odometry.frame(outcome.time_usec, system=target.system, sequence=self._sequence)
+        self._sequence = (self._sequence + 1) % 256
+        if not self._send(frame, target.peer):
             with self._lock:
                 self._core.refuse("link", "the link did not accept it: it is too slow, or broken")
 

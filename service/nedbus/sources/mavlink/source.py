@@ -262,9 +262,7 @@ class _LinkSession:
         known = [*self._receiver.vehicles.values()]  # changed on another thread
         return choose_target({each.system: (self._name_of(each.system), each.peers.peer) for each in known})
 
-    def _send_position(self, message: Any, encoder: Any, peer: Peer) -> bool:
-        frame = message.pack(encoder)
-        encoder.seq = (encoder.seq + 1) % 256
+    def _send_position(self, frame: bytes, peer: Peer) -> bool:
         try:
             return self._link.send(frame, peer)
         except OSError:  # the link breaks; the thread that reads it reports that
