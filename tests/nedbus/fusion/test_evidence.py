@@ -88,6 +88,22 @@ def test_velocity_alone_is_not_fused_without_its_bit() -> None:
     assert report.causes == ("bit 4 of EKF2_EV_CTRL is not set, or quality 100 is below EKF2_EV_QMIN",)
 
 
+def test_bias_against_gnss_is_named() -> None:
+    """With GNSS, a position that is 8.6 m off is fused with a tiny test ratio: the bias alone shows the offset."""
+    vehicle = Vehicle()
+    vehicle.fly(2.0, ratio=1e-7)
+    assert vehicle.tracker.fusion("1").remarks == ()
+    vehicle.tracker.add("estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (7.0, -5.0, 0.0)})
+    report = vehicle.fly(1.0, ratio=1e-7)[-1]
+    assert report.used
+    assert report.bias == (7.0, -5.0)
+    [remark] = report.remarks
+    assert remark.startswith("with GNSS, EKF2 gives vision a bias of 8.6 m: the estimate follows GNSS")
+    assert "bias against GNSS 7.0 m north, -5.0 m east" in "\n".join(report.lines)
+    vehicle.tracker.add("estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (0.3, -0.2, 0.0)})
+    assert vehicle.fly(1.0)[-1].remarks == ()
+
+
 def test_norm_of_q_within_1e_5_is_right() -> None:
     """A norm of 0.99999 is fused; 0.999 is not, although a validator accepts it."""
     [*_, right] = Vehicle().fly(2.0, q=(0.999995, 0.0, 0.0, 0.0))

@@ -18,6 +18,7 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import TIMINGS
 from nedbus.transport import KeyReader, RawSample, Session, Tls, open_client
 from nedbus_msgs import BY_TOPIC, Address, codec_of, provenance_of
+from nedbus_msgs.messages import TimesyncStatus
 
 from .link import Peer
 
@@ -31,6 +32,10 @@ _DOWNSAMPLED: Final = "rate"  # kind of refusal that is no fault of the publishe
 _MAX_ENCODING: Final = 512  # characters of an encoding; those of nedbus have at most 250
 _TARGET_INTERVAL: Final = 0.1  # s between two looks for the vehicle, whose address changes after 3 s of silence
 _SHORT_ID: Final = 8  # characters of the id of a session
+_FOREIGN_CLOCK: Final = (
+    "another client answers TIMESYNC: if it does so on this link, PX4 stamps positions with its clock; stop it, or give"
+    " the service a link of its own"
+)
 _EVIDENCE_TIMEOUT: Final = 10.0  # s for which an answer of another client to TIMESYNC counts
 
 
@@ -108,9 +113,10 @@ class PositionSender:
             reader.close()
         self._thread.join()
 
-    def on_foreign_timesync(self, now: float) -> None:
-        """Note that another client has answered the vehicle's TIMESYNC."""
-        self._answered = now
+    def on_timesync_status(self, fields: Mapping[str, object], now: float) -> None:
+        """Note that another client has answered the vehicle's TIMESYNC; over DDS, it concerns DDS alone."""
+        if fields.get("source_protocol") != TimesyncStatus.SOURCE_PROTOCOL_DDS:
+            self._answered = now
 
     def status(self) -> PositionStatus:
         """Return what was sent and left out so far."""
@@ -119,7 +125,7 @@ class PositionSender:
             core = self._core
             warnings = list(core.warnings.values())
             if self._clock == "arrival" and time.monotonic() - self._answered < _EVIDENCE_TIMEOUT:
-                warnings.append("another client answers TIMESYNC: on this link, PX4 would use its clock for positions")
+                warnings.append(_FOREIGN_CLOCK)
             is_active = time.monotonic() - core.last_sent < TIMINGS.stale
             return PositionStatus(
                 vehicle=target.name, address=str(self._address), sender=core.sender, sent=core.sent,

@@ -161,7 +161,7 @@ class _LinkSession:
                 yield each
                 continue
             if self._positions is not None and each.address.topic == TIMESYNC_TOPIC:
-                self._positions.on_foreign_timesync(now)
+                self._positions.on_timesync_status(each.fields, now)
             item = vehicle.report(each, log) if vehicle.lost or vehicle.rebooted else each
             if log is not None and not is_measured:
                 is_measured = True
