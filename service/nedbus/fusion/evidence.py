@@ -30,8 +30,11 @@ AID_TOPICS: Final = tuple(f"{_AID}{short}" for short in QUANTITIES.values())
 
 _NAMES: Final = {_ECHO: "position"} | dict(zip(AID_TOPICS, QUANTITIES, strict=True))
 
+VISION_TOPICS: Final = (*AID_TOPICS, _ECHO, _MOCAP)
+"""Topics that a vehicle publishes only while it receives an external position."""
+
 FUSION_TOPICS: Final = (
-    *AID_TOPICS, _ECHO, _MOCAP, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
+    *VISION_TOPICS, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
 )  # fmt: skip
 """Topics that a FusionTracker uses."""
 

@@ -75,14 +75,16 @@ def test_odometry_is_sent_as_published() -> None:
 
 
 @given(
-    st.lists(st.floats(-1000, 1000, width=32), min_size=3, max_size=3), st.integers(0, 255), st.integers(-1, 100),
+    st.fixed_dictionaries({
+        "position": st.lists(st.floats(-1000, 1000, width=32), min_size=3, max_size=3),
+        "reset_counter": st.integers(0, 255),
+        "quality": st.integers(-1, 100),
+    }),
     st.integers(1, 250), st.integers(0, 255), st.integers(0, 2**60),
 )  # fmt: skip
-def test_frame_is_that_of_pymavlink(
-    position: list[float], counter: int, quality: int, system: int, sequence: int, time_usec: int
-) -> None:
+def test_frame_is_that_of_pymavlink(fields: dict[str, Any], system: int, sequence: int, time_usec: int) -> None:
     """The frame is byte for byte the one that pymavlink packs from the same fields, also with zeros at its end."""
-    packed = odometry_of(odometry(position=position, reset_counter=counter, quality=quality))
+    packed = odometry_of(odometry(**fields))
     frame = packed.frame(time_usec, system=system, sequence=sequence)
     encoder = dialect.MAVLink(None, system, 197)
     encoder.seq = sequence
@@ -305,7 +307,7 @@ def test_reset_counter_rises_exactly_with_the_publisher() -> None:
     for index, counter in enumerate(counters):
         used = core if index < 4 else restarted
         position = odometry(index / 50, reset_counter=counter)
-        assert used.add(position, "a", 100 + index / 50).odometry.reset_counter == counter
+        assert sent(used.add(position, "a", 100 + index / 50)).reset_counter == counter
 
 
 def test_reset_counter_that_counts_messages_is_refused() -> None:
