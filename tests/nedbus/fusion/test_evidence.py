@@ -148,6 +148,26 @@ def test_missing_evidence_is_named_and_flags_are_used() -> None:
     assert "logger_topics.txt" in report.missing[0]
 
 
+@pytest.mark.parametrize(("is_valid", "remarks"), [(True, ()), (False, (Cause.NOT_VALID,))])
+def test_validity_is_the_evidence_without_a_log_stream(is_valid: bool, remarks: tuple[str, ...]) -> None:
+    """MAVLink has neither echo nor aid messages: xy_valid, from ESTIMATOR_STATUS, shows that nothing is used."""
+    tracker = FusionTracker()
+    tracker.add("vehicle_local_position", {"timestamp": 5_000_000, "eph": 0.1, "xy_valid": is_valid})
+    assert tracker.fusion("1").remarks == ()
+    report = tracker.fusion("1", PositionStatus(vehicle="1", sent=90, rate=30.0))
+    assert report.remarks == remarks
+    assert set(remarks) <= {*report.lines}
+    assert report.missing
+
+
+@pytest.mark.parametrize(("clock", "is_named"), [("arrival", True), ("timesync", False)])
+def test_measured_age_is_the_delay_to_set(clock: str, is_named: bool) -> None:
+    """While PX4 stamps positions on arrival, the report names their age as the value of EKF2_EV_DELAY."""
+    sent = PositionStatus(vehicle="1", address="mocap/vehicle_odometry", sent=90, rate=30.0, age=0.0124, clock=clock)
+    [line] = [line for line in FusionTracker().fusion("1", sent).lines if line.startswith("sent: ")]
+    assert ("; set EKF2_EV_DELAY to 12 ms, plus the delay of the link" in line) == is_named
+
+
 def test_vehicle_without_vision_has_no_cause() -> None:
     """Without vision nothing is known, and nothing is wrong."""
     tracker = FusionTracker()
