@@ -27,7 +27,9 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_certificate(folder, "router-elsewhere", hosts=["gcs.local", "10.0.0.7"])
     for name, days in (("router-expired", -1), ("router-soon", 10)):
         make_certificate(folder, name, hosts=["127.0.0.1"], days=days)
-    for name in ("vehicle-1", "vehicle-2", "vehicle-99", "vehicle-200", "reader", "operator", "stranger"):
+    for name in ("1", "2", "99", "200", "mocap"):
+        make_certificate(folder, f"vehicle-{name}")
+    for name in ("reader", "operator", "stranger"):
         make_certificate(folder, name)
     make_certificate(folder, "expired", days=-1)
     make_authority(folder / "foreign")

@@ -205,6 +205,7 @@ class Px4LogStream:
     `unsent`: number of STARTs that are accepted without sending data.
     `owner`: ids of the client that initially owns the stream; `is_owner_on_link`: it is on this link.
     `events`: by time in the recording [s]. `on_send`: called with each frame.
+    `on_message`: called with each message of the client.
     `waits`: hold the recording before its START until the client sends one.
     `second_port`: of a client on a second link, which has the telemetry, too. Like PX4, the vehicle sends the stream to
     the client whose START was accepted first, until a STOP arrives on the link of that client.
@@ -236,6 +237,7 @@ class Px4LogStream:
         second_port: int | None = None,
         deadline: float = 100.0,
         on_send: Callable[[bytes], object] = lambda _: None,
+        on_message: Callable[[Any], object] = lambda _: None,
     ) -> None:
         self.commands: list[int] = []
         self.dropped = self.late = self.streams = 0
@@ -245,6 +247,7 @@ class Px4LogStream:
         self._round_trip = round_trip if round_trip is not None else _ROUND_TRIP if speed else 0.0
         self._refusal, self._answers, self._unsent, self._waits = refusal, answers, unsent, waits
         self._events, self._on_send = deque(sorted((events or {}).items())), on_send
+        self._on_message = on_message
         self._triggered: deque[Event] = deque()
         self._ports = [port] if second_port is None else [port, second_port]
         self._streamer: tuple[int, tuple[int, int]] | None = None  # port and ids of the client that has the stream
@@ -336,6 +339,7 @@ class Px4LogStream:
                 data, (_, port) = self._socket.recvfrom(2048)
                 for message in self._mav.parse_buffer(data) or []:
                     if not self._is_gone:
+                        self._on_message(message)
                         self._handle(message, time.monotonic(), port)
 
     def _idle_time(self) -> float:

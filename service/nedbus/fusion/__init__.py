@@ -2,13 +2,14 @@
 
 from .causes import Cause
 from .changes import fusion_changes
-from .evidence import AID_TOPICS, FUSION_TOPICS, QUANTITIES, FusionTracker
+from .evidence import AID_TOPICS, FUSION_TOPICS, QUANTITIES, VISION_TOPICS, FusionTracker
 from .report import Fusion, QuantityFusion
 
 __all__ = [
     "AID_TOPICS",
     "FUSION_TOPICS",
     "QUANTITIES",
+    "VISION_TOPICS",
     "Cause",
     "Fusion",
     "FusionTracker",

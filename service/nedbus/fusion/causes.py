@@ -50,6 +50,7 @@ class Cause:
     JUMP = "the position jumped without a new reset_counter, or is noisier than its variance"
     DELAY = "the velocity is late or in another frame: set EKF2_EV_DELAY to its age, check child_frame_id"
     CLOCK = "EKF2 takes no message: its time is wrong; answer no TIMESYNC, or use one clock, and reboot PX4"
+    NOT_VALID = "the estimate has no valid position (xy_valid): EKF2 does not use what is sent"
     VARIANCES = "the variances are so large that the measurement has no effect: fused, but not used"
 
 

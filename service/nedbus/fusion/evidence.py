@@ -30,8 +30,11 @@ AID_TOPICS: Final = tuple(f"{_AID}{short}" for short in QUANTITIES.values())
 
 _NAMES: Final = {_ECHO: "position"} | dict(zip(AID_TOPICS, QUANTITIES, strict=True))
 
+VISION_TOPICS: Final = (*AID_TOPICS, _ECHO, _MOCAP)
+"""Topics that a vehicle publishes only while it receives an external position."""
+
 FUSION_TOPICS: Final = (
-    *AID_TOPICS, _ECHO, _MOCAP, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
+    *VISION_TOPICS, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
 )  # fmt: skip
 """Topics that a FusionTracker uses."""
 
@@ -57,7 +60,7 @@ _read_echo: Final = FieldReader((
 ))  # fmt: skip
 _FLAG_NAMES: Final = {name: f"cs_ev_{short}" for name, short in QUANTITIES.items()}
 _read_flags: Final = FieldReader(("timestamp", *_FLAG_NAMES.values()))
-_read_estimate: Final = FieldReader(("timestamp", "eph"))
+_read_estimate: Final = FieldReader(("timestamp", "eph", "xy_valid"))
 _read_bias: Final = FieldReader(("timestamp", "bias"))
 _read_primary: Final = FieldReader(("timestamp", "primary_instance"))
 _read_text: Final = FieldReader(("timestamp", "text"))
@@ -98,6 +101,7 @@ class FusionTracker:
         self._flags: dict[str, bool] = {}
         self._has_aids = False
         self._eph = math.nan
+        self._is_valid: bool | None = None  # xy_valid of the estimate
         self._bias = math.nan, math.nan
 
     def add_sample(self, sample: Sample[Any]) -> bool:
@@ -124,7 +128,8 @@ class FusionTracker:
             values = dict(zip(QUANTITIES, _read_flags(message)[1:], strict=True))
             self._flags = {name: bool(value) for name, value in values.items() if value is not None}
         elif topic == _ESTIMATE:
-            self._eph = _number(_read_estimate(message)[1])
+            _, eph, is_valid = _read_estimate(message)
+            self._eph, self._is_valid = _number(eph), bool(is_valid)
         elif topic == _BIAS:
             self._add_bias(message)
         elif topic == SELECTOR:
@@ -232,7 +237,7 @@ class FusionTracker:
         variance = _number(self._echo[6][0]) if echo.is_echoed and self._echo[6] else math.nan
         return Fusion(
             vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias,
-            tuple(self._remarks(states, variance)), tuple(self._missing(echo)),
+            tuple(self._remarks(states, variance, is_sent=sent is not None and sent.rate > 0)), tuple(self._missing(echo)),
         )  # fmt: skip
 
     def diagnosis(self, topic: str) -> str:
@@ -264,8 +269,10 @@ class FusionTracker:
             ahead=self._ahead if is_ahead else 0.0, counts_messages=is_counting, quality=quality,
         )  # fmt: skip
 
-    def _remarks(self, states: Mapping[str, State], variance: float) -> list[str]:
+    def _remarks(self, states: Mapping[str, State], variance: float, *, is_sent: bool) -> list[str]:
         remarks = []
+        if is_sent and states["position"] == "unknown" and self._is_valid is False:
+            remarks.append(Cause.NOT_VALID)
         if states["position"] == "fused" and variance >= USELESS_VARIANCE:
             remarks.append(Cause.VARIANCES)
         bias = math.hypot(*self._bias)

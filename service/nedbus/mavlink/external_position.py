@@ -1,10 +1,10 @@
 """External position: a position from the bus in, ODOMETRY for PX4 out, or why not; no I/O, monotonic time [s]."""
 
 import math
+import struct
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
@@ -43,11 +43,22 @@ _VELOCITY_FRAMES: Final = {
     VehicleOdometry.VELOCITY_FRAME_FRD: dialect.MAV_FRAME_LOCAL_FRD,
     VehicleOdometry.VELOCITY_FRAME_BODY_FRD: dialect.MAV_FRAME_BODY_FRD,
 }
+COMPONENT: Final = dialect.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+"""Component that sends positions."""
+
+_MAGIC: Final = b"\xfd"
+_HEADER: Final = struct.Struct("<BBBBBBHB")  # length, flags, flags, sequence, system, component, id
+_MESSAGE_ID: Final = dialect.MAVLINK_MSG_ID_ODOMETRY % 2**16, dialect.MAVLINK_MSG_ID_ODOMETRY >> 16
+_PAYLOAD: Final[struct.Struct] = dialect.MAVLink_odometry_message.unpacker
+_CRC_EXTRA: Final = bytes([dialect.MAVLink_odometry_message.crc_extra])
+_CHECKSUM: Final = struct.Struct("<H")
 _COVARIANCES: Final = 21  # elements of the upper triangle of a 6x6 matrix
 _DIAGONAL: Final = (0, 6, 11, 15, 18, 20)  # those of the variances
 
 _NAN3: Final = (math.nan,) * 3
 _NAN4: Final = (math.nan,) * 4
+_ZERO3: Final = (0.0,) * 3
+_UNKNOWN3: Final = (UNKNOWN_VARIANCE,) * 3
 
 Position = VehicleOdometry | VehicleLocalPosition
 """Messages that can be sent into a vehicle."""
@@ -68,8 +79,7 @@ class _RefusedError(ValueError):
         self.refusal = Refusal(kind, text)
 
 
-@dataclass(frozen=True, slots=True)
-class Odometry:
+class Odometry(NamedTuple):
     """The fields of ODOMETRY, except for its time; unknown values are NaN."""
 
     frame_id: int
@@ -83,20 +93,28 @@ class Odometry:
     reset_counter: int
     quality: int
 
-    def message(self, time_usec: int) -> Any:
-        """Return ODOMETRY with this time [us]."""
-        return dialect.MAVLink_odometry_message(
-            time_usec, self.frame_id, self.child_frame_id, *self.position, list(self.q), *self.velocity, *self.rates,
-            _covariance(self.pose_variances), _covariance(self.velocity_variances), self.reset_counter,
+    def frame(self, time_usec: int, *, system: int, sequence: int) -> bytes:
+        """Return the MAVLink 2 frame of ODOMETRY with this time [us], from the VIO component of a system.
+
+        It is packed here, because the message object of pymavlink takes three times as long.
+        """
+        payload = _PAYLOAD.pack(
+            time_usec, *self.position, *self.q, *self.velocity, *self.rates, *_covariance(self.pose_variances),
+            *_covariance(self.velocity_variances), self.frame_id, self.child_frame_id, self.reset_counter,
             dialect.MAV_ESTIMATOR_TYPE_VISION, self.quality,
-        )  # fmt: skip
+        ).rstrip(b"\0")  # fmt: skip
+        body = _HEADER.pack(len(payload), 0, 0, sequence, system, COMPONENT, *_MESSAGE_ID) + payload
+        return _MAGIC + body + _CHECKSUM.pack(dialect.x25crc(body + _CRC_EXTRA).crc)
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What becomes of one position: `message` to send, or the `refusal`. `warning`: why PX4 may not use it, or ""."""
+class Outcome(NamedTuple):
+    """What becomes of one position: `odometry` to send with `time_usec`, or the `refusal`.
 
-    message: Any = None
+    `warning`: why PX4 may not use it, or "".
+    """
+
+    odometry: Odometry | None = None
+    time_usec: int = 0
     refusal: Refusal | None = None
     warning: str = ""
 
@@ -146,13 +164,14 @@ class ExternalPosition:
     def add(self, position: Position, sender: str, now: float) -> Outcome:
         """Decide on a position that `sender` published, and that arrived at time `now`."""
         try:
-            message = self._accept(position, sender, now)
+            odometry = self._accept(position, sender, now)
         except _RefusedError as exc:
             return Outcome(refusal=self.refuse(*exc.refusal))
         self.sent += 1
         self._sent_times.append(now)
         self._warn_of_rate()
-        return Outcome(message, warning="; ".join(self.warnings.values()))
+        time_usec = max(0, math.floor(1e6 * (now - self.age)))
+        return Outcome(odometry, time_usec, warning="; ".join(self.warnings.values()))
 
     def refuse(self, kind: str, text: str) -> Refusal:
         """Count a position that is not sent."""
@@ -163,7 +182,7 @@ class ExternalPosition:
             self.left_out["other"] += 1
         return Refusal(kind, text)
 
-    def _accept(self, position: Position, sender: str, now: float) -> Any:
+    def _accept(self, position: Position, sender: str, now: float) -> Odometry:
         self._check_sender(sender, now)
         delay = self._delay_of(position.timestamp, now)
         age = delay + self._sensor_age(position)
@@ -174,7 +193,7 @@ class ExternalPosition:
             raise _RefusedError("age", text)
         self._check_rate(now)
         self.age = age
-        return odometry.message(max(0, math.floor(1e6 * (now - age))))
+        return odometry
 
     def _check_sender(self, sender: str, now: float) -> None:
         if sender != self.sender:
@@ -231,11 +250,7 @@ class ExternalPosition:
             )
             raise _RefusedError("reset_counter", text)
         distance = math.dist(before.position, odometry.position)
-        speed = max(
-            [_MAX_SPEED, *(2 * math.hypot(*each.velocity) for each in (before, odometry) if _known(each.velocity))]
-        )
-        is_known = max(before.pose_variances[0], odometry.pose_variances[0]) < UNKNOWN_VARIANCE
-        if has_changed or not is_known or distance <= _JUMP + speed * (timestamp - then) / 1e6:
+        if has_changed or distance <= _JUMP or not _is_jump(before, odometry, distance, (timestamp - then) / 1e6):
             self.warnings.pop("jump", None)
             return
         self.warnings["jump"] = (
@@ -255,6 +270,17 @@ class ExternalPosition:
             self.warnings["rate"] = (
                 f"{self.rate:.1f} messages per second: PX4 fuses none below {MIN_RATE:.0f}; send 20 to 50"
             )
+
+
+def _is_jump(before: Odometry, odometry: Odometry, distance: float, seconds: float) -> bool:
+    """Return whether a vehicle cannot have moved by this distance [m] between two known positions."""
+    if before.pose_variances[0] >= UNKNOWN_VARIANCE or odometry.pose_variances[0] >= UNKNOWN_VARIANCE:
+        return False
+    speed = _MAX_SPEED
+    for each in (before, odometry):
+        if _known(each.velocity):
+            speed = max(speed, 2 * math.hypot(*each.velocity))
+    return distance > _JUMP + speed * seconds
 
 
 class _Delay:
@@ -307,16 +333,15 @@ def _of_odometry(position: VehicleOdometry) -> Odometry:
     velocity = _vector("velocity", position.velocity)
     child_frame = _VELOCITY_FRAMES.get(position.velocity_frame)
     if child_frame is None:
-        if _known(velocity):
+        if velocity is not _NAN3:
             text = f"velocity_frame is {position.velocity_frame}: set it to 1 (NED), 2 (FRD) or 3 (BODY_FRD)"
             raise _RefusedError("velocity_frame", text)
         child_frame = dialect.MAV_FRAME_BODY_FRD
-    where, variance = (
-        _vector("position", position.position),
-        _variances("position_variance", position.position_variance),
-    )
-    if not _known(where):
-        where, variance = (0.0,) * 3, (UNKNOWN_VARIANCE,) * 3
+    where = _vector("position", position.position)
+    variance = _variances("position_variance", position.position_variance)
+    if where is _NAN3:
+        where = _ZERO3
+        variance = _UNKNOWN3
     rates = position.angular_velocity if _known(position.angular_velocity) else _NAN3
     attitude = _variances("orientation_variance", position.orientation_variance)
     return Odometry(
@@ -351,10 +376,10 @@ def _of_local_position(position: VehicleLocalPosition) -> Odometry:
         position.xy_reset_counter, position.z_reset_counter, position.vxy_reset_counter, position.vz_reset_counter,
         position.heading_reset_counter,
     )  # fmt: skip
-    heading_variance = _variance("heading_var", position.heading_var)
+    heading_variances = _variances("heading_var", [position.heading_var])
     return Odometry(
         dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_LOCAL_NED, where, q, velocity, _NAN3,
-        (*variances, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, heading_variance), velocity_variances,
+        (*variances, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, *heading_variances), velocity_variances,
         sum(counters) % 256, 0,
     )  # fmt: skip
 
@@ -374,12 +399,12 @@ def _valid(
 
 def _vector(name: str, values: Sequence[float]) -> Sequence[float]:
     """Return a vector; all NaN if it is unknown. One NaN makes PX4 drop all three."""
+    if _known(values):
+        return values
     if all(map(math.isnan, values)):
         return _NAN3
-    if not _known(values):
-        text = f"{name} is {list(values)}: PX4 drops all three coordinates; set the unknown one to 0"
-        raise _RefusedError(name, f"{text}, and its variance to {UNKNOWN_VARIANCE:.0e}")
-    return values
+    text = f"{name} is {list(values)}: PX4 drops all three coordinates; set the unknown one to 0"
+    raise _RefusedError(name, f"{text}, and its variance to {UNKNOWN_VARIANCE:.0e}")
 
 
 def _quaternion(q: Sequence[float]) -> Sequence[float]:
@@ -393,16 +418,13 @@ def _quaternion(q: Sequence[float]) -> Sequence[float]:
     return [part / norm for part in q]
 
 
-def _variances(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    return tuple(_variance(name, value) for value in values)
-
-
-def _variance(name: str, value: float) -> float:
-    """Return a variance; NaN and 0 mean that PX4 uses its parameters."""
-    if value < 0 or value > UNKNOWN_VARIANCE:
-        remedy = f"set NaN for PX4's parameters (EKF2_EVP_NOISE...), {UNKNOWN_VARIANCE:.0e} for an unknown quantity"
-        raise _RefusedError("variance", f"{name} is {value:g}: {remedy}")
-    return value
+def _variances(name: str, values: Sequence[float]) -> Sequence[float]:
+    """Return variances unless one is negative or absurd; NaN and 0 mean that PX4 uses its parameters."""
+    for value in values:
+        if value < 0 or value > UNKNOWN_VARIANCE:
+            remedy = f"set NaN for PX4's parameters (EKF2_EVP_NOISE...), {UNKNOWN_VARIANCE:.0e} for an unknown quantity"
+            raise _RefusedError("variance", f"{name} is {value:g}: {remedy}")
+    return values
 
 
 def _square(name: str, deviation: float) -> float:

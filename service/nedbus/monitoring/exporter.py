@@ -12,7 +12,7 @@ from typing import Any, Final
 from prometheus_client.core import Metric
 
 from nedbus import clock
-from nedbus.client import Bus, LogStreamStatus, find_services
+from nedbus.client import Bus, LogStreamStatus, PositionStatus, find_services
 from nedbus.errors import NedbusError
 from nedbus.events import report_of
 from nedbus.timings import TIMINGS
@@ -44,6 +44,7 @@ class Exporter(Observer):
         }
         self._routers: list[RouterState] = []
         self.log_streams: Mapping[str, LogStreamStatus] = {}  # by vehicle
+        self.positions: Mapping[str, PositionStatus] = {}  # that services send, by vehicle
         self._session: Session | None = None  # for queries
 
     def run(self, stop: threading.Event) -> None:
@@ -109,8 +110,9 @@ class Exporter(Observer):
             elif self._session is not None and self._has_mavlink():
                 with suppress(NedbusError):
                     services = find_services(self._session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout)
-                    logs = (log for each in services for source in each.sources for log in source.log_streams)
-                    self.log_streams = {log.vehicle: log for log in logs}
+                    sources = [source for each in services for source in each.sources]
+                    self.log_streams = {log.vehicle: log for source in sources for log in source.log_streams}
+                    self.positions = {sent.vehicle: sent for source in sources for sent in source.positions}
         if self._session is not None:
             self._session.close()
 

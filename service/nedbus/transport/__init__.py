@@ -3,6 +3,7 @@
 from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
 
 from .access_control import AccessControl
+from .key_reader import KeyReader
 from .liveliness import LivelinessTokens, token_keys
 from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (

@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from nedbus.client import Health, LogStreamStatus, Monitor, NewestMessage, RejectionReport, StreamState, stream_state
 from nedbus.events import FIXES, MODES, State, rank_vehicle
+from nedbus.fusion import Fusion
 from nedbus.monitoring import Snapshot
 from nedbus.samples import Sample
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -57,7 +59,7 @@ class VehicleView:
     """Snapshot of one vehicle: its state and its streams.
 
     `main`: the stream of its map marker; `status`: mode, armed, battery and gps; `number`: index of its colour;
-    `log`: its ULog stream over MAVLink, if any.
+    `log`: its ULog stream over MAVLink, if any; `fusion`: the use of an external position, if it receives one.
     """
 
     vehicle: str
@@ -67,6 +69,7 @@ class VehicleView:
     status: Mapping[str, StatusValue]
     number: int
     log: LogStreamStatus | None = None
+    fusion: Fusion | None = None
 
     @property
     def grade(self) -> str:
@@ -176,8 +179,14 @@ class Fleet:
         for collection in (self.streams, self._rejected, self._reports):
             collection.clear()
 
-    def update(self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus]) -> None:
-        """Update `snapshot`; `states`, `logs`: states and ULog streams by vehicle."""
+    def update(
+        self,
+        now: Snapshot,
+        states: Mapping[str, State],
+        logs: Mapping[str, LogStreamStatus],
+        fusion: Mapping[str, Fusion] = MappingProxyType({}),
+    ) -> None:
+        """Update `snapshot`; by vehicle: `states`, its ULog streams `logs`, and `fusion` of an external position."""
         self.reject(now.rejected)
         alive = now.alive
         with self._lock:
@@ -195,7 +204,9 @@ class Fleet:
         for name, each in views.items():
             main = min(each, key=lambda view: (view.address.topic != DEFAULT_TOPIC, not is_position(view.address)))
             vehicle_state, number = states.get(name, _OK), self._number_of(name)
-            vehicles.append(VehicleView(name, vehicle_state, main, tuple(each), _status(each), number, logs.get(name)))
+            status, log = _status(each), logs.get(name)
+            vehicle = VehicleView(name, vehicle_state, main, tuple(each), status, number, log, fusion.get(name))
+            vehicles.append(vehicle)
         vehicles.sort(key=lambda view: rank_vehicle(view.vehicle, view.state.severity))
         alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
         rejected, left_out = self._rejected.total(), len(newest) - len(streams)

@@ -40,6 +40,7 @@ from .event_timeline import PAST, EventTimeline
 from .fleet import Fleet
 from .playback import Player, Recording
 from .viewer import Viewer
+from .vision import VisionWatch
 
 _log = logging.getLogger(__name__)
 
@@ -105,7 +106,7 @@ class LiveFleet(Exporter):
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         super().__init__(bus, selection, version=version)
-        self.fleet = Fleet(self.monitor)
+        self.fleet, self._vision = Fleet(self.monitor), VisionWatch()
         now = clock.utc()
         reports = [each for each in bus.accounts(within=PAST) if any(map(selection.matches_vehicle, each.vehicles))]
         remembered = [event for _, event in once_per_service(reports) if event.time < now]
@@ -115,6 +116,7 @@ class LiveFleet(Exporter):
         """Add a sample to the metrics and to the fleet."""
         super().add(sample)
         self.fleet.add(sample, clock.steady())
+        self._vision.add(sample)
 
     def poll(self) -> Snapshot:
         """Poll all vehicles; update the fleet and the clock of the timeline."""
@@ -123,7 +125,7 @@ class LiveFleet(Exporter):
         self.timeline.clock_offset, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
         vehicles = {*event_log.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: event_log.state(vehicle, snapshot.time) for vehicle in vehicles}
-        self.fleet.update(snapshot, states, self.log_streams)
+        self.fleet.update(snapshot, states, self.log_streams, self._vision.reports(vehicles, self.positions))
         return snapshot
 
 

@@ -88,6 +88,22 @@ def test_velocity_alone_is_not_fused_without_its_bit() -> None:
     assert report.causes == ("bit 4 of EKF2_EV_CTRL is not set, or quality 100 is below EKF2_EV_QMIN",)
 
 
+def test_bias_against_gnss_is_named() -> None:
+    """With GNSS, a position that is 8.6 m off is fused with a tiny test ratio: the bias alone shows the offset."""
+    vehicle = Vehicle()
+    vehicle.fly(2.0, ratio=1e-7)
+    assert vehicle.tracker.fusion("1").remarks == ()
+    vehicle.tracker.add("estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (7.0, -5.0, 0.0)})
+    report = vehicle.fly(1.0, ratio=1e-7)[-1]
+    assert report.used
+    assert report.bias == (7.0, -5.0)
+    [remark] = report.remarks
+    assert remark.startswith("with GNSS, EKF2 gives vision a bias of 8.6 m: the estimate follows GNSS")
+    assert "bias against GNSS 7.0 m north, -5.0 m east" in "\n".join(report.lines)
+    vehicle.tracker.add("estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (0.3, -0.2, 0.0)})
+    assert vehicle.fly(1.0)[-1].remarks == ()
+
+
 def test_norm_of_q_within_1e_5_is_right() -> None:
     """A norm of 0.99999 is fused; 0.999 is not, although a validator accepts it."""
     [*_, right] = Vehicle().fly(2.0, q=(0.999995, 0.0, 0.0, 0.0))
@@ -130,6 +146,26 @@ def test_missing_evidence_is_named_and_flags_are_used() -> None:
     assert [each.state for each in report.quantities] == ["fused", "fused", "not used", "not used"]
     assert report.missing[0].startswith("estimator_aid_src_ev_*")
     assert "logger_topics.txt" in report.missing[0]
+
+
+@pytest.mark.parametrize(("is_valid", "remarks"), [(True, ()), (False, (Cause.NOT_VALID,))])
+def test_validity_is_the_evidence_without_a_log_stream(is_valid: bool, remarks: tuple[str, ...]) -> None:
+    """MAVLink has neither echo nor aid messages: xy_valid, from ESTIMATOR_STATUS, shows that nothing is used."""
+    tracker = FusionTracker()
+    tracker.add("vehicle_local_position", {"timestamp": 5_000_000, "eph": 0.1, "xy_valid": is_valid})
+    assert tracker.fusion("1").remarks == ()
+    report = tracker.fusion("1", PositionStatus(vehicle="1", sent=90, rate=30.0))
+    assert report.remarks == remarks
+    assert set(remarks) <= {*report.lines}
+    assert report.missing
+
+
+@pytest.mark.parametrize(("clock", "is_named"), [("arrival", True), ("timesync", False)])
+def test_measured_age_is_the_delay_to_set(clock: str, is_named: bool) -> None:
+    """While PX4 stamps positions on arrival, the report names their age as the value of EKF2_EV_DELAY."""
+    sent = PositionStatus(vehicle="1", address="mocap/vehicle_odometry", sent=90, rate=30.0, age=0.0124, clock=clock)
+    [line] = [line for line in FusionTracker().fusion("1", sent).lines if line.startswith("sent: ")]
+    assert ("; set EKF2_EV_DELAY to 12 ms, plus the delay of the link" in line) == is_named
 
 
 def test_vehicle_without_vision_has_no_cause() -> None:

@@ -24,6 +24,7 @@ import nedbus
 from nedbus.client import LogStreamStatus, Sample, describe_stream, stream_state
 from nedbus.events import EventLog
 from nedbus.flights import RecordingWriter
+from nedbus.health import Fusion
 from nedbus.monitoring import Snapshot
 from nedbus.web import PageOptions, serve_live
 from nedbus.web.event_timeline import EventTimeline
@@ -81,6 +82,7 @@ class SimulatedFleet:
         behind: str = "",
         is_behind: bool = False,
         logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
+        fusion: Mapping[str, Fusion] = MappingProxyType({}),
     ) -> FleetSnapshot:
         """Update the snapshot as the exporter does twice a second."""
         healths = self.monitor.snapshot(round(self.time * 1e9))
@@ -93,7 +95,7 @@ class SimulatedFleet:
         }
         self.event_log.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.event_log.state(name, self.time) for name in self.event_log.vehicles}
-        self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=behind), states, logs)
+        self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=behind), states, logs, fusion)
         return self.fleet.snapshot
 
     def vehicle(self, vehicle: str = "wing", **options: Any) -> VehicleView:

@@ -24,6 +24,7 @@ from hypothesis import given, strategies as st
 import nedbus
 from nedbus.client import LogStreamStatus, RejectionReport, reply_parts
 from nedbus.events import AccountReport, Event, VehicleReport
+from nedbus.health import Fusion, PositionStatus, QuantityFusion
 from nedbus.transport import Session, open_router
 from nedbus.web.column_data import LINE_TYPES, Track, Tracks
 from nedbus.web.fleet import TRUTH
@@ -187,6 +188,22 @@ def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
     page.refresh(logs={"wing": LogStreamStatus(vehicle="wing", state="refused", reason="<b>another client has it")})
     assert "ULog stream" in page.text
     assert "refused, &lt;b&gt;another client has it" in page.text
+
+
+def test_use_of_an_external_position_is_shown_escaped(sim: SimulatedFleet) -> None:
+    """A line tells whether the selected vehicle uses a position that it receives; it is amber if a cause is known."""
+    page = Page(sim)
+    sim.fly(3)
+    page.refresh()
+    assert "external position" not in page.text
+    fused, yaw = QuantityFusion("position", "fused", 5.0), QuantityFusion("yaw", "fused", 5.0)
+    page.refresh(fusion={"wing": Fusion("wing", (fused, yaw), echoed=40.0)})
+    assert '<div class="quiet">external position: position, yaw fused since 5.0 s; PX4 receives 40.0 Hz' in page.text
+    rejected = QuantityFusion("yaw", "rejected", 5.0, cause="q is no unit quaternion")
+    sent = PositionStatus(vehicle="wing", address="mocap/vehicle_odometry", sender="<b>", sent=7)
+    page.refresh(fusion={"wing": Fusion("wing", (fused, rejected), sent)})
+    assert '<div class="watch">external position: sent: 7 positions of mocap/vehicle_odometry sent' in page.text
+    assert "from &lt;b&gt;; position fused since 5.0 s; yaw rejected since 5.0 s: q is no unit quaternion" in page.text
 
 
 def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:

@@ -1,50 +1,65 @@
 """PositionSender: send positions from the bus into the vehicle on a link, on a thread of its own."""
 
 import logging
+import math
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, cast
+from typing import Final, NamedTuple, cast
 
-from pymavlink.dialects.v20 import common as dialect
-
-from nedbus.client import Bus, Sample, Subscription, connect
-from nedbus.errors import NedbusError
-from nedbus.log_event import about
+from nedbus.errors import ClosedError, DecodeError, NedbusError
+from nedbus.log_event import UnexpectedErrors, about
 from nedbus.mavlink import ExternalPosition
 from nedbus.samples import PositionStatus, Rejection
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import TIMINGS
-from nedbus.transport import Tls
-from nedbus_msgs import Address
+from nedbus.transport import KeyReader, RawSample, Session, Tls, open_client
+from nedbus_msgs import BY_TOPIC, Address, codec_of, provenance_of
+from nedbus_msgs.messages import TimesyncStatus
 
 from .link import Peer
 
 _log = logging.getLogger(__name__)
 
-COMPONENT: Final = dialect.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 TIMESYNC_TOPIC: Final = "timesync_status"
 """Topic that PX4 publishes while a client answers its TIMESYNC; nedbus does so only with `position_clock=timesync`."""
 
 _CONNECT_TIMEOUT: Final = 0.5  # s
 _DOWNSAMPLED: Final = "rate"  # kind of refusal that is no fault of the publisher
+_MAX_ENCODING: Final = 512  # characters of an encoding; those of nedbus have at most 250
+_TARGET_INTERVAL: Final = 0.1  # s between two looks for the vehicle, whose address changes after 3 s of silence
 _SHORT_ID: Final = 8  # characters of the id of a session
+_FOREIGN_CLOCK: Final = (
+    "another client answers TIMESYNC: if it does so on this link, PX4 stamps positions with its clock; stop it, or give"
+    " the service a link of its own"
+)
 _EVIDENCE_TIMEOUT: Final = 10.0  # s for which an answer of another client to TIMESYNC counts
 
 
 @dataclass(frozen=True, slots=True)
 class BusAccess:
-    """What is needed to subscribe to the bus of a service."""
+    """What is needed to read the bus of a service; `router`: its session if it is a router, else `routers` has one."""
 
+    router: Session | None
     routers: tuple[str, ...]
     tls: Tls | None
     prefix: str
 
-    def open(self) -> Bus:
-        """Connect; raise NedbusError."""
-        return connect(self.routers, timeout=_CONNECT_TIMEOUT, prefix=self.prefix, tls=self.tls)
+    @contextmanager
+    def read(self, address: Address) -> Iterator[KeyReader]:
+        """Receive the messages of an address inside a `with` block; raise NedbusError if no router answers.
+
+        A second session to the own router would double the processor time.
+        """
+        with ExitStack() as opened:
+            session = self.router
+            if session is None:
+                session = open_client(self.routers, timeout=_CONNECT_TIMEOUT, tls=self.tls)
+                opened.callback(session.close)
+            yield opened.enter_context(closing(KeyReader(session, address.key(prefix=self.prefix))))
 
 
 class Target(NamedTuple):
@@ -59,8 +74,8 @@ class Target(NamedTuple):
 class PositionSender:
     """Send each position of one address as ODOMETRY to the vehicle on a link, as the component of a VIO.
 
-    `find_target`: returns the vehicle. `send`: sends a message with the ids of an encoder; returns whether the link
-    accepted it. Both are called on this object's thread.
+    `find_target`: returns the vehicle. `send`: sends a frame; returns whether the link accepted it. Both are called on
+    this object's thread.
     """
 
     def __init__(
@@ -70,17 +85,21 @@ class PositionSender:
         access: BusAccess,
         *,
         find_target: Callable[[], Target],
-        send: Callable[[Any, Any, Peer], bool],
+        send: Callable[[bytes, Peer], bool],
     ) -> None:
         self._name, self._access = name, access
         self._address = cast("Address", options.position)
         self._clock = options.position_clock
         self._find_target, self._send = find_target, send
         self._core, self._lock = ExternalPosition(), threading.Lock()
-        self._encoder = dialect.MAVLink(None, 0, COMPONENT)
+        self._sequence = 0  # of MAVLink
         self._reported = Counter[str]()
-        self._answered = -float("inf")  # time of an answer to TIMESYNC by another client
-        self._stop, self._subscription = threading.Event(), cast("Subscription[Any] | None", None)
+        self._answered = -math.inf  # time of an answer to TIMESYNC by another client
+        self._decode = codec_of(BY_TOPIC[self._address.topic]).decode
+        self._target, self._target_due = Target(), -math.inf
+        self._sender = SenderName(self._address.topic)
+        self._stop, self._reader = threading.Event(), cast("KeyReader | None", None)
+        self._errors = UnexpectedErrors(_log, "%s: unexpected error, left out a position (logged once)", name)
         text = "PX4 stamps them on arrival" if self._clock == "arrival" else "PX4's TIMESYNC is answered"
         extra = about("position", source=name)
         _log.info("%s: positions of %s are sent into the vehicle; %s", name, self._address, text, extra=extra)
@@ -90,13 +109,14 @@ class PositionSender:
     def close(self) -> None:
         """Stop sending."""
         self._stop.set()
-        if self._subscription is not None:
-            self._subscription.close()
+        if (reader := self._reader) is not None:
+            reader.close()
         self._thread.join()
 
-    def on_foreign_timesync(self, now: float) -> None:
-        """Note that another client has answered the vehicle's TIMESYNC."""
-        self._answered = now
+    def on_timesync_status(self, fields: Mapping[str, object], now: float) -> None:
+        """Note that another client has answered the vehicle's TIMESYNC; over DDS, it concerns DDS alone."""
+        if fields.get("source_protocol") != TimesyncStatus.SOURCE_PROTOCOL_DDS:
+            self._answered = now
 
     def status(self) -> PositionStatus:
         """Return what was sent and left out so far."""
@@ -105,7 +125,7 @@ class PositionSender:
             core = self._core
             warnings = list(core.warnings.values())
             if self._clock == "arrival" and time.monotonic() - self._answered < _EVIDENCE_TIMEOUT:
-                warnings.append("another client answers TIMESYNC: on this link, PX4 would use its clock for positions")
+                warnings.append(_FOREIGN_CLOCK)
             is_active = time.monotonic() - core.last_sent < TIMINGS.stale
             return PositionStatus(
                 vehicle=target.name, address=str(self._address), sender=core.sender, sent=core.sent,
@@ -131,56 +151,79 @@ class PositionSender:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                with self._access.open() as bus:
-                    self._follow(bus)
-            except NedbusError as exc:  # the router is not up yet, or closed the session
+                with self._access.read(self._address) as self._reader:
+                    self._follow(self._reader)
+            except NedbusError as exc:  # the router is not up yet, or its session was closed
                 _log.debug("%s: no positions: %s", self._name, exc)
                 self._stop.wait(TIMINGS.source_tick)
 
-    def _follow(self, bus: Bus) -> None:
-        """Send what arrives until `close`: of several unread positions, only the newest.
-
-        Without a timeout the samples are received on this thread: no other thread has to hand them over.
-        """
-        topic, vehicle = self._address.topic, self._address.vehicle
-        with bus.subscribe(topic, vehicle=vehicle, mode="latest") as subscription:
-            self._subscription = subscription
-            if self._stop.is_set():  # before `close` could see the subscription
+    def _follow(self, reader: KeyReader) -> None:
+        """Send what arrives until `close`: of several unread positions, only the newest."""
+        before = 0
+        while not self._stop.is_set():
+            try:
+                raw = reader.receive()
+            except ClosedError:
+                self._stop.wait(TIMINGS.source_tick)  # unless this object was closed
                 return
-            for sample in subscription:
-                if not (sample.retained or sample.stored):  # it is older than this subscription
-                    self._handle(sample)
-            self._note_unread(subscription.counts.dropped)
+            try:
+                self._handle(raw, reader.superseded - before)
+            except BaseException as exc:  # a panic of Zenoh is not an Exception
+                if not self._errors.survives(exc):
+                    raise
+            before = reader.superseded
 
-    def _note_unread(self, count: int) -> None:
+    def _handle(self, raw: RawSample, superseded: int) -> None:
+        now = time.monotonic()
+        if now >= self._target_due:
+            self._target, self._target_due = self._find_target(), now + _TARGET_INTERVAL
+        target = self._target
         with self._lock:
-            self._core.left_out["superseded"] += count
-
-    def _handle(self, sample: Sample[Any]) -> None:
-        target = self._find_target()
-        with self._lock:
+            core = self._core
+            if superseded:
+                core.left_out["superseded"] += superseded
             if target.obstacle:
-                self._core.refuse("vehicle", target.obstacle)
+                core.refuse("vehicle", target.obstacle)
                 return
             if target.name == self._address.vehicle:
                 text = f"{self._address} is the vehicle's own name, so its echo would be sent back: publish another one"
-                self._core.refuse("address", text)
+                core.refuse("address", text)
                 return
-            outcome = self._core.add(sample.message, sender_of(sample), time.monotonic())
-        if outcome.message is None:
+            try:
+                position = self._decode(raw.payload.to_bytes())
+            except DecodeError as exc:
+                core.refuse("invalid", f"the message cannot be decoded: {exc}; use the same version of nedbus")
+                return
+            outcome = core.add(position, self._sender.of(raw), now)
+        if outcome.odometry is None:
             return
-        self._encoder.srcSystem = target.system
-        if not self._send(outcome.message, self._encoder, target.peer):
+        frame = outcome.odometry.frame(outcome.time_usec, system=target.system, sequence=self._sequence)
+        self._sequence = (self._sequence + 1) % 256
+        if not self._send(frame, target.peer):
             with self._lock:
                 self._core.refuse("link", "the link did not accept it: it is too slow, or broken")
 
 
-def sender_of(sample: Sample[Any]) -> str:
-    """Return the publisher of a sample: its source, and the id of its session."""
-    name = sample.source or "a publisher"
-    if sample.stamp is None:
-        return name
-    return f"{name} (session {str(sample.stamp.get_id())[:_SHORT_ID]})"
+class SenderName:
+    """The publisher of samples as text: its source, and the id of its session; described again when it changes."""
+
+    def __init__(self, topic: str) -> None:
+        self._definition = BY_TOPIC[topic]
+        self._session: object = None
+        self._encoding: object = None
+        self._name = ""
+
+    def of(self, raw: RawSample) -> str:
+        """Return the publisher of a sample."""
+        session = None if raw.timestamp is None else raw.timestamp.get_id()
+        encoding = raw.encoding
+        if session != self._session or encoding != self._encoding or not self._name:
+            self._session, self._encoding = session, encoding
+            source = provenance_of(self._definition, str(encoding)[:_MAX_ENCODING]).source
+            self._name = source or "a publisher"
+            if session is not None:
+                self._name += f" (session {str(session)[:_SHORT_ID]})"
+        return self._name
 
 
 def choose_target(vehicles: Mapping[int, tuple[str, Peer]]) -> Target:

@@ -55,13 +55,14 @@ class MavlinkSource:
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
-        self._access = BusAccess(routers, tls, prefix)
+        self._routers, self._tls, self._prefix = routers, tls, prefix
 
-    def listen(self, _: Session | None) -> Iterator[LiveItem]:
+    def listen(self, router: Session | None) -> Iterator[LiveItem]:
         """Receive messages; raise SourceError if the link cannot be opened or fails."""
+        access = BusAccess(router, self._routers, self._tls, self._prefix)
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                with closing(_LinkSession(link, self._options, name=self._link, access=self._access)) as session:
+                with closing(_LinkSession(link, self._options, name=self._link, access=access)) as session:
                     yield from session.run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
@@ -160,7 +161,7 @@ class _LinkSession:
                 yield each
                 continue
             if self._positions is not None and each.address.topic == TIMESYNC_TOPIC:
-                self._positions.on_foreign_timesync(now)
+                self._positions.on_timesync_status(each.fields, now)
             item = vehicle.report(each, log) if vehicle.lost or vehicle.rebooted else each
             if log is not None and not is_measured:
                 is_measured = True
@@ -261,9 +262,7 @@ class _LinkSession:
         known = [*self._receiver.vehicles.values()]  # changed on another thread
         return choose_target({each.system: (self._name_of(each.system), each.peers.peer) for each in known})
 
-    def _send_position(self, message: Any, encoder: Any, peer: Peer) -> bool:
-        frame = message.pack(encoder)
-        encoder.seq = (encoder.seq + 1) % 256
+    def _send_position(self, frame: bytes, peer: Peer) -> bool:
         try:
             return self._link.send(frame, peer)
         except OSError:  # the link breaks; the thread that reads it reports that

@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 from hypothesis import given, strategies as st
+from pymavlink.dialects.v20 import common as dialect
 
 from nedbus import VehicleLocalPosition, VehicleOdometry
 from nedbus.mavlink import MAX_AGE, MAX_RATE, UNKNOWN_VARIANCE, ExternalPosition
-from nedbus.mavlink.external_position import Outcome
+from nedbus.mavlink.external_position import Outcome, odometry_of
 
 NAN = math.nan
 SECOND = 1_000_000  # us
@@ -43,17 +44,24 @@ def send(position: Any, now: float = 100.0) -> Outcome:
     return ExternalPosition().add(position, "a", now)
 
 
+def sent(outcome: Outcome) -> Any:
+    """Return the ODOMETRY message that pymavlink finds in the frame of an outcome."""
+    assert outcome.odometry is not None
+    frame = outcome.odometry.frame(outcome.time_usec, system=4, sequence=200)
+    return dialect.MAVLink(None).decode(bytearray(frame))
+
+
 def refusal(position: Any) -> tuple[str, str]:
     """Return kind and text of the refusal of a single position."""
     outcome = send(position)
-    assert outcome.message is None
+    assert outcome.odometry is None
     assert outcome.refusal is not None
     return outcome.refusal
 
 
 def test_odometry_is_sent_as_published() -> None:
     """Frames, values, variances, counter and quality of VehicleOdometry stand in ODOMETRY; the type is VISION."""
-    message = send(odometry()).message
+    message = sent(send(odometry()))
     assert (message.frame_id, message.child_frame_id, message.estimator_type) == (1, 1, 2)
     assert (message.x, message.y, message.z) == pytest.approx((1, 2, -3))
     assert (message.vx, message.vy, message.vz) == pytest.approx((0.1, 0.2, 0.3))
@@ -63,12 +71,31 @@ def test_odometry_is_sent_as_published() -> None:
     assert [message.velocity_covariance[each] for each in (0, 6, 11)] == pytest.approx([0.07, 0.08, 0.09])
     assert sum(map(math.isnan, message.pose_covariance)) == 15
     assert (message.reset_counter, message.quality) == (7, 90)
+    assert (message.get_srcSystem(), message.get_srcComponent(), message.get_seq()) == (4, 197, 200)
+
+
+@given(
+    st.fixed_dictionaries({
+        "position": st.lists(st.floats(-1000, 1000, width=32), min_size=3, max_size=3),
+        "reset_counter": st.integers(0, 255),
+        "quality": st.integers(-1, 100),
+    }),
+    st.integers(1, 250), st.integers(0, 255), st.integers(0, 2**60),
+)  # fmt: skip
+def test_frame_is_that_of_pymavlink(fields: dict[str, Any], system: int, sequence: int, time_usec: int) -> None:
+    """The frame is byte for byte the one that pymavlink packs from the same fields, also with zeros at its end."""
+    packed = odometry_of(odometry(**fields))
+    frame = packed.frame(time_usec, system=system, sequence=sequence)
+    encoder = dialect.MAVLink(None, system, 197)
+    encoder.seq = sequence
+    message = dialect.MAVLink(None).decode(bytearray(frame))
+    assert message.pack(encoder) == frame
 
 
 @pytest.mark.parametrize(("pose", "velocity", "frames"), [(2, 2, (20, 20)), (1, 3, (1, 12)), (2, 3, (20, 12))])
 def test_frames_are_those_that_px4_knows(pose: int, velocity: int, frames: tuple[int, int]) -> None:
     """FRD is MAV_FRAME_LOCAL_FRD (20), body FRD is MAV_FRAME_BODY_FRD (12)."""
-    message = send(odometry(pose_frame=pose, velocity_frame=velocity)).message
+    message = sent(send(odometry(pose_frame=pose, velocity_frame=velocity)))
     assert (message.frame_id, message.child_frame_id) == frames
 
 
@@ -100,34 +127,34 @@ def test_position_that_px4_would_ignore_is_refused(changes: dict[str, Any], kind
 def test_quaternion_is_normalised_within_a_hundredth(q: list[float], scale: float) -> None:
     """A quaternion of few decimals is sent with the norm that EKF2 requires: 1 within 1e-5."""
     norm = math.hypot(*q)
-    sent = send(odometry(q=[scale * part / norm for part in q])).message.q
-    assert abs(math.hypot(*sent) - 1) < 1e-5
-    assert sent == pytest.approx([part / norm for part in q], abs=1e-6)
+    unit = sent(send(odometry(q=[scale * part / norm for part in q]))).q
+    assert abs(math.hypot(*unit) - 1) < 1e-5
+    assert unit == pytest.approx([part / norm for part in q], abs=1e-6)
 
 
 @pytest.mark.parametrize("q", [[NAN] * 4, [0.0] * 4])
 def test_unknown_attitude_is_nan(q: list[float]) -> None:
     """An unknown attitude is NaN, with which PX4 ends the fusion of yaw alone."""
-    assert all(map(math.isnan, send(odometry(q=q)).message.q))
+    assert all(map(math.isnan, sent(send(odometry(q=q))).q))
 
 
 def test_unknown_position_has_a_large_variance() -> None:
     """A message without a position has no NaN in a coordinate, which would also end the fusion of velocity."""
-    message = send(odometry(position=[NAN] * 3, position_variance=[NAN] * 3)).message
+    message = sent(send(odometry(position=[NAN] * 3, position_variance=[NAN] * 3)))
     assert (message.x, message.y, message.z) == (0, 0, 0)
     assert [message.pose_covariance[each] for each in (0, 6, 11)] == [UNKNOWN_VARIANCE] * 3
 
 
 def test_unknown_velocity_is_left_out() -> None:
     """A message without a velocity is sent, whatever its velocity_frame."""
-    message = send(odometry(velocity=[NAN] * 3, velocity_frame=0)).message
+    message = sent(send(odometry(velocity=[NAN] * 3, velocity_frame=0)))
     assert all(map(math.isnan, (message.vx, message.vy, message.vz)))
     assert message.child_frame_id == 12
 
 
 def test_local_position_is_sent_with_a_yaw_only_attitude() -> None:
     """Eph^2 / 2 and epv^2 are variances of position, evh and evv those of velocity; roll and pitch are unknown."""
-    message = send(local_position()).message
+    message = sent(send(local_position()))
     assert (message.frame_id, message.child_frame_id) == (1, 1)
     assert message.q == pytest.approx([math.cos(0.5), 0, 0, math.sin(0.5)])
     assert [message.pose_covariance[each] for each in (0, 6, 11)] == pytest.approx([2, 2, 9])
@@ -137,7 +164,7 @@ def test_local_position_is_sent_with_a_yaw_only_attitude() -> None:
 
 def test_invalid_parts_of_a_local_position_get_a_large_variance() -> None:
     """What is not valid is no NaN: x and y keep their values with the variance of an unknown quantity."""
-    message = send(local_position(xy_valid=False, v_z_valid=False, vz=NAN, heading_good_for_control=False)).message
+    message = sent(send(local_position(xy_valid=False, v_z_valid=False, vz=NAN, heading_good_for_control=False)))
     assert (message.x, message.y) == (1, 2)
     assert [message.pose_covariance[each] for each in (0, 6, 11)] == pytest.approx([1e6, 1e6, 9])
     assert message.vz == 0
@@ -154,7 +181,7 @@ def test_local_position_without_anything_valid_is_refused() -> None:
 def test_reset_counter_of_a_local_position_counts_all_resets() -> None:
     """A reset of any quantity changes reset_counter, and the number depends on the message alone."""
     counters = {"xy_reset_counter": 250, "z_reset_counter": 3, "heading_reset_counter": 5}
-    assert send(local_position(**counters)).message.reset_counter == (250 + 3 + 5) % 256
+    assert sent(send(local_position(**counters))).reset_counter == (250 + 3 + 5) % 256
 
 
 def play(core: ExternalPosition, times: list[tuple[float, float]], **changes: Any) -> list[Outcome]:
@@ -181,7 +208,7 @@ def test_jitter_costs_no_message(jitter: list[float]) -> None:
 def test_slow_publisher_is_warned() -> None:
     """Below 5 Hz, positions are sent with a warning, because PX4 never starts to fuse them."""
     last = play(ExternalPosition(), [(each / 4.2, 100 + each / 4.2) for each in range(20)])[-1]
-    assert last.message is not None
+    assert last.odometry is not None
     assert last.warning.startswith("4.2 messages per second: PX4 fuses none below 5")
 
 
@@ -189,7 +216,7 @@ def test_old_position_is_left_out() -> None:
     """A position that waited more than 100 ms on its way is not sent; the next one is."""
     core = ExternalPosition()
     outcomes = play(core, [(0.0, 100.0), (0.02, 100.02), (0.04, 100.16), (0.06, 100.165), (0.16, 100.17)])
-    assert [each.message is not None for each in outcomes] == [True, True, False, False, True]
+    assert [each.odometry is not None for each in outcomes] == [True, True, False, False, True]
     assert core.left_out == {"age": 2}
     assert "it is 120 ms old, more than 100" in (outcomes[2].refusal or ("", ""))[1]
 
@@ -199,16 +226,17 @@ def test_age_includes_that_of_the_measurement() -> None:
     core = ExternalPosition()
     core.add(odometry(0.0), "a", 100.0)
     late = odometry(0.02)
-    message = core.add(late.model_copy(update={"timestamp_sample": late.timestamp - 30_000}), "a", 100.03).message
+    older = late.model_copy(update={"timestamp_sample": late.timestamp - 30_000})
+    outcome = core.add(older, "a", 100.03)
     assert core.age == pytest.approx(0.04)
-    assert message.time_usec == pytest.approx(1e6 * 99.99, abs=2)
+    assert outcome.time_usec == pytest.approx(1e6 * 99.99, abs=2)
 
 
 def test_time_must_rise() -> None:
     """The same message twice, and one that is older than the last, are refused."""
     core = ExternalPosition()
     outcomes = play(core, [(0.1, 100.1), (0.1, 100.12), (0.05, 100.13), (0.15, 100.15)])
-    assert [each.message is not None for each in outcomes] == [True, False, False, True]
+    assert [each.odometry is not None for each in outcomes] == [True, False, False, True]
     assert core.left_out == {"time": 2}
 
 
@@ -218,7 +246,7 @@ def test_clock_step_of_the_publisher_costs_less_than_fusion_needs_to_stop() -> N
         core, sent = ExternalPosition(), []
         for index in range(200):
             stamp = 1e6 + index / 50 + (step if index >= 100 else 0.0)
-            if core.add(odometry(stamp), "a", 100 + index / 50).message is not None:
+            if core.add(odometry(stamp), "a", 100 + index / 50).odometry is not None:
                 sent.append(index / 50)
         assert max(after - before for before, after in pairwise(sent)) < 0.4
         assert core.left_out["clock"] == 200 - len(sent)
@@ -229,14 +257,14 @@ def test_backlog_after_a_stall_is_not_sent() -> None:
     core = ExternalPosition()
     stall = [(1 + each / 50, 106 + each / 10_000) for each in range(250)]
     outcomes = play(core, [(each / 50, 100 + each / 50) for each in range(50)] + stall)
-    assert not any(each.message for each in outcomes[50:295])
+    assert not any(each.odometry for each in outcomes[50:295])
 
 
 def test_wild_time_of_one_message_does_not_stop_the_others() -> None:
     """A single timestamp a day ahead is refused, and the next position is sent."""
     core = ExternalPosition()
     outcomes = play(core, [(0.0, 100.0), (86_400.0, 100.02), (0.04, 100.04)])
-    assert [each.message is not None for each in outcomes] == [True, False, True]
+    assert [each.odometry is not None for each in outcomes] == [True, False, True]
 
 
 @given(
@@ -247,9 +275,9 @@ def test_nothing_is_stamped_ahead(messages: list[tuple[int, int, float]]) -> Non
     core, now = ExternalPosition(), 100.0
     for stamp, sample, pause in messages:
         now += pause
-        message = core.add(odometry(timestamp=stamp, timestamp_sample=sample), "a", now).message
-        if message is not None:
-            assert now - MAX_AGE - 1e-5 <= message.time_usec / 1e6 <= now
+        outcome = core.add(odometry(timestamp=stamp, timestamp_sample=sample), "a", now)
+        if outcome.odometry is not None:
+            assert now - MAX_AGE - 1e-5 <= outcome.time_usec / 1e6 <= now
 
 
 @given(st.lists(st.tuples(st.floats(-1e5, 1e5), st.floats(0, 0.2)), min_size=1, max_size=50))
@@ -258,8 +286,8 @@ def test_clock_steps_stamp_nothing_ahead(steps: list[tuple[float, float]]) -> No
     core, now, clock = ExternalPosition(), 100.0, 1e6
     for step, pause in steps:
         now, clock = now + pause, clock + pause + step
-        message = core.add(odometry(max(0.0, clock)), "a", now).message
-        assert message is None or message.time_usec / 1e6 <= now
+        outcome = core.add(odometry(max(0.0, clock)), "a", now)
+        assert outcome.odometry is None or outcome.time_usec / 1e6 <= now
     assert core.sent + core.left_out.total() == len(steps)
 
 
@@ -268,7 +296,7 @@ def test_wild_sample_time_is_not_used() -> None:
     for wild in (3_600 * SECOND, -3_600 * SECOND):
         position = odometry(4000.0)
         outcome = send(position.model_copy(update={"timestamp_sample": position.timestamp + wild}))
-        assert outcome.message.time_usec == 100 * SECOND
+        assert outcome.time_usec == 100 * SECOND
         assert "is 3600.0 s" in outcome.warning
 
 
@@ -279,7 +307,7 @@ def test_reset_counter_rises_exactly_with_the_publisher() -> None:
     for index, counter in enumerate(counters):
         used = core if index < 4 else restarted
         position = odometry(index / 50, reset_counter=counter)
-        assert used.add(position, "a", 100 + index / 50).message.reset_counter == counter
+        assert sent(used.add(position, "a", 100 + index / 50)).reset_counter == counter
 
 
 def test_reset_counter_that_counts_messages_is_refused() -> None:
@@ -289,7 +317,7 @@ def test_reset_counter_that_counts_messages_is_refused() -> None:
         outcome = core.add(odometry(index / 50, reset_counter=index), "a", 100 + index / 50)
     assert outcome.refusal is not None
     assert outcome.refusal.text.startswith("reset_counter 19 changes with each message")
-    assert play(core, [(0.4, 100.4), (0.42, 100.42)], reset_counter=19)[-1].message is not None
+    assert play(core, [(0.4, 100.4), (0.42, 100.42)], reset_counter=19)[-1].odometry is not None
 
 
 def test_jump_without_a_new_counter_is_warned() -> None:
@@ -297,7 +325,7 @@ def test_jump_without_a_new_counter_is_warned() -> None:
     core = ExternalPosition()
     core.add(odometry(0.0), "a", 100.0)
     outcome = core.add(odometry(0.02, position=[3.0, 2.0, -3.0]), "a", 100.02)
-    assert outcome.message is not None
+    assert outcome.odometry is not None
     assert outcome.warning.startswith("position jumped by 2.0 m and reset_counter stayed 7")
     assert not core.add(odometry(0.04, reset_counter=8), "a", 100.04).warning
 
@@ -318,7 +346,7 @@ def test_second_sender_is_refused_with_the_name_of_the_first() -> None:
     outcome = core.add(odometry(0.01), "vio (session 2)", 100.01)
     assert outcome.refusal is not None
     assert "vio (session 2) publishes, too, but mocap (session 1) is the sender" in outcome.refusal.text
-    assert core.add(odometry(7.0), "vio (session 2)", 101.5).message is not None
+    assert core.add(odometry(7.0), "vio (session 2)", 101.5).odometry is not None
     assert core.sender == "vio (session 2)"
 
 

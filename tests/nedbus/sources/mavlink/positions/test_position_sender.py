@@ -14,10 +14,12 @@ import nedbus
 from nedbus import VehicleOdometry
 from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
-from nedbus.sources.mavlink.position_sender import Target, choose_target
+from nedbus.sources.mavlink.position_sender import BusAccess, PositionSender, Target, choose_target
+from nedbus.sources.options import MavlinkOptions
 from tests.peers.live_source import source_status
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
+from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording
 from tests.waits import wait_for
 
 from .px4_vision import SYNC_ANSWERS, Px4OnLink
@@ -25,6 +27,7 @@ from .test_external_position import odometry
 
 ALL = dict.fromkeys(("position", "height", "velocity", "yaw"), "fused")
 TOPIC = "vehicle_visual_odometry"
+REFUSED = STREAMS.parent / "ev_refused.bin.gz"
 
 
 class Script:
@@ -107,16 +110,24 @@ def test_position_of_a_script_is_fused(setup: Setup, bus: nedbus.Bus) -> None:
     assert px4.count() <= len(script.sent)
 
 
+def test_start_of_the_service_names_what_is_sent(setup: Setup) -> None:
+    """The start says in one line which positions are sent, over which link, and whose clock stamps them."""
+    line = f"udpin:127.0.0.1:{setup.port}: positions of mocap/{TOPIC} are sent into the vehicle; PX4 stamps them"
+    wait_for(lambda: line in setup.service.err, what="the line")
+    assert setup.service.err.count("are sent into the vehicle") == 1
+
+
 def test_without_the_option_nothing_is_sent(start: Start) -> None:
     """By default a source only reads: a position on the bus is not sent."""
     setup = Setup.__new__(Setup)
     setup._start, setup.port, setup.endpoint = start, free_port(), f"tcp/127.0.0.1:{free_port()}"
     setup.source = f"mavlink:udpin:127.0.0.1:{setup.port}"
-    setup.serve()
+    service = setup.serve()
     with nedbus.connect(setup.endpoint, timeout=20) as bus, Px4OnLink(setup.port) as px4, Script(bus) as script:
         wait_for(lambda: source_status(bus).published > 2, what="the vehicle")
         wait_for(lambda: len(script.sent) > 50, what="published positions")
         assert px4.count() == 0
+        assert "sent into the vehicle" not in service.err
         assert source_status(bus).positions == ()
 
 
@@ -136,6 +147,33 @@ def test_timesync_is_answered_on_request(start: Start) -> None:
             echoes = [fields for topic, fields in px4.vision.published if topic == TOPIC][-50:]
         ages = [(fields["timestamp"] - fields["timestamp_sample"]) / 1e6 for fields in echoes]
         assert sorted(ages)[len(ages) // 2] == pytest.approx(0.004, abs=0.02)
+
+
+@pytest.mark.logs
+@pytest.mark.slow
+@pytest.mark.skipif(not REFUSED.exists(), reason=f"no recording: {REFUSED}")
+def test_another_client_that_answers_timesync_is_named(start: Start) -> None:
+    """timesync_status in the log stream of a real PX4, whose TIMESYNC a second client answered, causes a warning."""
+    setup = Setup(start, log=1)
+    recording = read_recording(REFUSED)
+    with nedbus.connect(setup.endpoint, timeout=20) as bus, Px4LogStream(recording, setup.port, speed=10.0):
+
+        def warnings() -> list[str]:
+            return [text for status in source_status(bus).positions for text in status.warnings]
+
+        wait_for(warnings, what="the warning")
+        assert warnings()[0].startswith("another client answers TIMESYNC: if it does so on this link, PX4 stamps")
+
+
+@pytest.mark.parametrize(("protocol", "is_warned"), [(0, True), (1, True), (2, False)])
+def test_timesync_over_dds_is_no_clock_of_the_link(protocol: int, is_warned: bool) -> None:
+    """A client that synchronises over DDS does not affect MAVLink; PX4's MAVLink module sets no protocol."""
+    options = MavlinkOptions.model_validate({"position": f"mocap/{TOPIC}"})
+    access = BusAccess(None, ("tcp/127.0.0.1:1",), None, "nedbus")
+    sender = PositionSender("link", options, access, find_target=Target, send=lambda *_: True)
+    sender.on_timesync_status({"source_protocol": protocol}, time.monotonic())
+    sender.close()
+    assert bool(sender.status().warnings) == is_warned
 
 
 def test_wrong_positions_are_counted_and_not_sent(setup: Setup, bus: nedbus.Bus) -> None:
