@@ -17,8 +17,8 @@ from .client import (
     StreamStatus,
     Vehicles,
 )
-from .events import AccountReport, Condition, Event, VehicleReport
 from .fusion import Fusion, QuantityFusion
+from .vehicle_events import AccountReport, Condition, Event, VehicleReport
 
 __all__ = [
     "AccountReport", "Condition", "Event", "Fusion", "Health", "Histogram", "LinkCallback", "LogStreamStatus",

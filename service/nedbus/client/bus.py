@@ -49,7 +49,7 @@ from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiv
 from .subscription import Subscription
 
 if TYPE_CHECKING:
-    from nedbus.events import AccountReport
+    from nedbus.vehicle_events import AccountReport
 
 
 class Bus(AbstractContextManager["Bus"]):

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from nedbus.errors import InvalidMessageError
-from nedbus.events import EVENT_TOPICS, EventLog, Times
 from nedbus.samples import SourceMessage
+from nedbus.vehicle_events import EVENT_TOPICS, EventLog, Times
 
 from .merge import MergedFlights
 from .readers import ReadOptions

@@ -25,7 +25,8 @@ from nedbus.cli.options import (
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import (
+from nedbus.flights import FileEvents, read_file_events
+from nedbus.vehicle_events import (
     SEVERITIES,
     WINDOW,
     Event,
@@ -39,7 +40,6 @@ from nedbus.events import (
     report_of,
     verdict_of,
 )
-from nedbus.flights import FileEvents, read_file_events
 from nedbus_msgs import ANY, Selection, check_vehicle
 
 if TYPE_CHECKING:

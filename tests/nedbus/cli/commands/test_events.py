@@ -22,9 +22,9 @@ import nedbus
 from nedbus import Address
 from nedbus.cli.commands.events import _LinkLosses
 from nedbus.client import QueryServer, reply_parts
-from nedbus.events import KINDS, EventLog, report_of
 from nedbus.flights import format_of, read_file_events
 from nedbus.transport import Session
+from nedbus.vehicle_events import KINDS, EventLog, report_of
 from nedbus_msgs import status_key
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, cached_events

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
-from nedbus.events.rules import PAUSE
+from nedbus.vehicle_events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
+from nedbus.vehicle_events.rules import PAUSE
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP
-from tests.nedbus.events.flight import ARMED, Flight
+from tests.nedbus.vehicle_events.flight import ARMED, Flight
 
 MAIN = Address("1", VLP)
 GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0}

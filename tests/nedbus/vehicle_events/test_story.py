@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Event, Story, Times, stories_of, unit_of
+from nedbus.vehicle_events import Event, Story, Times, stories_of, unit_of
 
 from .flight import ARMED, Flight, lose_gps
 
