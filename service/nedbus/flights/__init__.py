@@ -10,7 +10,16 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .columns import Columns, Decoded
     from .conversion import convert
-    from .events import EVENT_OPTIONS, MAX_FILE_EVENTS, FileEvents, follow, read_file_events, times_of
+    from .events import (
+        EVENT_OPTIONS,
+        MAX_FILE_EVENTS,
+        FileEvents,
+        detect_sample_events,
+        follow,
+        read_file_events,
+        read_flight_events,
+        times_of,
+    )
     from .flight import Flight, FlightSamples, open_flight
     from .merge import FlightFile, MergedFlights, distinct_names, no_utc, renamed, require_files
     from .readers import FileStream, FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
@@ -22,7 +31,8 @@ else:
     _NAMES = {
         ("", "columns"): "Columns Decoded",
         ("mcap", "conversion"): "convert",
-        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow read_file_events times_of",
+        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents detect_sample_events follow read_file_events"
+        " read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight",
         ("", "merge"): "FlightFile MergedFlights distinct_names no_utc renamed require_files",
         ("", "readers"): "FileStream FlightReader ReadOptions check_recording find_format format_of open_reader",
