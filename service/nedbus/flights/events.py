@@ -115,12 +115,13 @@ def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
 
 
 def _received(samples: Iterable[Sample[Any]]) -> Iterator[_Received]:
-    topics = {*EVENT_TOPICS}
+    topics, streams = {*EVENT_TOPICS}, dict[Address, Address]()
     for sample in samples:
         if not isinstance(sample, Sample):
             raise ArgumentError("source", sample, "a sample; a list of files contains only str and Path")
         if sample.topic in topics and not sample.retained:
-            yield _Received(sample, sample.address, sample.received // 1000, sample.address)
+            stream = streams.setdefault(sample.address, sample.address)  # one object, which identifies the stream
+            yield _Received(sample, stream, sample.received // 1000, stream)
 
 
 def times_of(flights: MergedFlights) -> Times:
