@@ -155,6 +155,6 @@ def test_service_with_many_topics_stops(run_nedbus: Start, endpoint: str, tmp_pa
     wait_for(lambda: "MB" in service.err, what="the start of the replay")
     with Stopwatch(service.popen.pid) as watch:
         service.signal(signal.SIGINT)
-        assert service.wait() == 130
+        assert service.wait() == 130, service.err
     assert watch.seconds < _STOP
     assert "exiting anyway" not in service.err
