@@ -18,7 +18,7 @@ from .processes import HERE, Checkout, end, expect, resume
 ADD: Final = """
 import sys, time
 from pathlib import Path
-from nedbus.events import EventLog
+from nedbus.vehicle_events import EventLog
 from nedbus.flights import format_of
 from nedbus.sources import parse_source
 from nedbus.errors import InvalidMessageError

@@ -20,7 +20,7 @@ from tests.flights.local_position import upgrade
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
 
-from nedbus.events.rules import POSITIONS
+from nedbus.vehicle_events.rules import POSITIONS
 from nedbus_msgs import RESET_COUNTERS, Address, Quantity, jump_of
 from nedbus_msgs.frames import wrap
 from nedbus_msgs.resets import Point

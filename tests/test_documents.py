@@ -26,7 +26,6 @@ from docs.generator.api import api_page
 from docs.generator.commands import commands, commands_page
 from docs.generator.metrics import metrics_page
 from docs.generator.tables import events_page, keys_page, limits_page, settings_page
-from nedbus.events import KINDS
 from nedbus.health import StreamHealth
 from nedbus.log_event import EVENTS
 from nedbus.mavlink.fields import CONVERSIONS
@@ -35,6 +34,7 @@ from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS, parse_source
 from nedbus.timings import TIMINGS
 from nedbus.transport import open_router
+from nedbus.vehicle_events import KINDS
 from nedbus_msgs import MESSAGES, TOPICS, VehicleLocalPosition
 from tests.documents import (
     BLOCKS,

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Self, cast
 
 import zenoh
@@ -68,17 +69,22 @@ def repeating(action: Callable[[], object]) -> Iterator[None]:
 
 
 class Stopwatch:
-    """A clock that does not advance while a busy machine does not run this process; it counts ticks of 10 ms.
+    """The time that the main thread of a process sleeps, or the thread that enters this; it counts ticks of 10 ms.
 
-    For limits that tell a wait for a timeout from none: on an idle machine it is exact to a few percent.
+    For limits that tell a wait for a timeout from none: time in which the thread works, or waits for a CPU of a busy
+    machine, does not count.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pid: int | None = None) -> None:
         self.seconds = 0.0
+        self._pid = pid
+        self._state = Path()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
     def __enter__(self) -> Self:
+        thread = threading.get_native_id() if self._pid is None else self._pid
+        self._state = Path(f"/proc/{self._pid or 'self'}/task/{thread}/stat")
         self._thread.start()
         return self
 
@@ -88,4 +94,13 @@ class Stopwatch:
 
     def _run(self) -> None:
         while not self._stop.wait(0.01):
-            self.seconds += 0.01
+            if self._is_asleep():
+                self.seconds += 0.01
+
+    def _is_asleep(self) -> bool:
+        """Return whether the thread sleeps: not while it runs or waits for a CPU, nor once it has ended."""
+        try:
+            state = self._state.read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return False
+        return state in {"S", "D"}

@@ -19,7 +19,7 @@ from .markdown import cell, code, docstring, page, section, table
 _SECTIONS: Final = {  # by title: the packages of the names
     "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.samples", "nedbus.transport"),
     "Files": ("nedbus.flights", "nedbus.tables"),
-    "Events": ("nedbus.events",),
+    "Events": ("nedbus.vehicle_events", "nedbus.event_history", "nedbus.event_sources", "nedbus.monitoring"),
     "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
     "Messages, arrays, frames and resets": ("nedbus_msgs",),
 }

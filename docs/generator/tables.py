@@ -10,11 +10,11 @@ from typing import Final
 
 import nedbus
 import nedbus_msgs
-from nedbus.events import KINDS
 from nedbus.log_event import EVENTS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.timings import Timings
+from nedbus.vehicle_events import KINDS
 from nedbus_msgs import MESSAGES, TOPICS, Address, codec_of, encoding_of
 
 from .api import constants_of

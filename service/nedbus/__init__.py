@@ -69,6 +69,7 @@ if TYPE_CHECKING:
         ReceiveError,
         SourceError,
     )
+    from .event_sources import events, why
     from .flights import (
         Flight,
         FlightSamples,
@@ -130,6 +131,7 @@ __all__ = [
     "connect_async",
     "define_msg",
     "dtype_of",
+    "events",
     "mask_invalid",
     "missing_of",
     "open",
@@ -137,6 +139,7 @@ __all__ = [
     "to_array",
     "to_message",
     "utc_of",
+    "why",
 ]  # fmt: skip
 
 # By module; a module is imported on first use of one of its names: those for files load no Zenoh, and few load NumPy.
@@ -144,6 +147,7 @@ _MODULES = {
     "nedbus.samples": "Batch Counts Mode Sample",
     "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest Publisher Subscription connect"
     " connect_async",
+    "nedbus.event_sources": "events why",
     "nedbus.flights": "Flight FlightSamples open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.timeline": "UtcOffset",

@@ -1,27 +1,60 @@
-"""The newest message and health of a stream, and status types: services, publishers, vehicles, events, rejections."""
+"""The newest message and health of a stream, and status types: services, publishers, vehicles, events, rejections.
 
-from .client import (
-    Health,
-    Histogram,
-    LinkCallback,
-    LogStreamStatus,
-    Monitor,
-    NewestMessage,
-    PositionStatus,
-    Publishers,
-    RejectionReport,
-    Rejections,
-    ServiceStatus,
-    SourceStatus,
-    StreamHealth,
-    StreamStatus,
-    Vehicles,
-)
-from .events import AccountReport, Condition, Event, VehicleReport
-from .fusion import Fusion, QuantityFusion
+Each name imports its package on first use: types of events need no Zenoh.
+"""
+
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
+if TYPE_CHECKING:
+    from .client import (
+        Health,
+        Histogram,
+        LinkCallback,
+        LogStreamStatus,
+        Monitor,
+        NewestMessage,
+        PositionStatus,
+        Publishers,
+        RejectionReport,
+        Rejections,
+        ServiceStatus,
+        SourceStatus,
+        StreamHealth,
+        StreamStatus,
+        Vehicles,
+    )
+    from .event_history import EventHistory
+    from .fusion import Fusion, QuantityFusion
+    from .monitoring import LiveEvents
+    from .vehicle_events import (
+        SEVERITIES,
+        AccountReport,
+        Condition,
+        Event,
+        Span,
+        Story,
+        Times,
+        VehicleReport,
+        Verdict,
+    )
+else:
+    _NAMES = {
+        "client": "Health Histogram LinkCallback LogStreamStatus Monitor NewestMessage PositionStatus Publishers"
+        " RejectionReport Rejections ServiceStatus SourceStatus StreamHealth StreamStatus Vehicles",
+        "vehicle_events": "SEVERITIES AccountReport Condition Event Span Story Times VehicleReport Verdict",
+        "event_history": "EventHistory",
+        "fusion": "Fusion QuantityFusion",
+        "monitoring": "LiveEvents",
+    }
+    __getattr__ = lazy_exports(
+        "nedbus", {name: ("", module) for module, names in _NAMES.items() for name in names.split()}
+    )
 
 __all__ = [
-    "AccountReport", "Condition", "Event", "Fusion", "Health", "Histogram", "LinkCallback", "LogStreamStatus",
-    "Monitor", "NewestMessage", "PositionStatus", "Publishers", "QuantityFusion", "RejectionReport", "Rejections",
-    "ServiceStatus", "SourceStatus", "StreamHealth", "StreamStatus", "VehicleReport", "Vehicles",
+    "SEVERITIES", "AccountReport", "Condition", "Event", "EventHistory", "Fusion", "Health", "Histogram",
+    "LinkCallback", "LiveEvents", "LogStreamStatus", "Monitor", "NewestMessage", "PositionStatus", "Publishers",
+    "QuantityFusion", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "Span", "Story",
+    "StreamHealth", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict",
 ]  # fmt: skip

@@ -13,12 +13,12 @@ import pytest
 from nedbus import clock
 from nedbus.client import Health, PublisherRegistry, stream_state
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import Event, EventLog, Times, Verdict, report_of, verdict_of
 from nedbus.mavlink.parser import Received, new_parser, parse
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.reader import LogReceiver
 from nedbus.sources.mavlink.source import _LinkSession
 from nedbus.sources.options import MavlinkOptions
+from nedbus.vehicle_events import Event, EventLog, Times, Verdict, report_of, verdict_of
 from nedbus_msgs import BY_TOPIC, Address
 from tests.peers.px4_log_stream import datagrams
 

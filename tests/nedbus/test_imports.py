@@ -58,7 +58,7 @@ def test_connecting_imports_no_analysis(start: Start) -> None:
 import sys
 import nedbus
 assert callable(nedbus.connect)
-unused = {"numpy", "nedbus.events", "nedbus.flights", "nedbus.pki", "asyncio", "ssl", "typer", "rich"}
+unused = {"numpy", "nedbus.vehicle_events", "nedbus.flights", "nedbus.pki", "asyncio", "ssl", "typer", "rich"}
 unused.add("pydantic.plugin._loader")
 assert not unused & set(sys.modules), unused & set(sys.modules)
 """
@@ -76,7 +76,7 @@ try:
     main()
 except SystemExit as exc:
     assert not exc.code
-unused = "numpy nedbus.events nedbus.flights nedbus.pki nedbus.doctor asyncio ssl rich cryptography http.server"
+unused = "numpy nedbus.vehicle_events nedbus.flights nedbus.pki nedbus.doctor asyncio ssl rich cryptography http.server"
 assert not set(unused.split()) & set(sys.modules), set(unused.split()) & set(sys.modules)
 """
     process = start("-c", program, fresh=True)

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -25,6 +26,7 @@ import typer
 
 from nedbus.cli.app import make_app
 from nedbus.cli.output.logs import RateLimit
+from tests.waits import DEADLINE
 
 from .processes import ForkedProcess, ForkServer, without_coverage
 
@@ -54,6 +56,19 @@ def run_command(*arguments: str, **environment: str) -> CommandResult:
             exit_code = 1
             traceback.print_exc()
     return CommandResult(exit_code, out.getvalue().decode(), err.getvalue().decode())
+
+
+def run_until_shown(text: str, *arguments: str, **environment: str) -> CommandResult:
+    """Repeat a command until it prints a text: a service on a busy machine may answer after the command's timeout.
+
+    Line breaks and spaces of the output count as one space.
+    """
+    end = time.monotonic() + DEADLINE
+    while True:
+        result = run_command(*arguments, **environment)
+        if text in " ".join(result.out.split()) or text in " ".join(result.err.split()):
+            return result
+        assert time.monotonic() < end, f"{text!r} is not shown by {arguments}: {result}"
 
 
 def fork_command(

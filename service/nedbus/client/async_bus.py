@@ -146,6 +146,8 @@ class AsyncBus:
     publishers = _awaited(Bus.publishers)
     services = _awaited(Bus.services)
     accounts = _awaited(Bus.accounts)
+    history = _awaited(Bus.history)
+    why = _awaited(Bus.why)
     fusion = _awaited(Bus.fusion)
     rejections = _awaited(Bus.rejections)
 

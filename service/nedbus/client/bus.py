@@ -49,7 +49,8 @@ from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiv
 from .subscription import Subscription
 
 if TYPE_CHECKING:
-    from nedbus.events import AccountReport
+    from nedbus.event_history import EventHistory
+    from nedbus.vehicle_events import AccountReport, Verdict
 
 
 class Bus(AbstractContextManager["Bus"]):
@@ -223,6 +224,28 @@ class Bus(AbstractContextManager["Bus"]):
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
         """Query the event reports of all nedbus services: events of the last `within` seconds, and vehicle states."""
         return find_reports(self._session, prefix=self.prefix, within=within, timeout=timeout)
+
+    def history(self, *, within: float = 86_400.0, timeout: float = 2.0) -> EventHistory:
+        """Query the events of the last `within` seconds [s] and the vehicle states from all services, as one history.
+
+        Event times are Unix times by the clocks of the services' hosts [s]. A service keeps up to 2,000 events.
+        """
+        from nedbus.event_history import history_of_services
+
+        return history_of_services(self.accounts(within=within, timeout=timeout))
+
+    def why(self, vehicle: str | int, *, at: str | None = None, timeout: float = 2.0) -> Verdict:
+        """Return the verdict on a vehicle from the services' history of the last day: usable or not, and why.
+
+        `at`: the time in question, as in `EventHistory.why`, by default now. `nedbus.why(bus)` has all vehicles.
+
+        Raises NoDataError if no service has data on the vehicle within `timeout` seconds, ArgumentError for `at` if it
+        is no time of this data.
+        """
+        name, history = vehicle_name(vehicle), self.history(timeout=timeout)
+        if name not in history.vehicles:
+            raise NoDataError(f"the event history of vehicle {name}, which services keep,", timeout)
+        return history.why(name, at=at)
 
     def fusion(self, vehicle: str | int, *, duration: float = 2.0) -> Fusion:
         """Return whether PX4 uses the position that is sent into a vehicle, and why not, after `duration` seconds.

@@ -24,7 +24,7 @@ from nedbus.transport import MAX_REPLY_BYTES, RawSample, Session, query, transla
 from nedbus_msgs import REJECTED, Address, all_status_keys, parse_status_key
 
 if TYPE_CHECKING:
-    from nedbus.events import AccountReport
+    from nedbus.vehicle_events import AccountReport
 
 _log = logging.getLogger(__name__)
 
@@ -206,7 +206,7 @@ def find_reports(session: Session, *, prefix: str, within: float, timeout: float
 
     Ignores invalid and oversized replies, and statements about other vehicles than that of the key.
     """
-    from nedbus.events import ACCOUNT_PARAMETER, from_json, joined
+    from nedbus.vehicle_events import ACCOUNT_PARAMETER, from_json, joined
 
     selector = f"{all_status_keys(prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[tuple[str, str], list[AccountReport]] = {}

@@ -19,10 +19,10 @@ from nedbus.client import (
     StreamStatus,
 )
 from nedbus.errors import AddressInUseError, InvalidMessageError
-from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import LinkLoad, Rejection, ReplayRun, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
+from nedbus.vehicle_events import EventLog
 from nedbus_msgs import Address, Definition, get_topic
 
 _log = logging.getLogger(__name__)

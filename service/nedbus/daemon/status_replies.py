@@ -10,7 +10,7 @@ from typing import Final
 
 from nedbus import clock
 from nedbus.client import QueryServer, ServiceStatus, reply_parts
-from nedbus.events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
+from nedbus.vehicle_events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
 from nedbus_msgs import status_key
 
 _FRESH: Final = 0.5  # s; a query for all vehicles of a service asks once for each of them

@@ -10,7 +10,6 @@ from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, PositionStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError, SourceError
-from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import (
     LinkCopies,
@@ -27,6 +26,7 @@ from nedbus.sources import (
 from nedbus.timeline import MAX_PAUSE, Pace
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
+from nedbus.vehicle_events import EventLog
 
 from .output import SourceOutput
 

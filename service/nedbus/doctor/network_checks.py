@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from nedbus.client import ServiceStatus, SourceStatus, prefix_of
-from nedbus.events import by_vehicle, format_duration, format_since
+from nedbus.vehicle_events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
 from .finding import FIRST_PARTNER, Finding, State, brief, list_names

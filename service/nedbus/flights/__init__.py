@@ -10,9 +10,19 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .columns import Columns, Decoded
     from .conversion import convert, convert_flight
-    from .events import EVENT_OPTIONS, MAX_FILE_EVENTS, FileEvents, follow, follow_flight, read_file_events, times_of
+    from .events import (
+        EVENT_OPTIONS,
+        MAX_FILE_EVENTS,
+        FileEvents,
+        detect_sample_events,
+        follow,
+        follow_flight,
+        read_file_events,
+        read_flight_events,
+        times_of,
+    )
     from .flight import Flight, FlightSamples, open_flight, open_messages
-    from .merge import no_utc
+    from .merge import no_utc, require_files
     from .readers import FileStream, FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
     from .utc import find_utc, utc_of
@@ -22,9 +32,10 @@ else:
     _NAMES = {
         ("", "columns"): "Columns Decoded",
         ("mcap", "conversion"): "convert convert_flight",
-        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events times_of",
+        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents detect_sample_events follow follow_flight"
+        " read_file_events read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",
-        ("", "merge"): "no_utc",
+        ("", "merge"): "no_utc require_files",
         ("", "readers"): "FileStream FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",

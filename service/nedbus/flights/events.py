@@ -1,15 +1,19 @@
-"""Event detection in logs and recordings, by replaying them."""
+"""Event detection in logs, recordings and lists of samples, by replaying them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from nedbus.errors import InvalidMessageError
-from nedbus.events import EVENT_TOPICS, EventLog, Times
-from nedbus.samples import SourceMessage
+from nedbus.errors import ArgumentError, InvalidMessageError
+from nedbus.event_history import EventHistory
+from nedbus.samples import Sample, SourceMessage
+from nedbus.timeline import Order
+from nedbus.vehicle_events import EVENT_TOPICS, EventLog, Times, by_vehicle, report_of
+from nedbus_msgs import Address, is_unix_time
 
 from .flight import Flight, open_messages
 from .readers import ReadOptions
@@ -34,6 +38,20 @@ class FileEvents:
     end: float
     warnings: tuple[str, ...]
 
+    def history(self) -> EventHistory:
+        """Return the retained events and the state of each vehicle at the end."""
+        events, total = self.event_log.events_since(0)
+        report = report_of(self.event_log, "", "", self.end, within=math.inf)
+        held = {name: vehicle.held_from_start for name, vehicle in sorted(self.event_log.vehicles.items())}
+        return EventHistory(
+            events=tuple(sorted(events, key=lambda event: event.time)),
+            reports=by_vehicle([report]),
+            times=self.times,
+            from_start={name: text for name, text in held.items() if text},
+            dropped=total - len(events),
+            warnings=self.warnings,
+        )
+
 
 def read_file_events(*paths: Path) -> FileEvents:
     """Detect the events in files; raise the errors of `nedbus.open` and its samples."""
@@ -43,6 +61,72 @@ def read_file_events(*paths: Path) -> FileEvents:
             pass
         event_log.label_first_events()
         return FileEvents(event_log, times_of(flight), flight.duration, flight.warnings)
+
+
+def read_flight_events(flight: Flight) -> FileEvents:
+    """Detect the events of the selected vehicle in an open flight; raise the errors of its call."""
+    event_log, ended, end = EventLog(MAX_FILE_EVENTS), set[str](), 0.0
+    readers = flight._open({*EVENT_TOPICS})
+    try:
+        messages = flight._merge(readers, lambda names: ended.update(names.values()))
+        selected = (message for message in messages if flight._selection.matches(message.address))
+        for message, _, _ in follow(selected, event_log, ended=ended):
+            end = message.at
+    finally:
+        for reader in readers:
+            reader.close()
+    event_log.label_first_events()
+    return FileEvents(event_log, times_of(flight), end, flight.warnings)
+
+
+@dataclass(slots=True)
+class _Received:
+    """A sample, as the order of a flight needs it; `time`: when it was received [us]."""
+
+    sample: Sample[Any]
+    address: Address
+    time: int
+    logged: object  # distinguishes the streams
+    at: float = 0.0
+    error: str | None = None
+
+    @property
+    def timestamp(self) -> int:
+        return int(self.sample.message.timestamp)
+
+
+def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
+    """Detect the events in samples that end; they are put in the order of the vehicles' clocks.
+
+    A retained sample is left out, because its stream may have ended long before the others began. UTC is that of
+    `sample.received`, unless this is a time since boot, as in a log without UTC.
+
+    Raises ArgumentError for anything but a sample.
+    """
+    event_log, offsets, due = EventLog(MAX_FILE_EVENTS), dict[str, float](), 0.0
+    checks = _Checks(event_log)
+    for each in Order[_Received]().arrange(_received(samples)):
+        sample, due = each.sample, each.at
+        checks.advance(due)
+        event_log.add(
+            sample.address, sample.message, due, missing=sample.missing, lost=sample.lost, source=sample.source
+        )
+        if is_unix_time(each.time) and not is_unix_time(each.timestamp):
+            offset = (each.time - each.timestamp) / 1e6
+            offsets[sample.vehicle] = min(offset, offsets.get(sample.vehicle, math.inf))  # with the least delay
+    checks.end(due)
+    event_log.label_first_events()
+    return FileEvents(event_log, Times(offsets=offsets), due, ())
+
+
+def _received(samples: Iterable[Sample[Any]]) -> Iterator[_Received]:
+    topics, streams = {*EVENT_TOPICS}, dict[Address, Address]()
+    for sample in samples:
+        if not isinstance(sample, Sample):
+            raise ArgumentError("source", sample, "a sample; a list of files contains only str and Path")
+        if sample.topic in topics and not sample.retained:
+            stream = streams.setdefault(sample.address, sample.address)  # one object, which identifies the stream
+            yield _Received(sample, stream, sample.received // 1000, stream)
 
 
 def times_of(flight: Flight) -> Times:
@@ -71,24 +155,12 @@ def follow(
 
     `ended`: vehicles without further messages, which do not count as silent.
     """
-    checked = due = 0.0
-
-    def update(time: float) -> None:
-        mains = (event_log.vehicles[name].main for name in ended if name in event_log.vehicles)
-        event_log.update(time, {main: "ended" for main in mains if main})
-
+    checks, due = _Checks(event_log, ended), 0.0
     for message in messages:
         if message.dropout:
             event_log.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.at, message.error, None
-        if due - checked >= _CHECK_INTERVAL and event_log.vehicles.keys() <= set(ended):
-            checked = due  # no vehicle is active between two files
-        settled = checked + _MAX_CHECKED
-        while due - checked >= _CHECK_INTERVAL:
-            checked += _CHECK_INTERVAL
-            update(checked)
-            if checked >= settled and due - checked > _CHECK_INTERVAL:
-                checked = due - _CHECK_INTERVAL  # a long pause changes nothing more
+        checks.advance(due)
         if reason is None:
             try:
                 row, payload, _, missing = message.encode()
@@ -98,5 +170,35 @@ def follow(
         if reason is not None:
             event_log.reject(message.address, reason, due)
         yield message, reason, payload
-    update(due)
-    event_log.settle(due + _SETTLE_TIME)
+    checks.end(due)
+
+
+class _Checks:
+    """Checks of an event log for silence and settled events, twice a second of flight time."""
+
+    def __init__(self, event_log: EventLog, ended: Collection[str] = ()) -> None:
+        self._event_log, self._ended = event_log, ended
+        self._checked = 0.0
+
+    def advance(self, due: float) -> None:
+        """Check the time before a message, which is due at this time [s]."""
+        if due - self._checked < _CHECK_INTERVAL:
+            return
+        if self._event_log.vehicles.keys() <= set(self._ended):
+            self._checked = due  # no vehicle is active between two files
+        settled = self._checked + _MAX_CHECKED
+        while due - self._checked >= _CHECK_INTERVAL:
+            self._checked += _CHECK_INTERVAL
+            self._update(self._checked)
+            if self._checked >= settled and due - self._checked > _CHECK_INTERVAL:
+                self._checked = due - _CHECK_INTERVAL  # a long pause changes nothing more
+
+    def end(self, due: float) -> None:
+        """Check the time of the last message, and report what has not settled."""
+        self._update(due)
+        self._event_log.settle(due + _SETTLE_TIME)
+
+    def _update(self, time: float) -> None:
+        vehicles = self._event_log.vehicles
+        mains = (vehicles[name].main for name in self._ended if name in vehicles)
+        self._event_log.update(time, {main: "ended" for main in mains if main})

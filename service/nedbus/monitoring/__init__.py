@@ -6,6 +6,7 @@ from nedbus.extras import lazy_exports
 
 from .access import why_refused
 from .http_server import HttpServer, Page
+from .live_events import LinkLosses, LiveEvents
 from .observer import Observer, Snapshot
 from .pages import service_pages, why_not_ready
 

@@ -14,9 +14,9 @@ from prometheus_client.core import Metric
 from nedbus import clock
 from nedbus.client import Bus, LogStreamStatus, PositionStatus, find_services
 from nedbus.errors import NedbusError
-from nedbus.events import report_of
 from nedbus.timings import TIMINGS
 from nedbus.transport import RouterState, Session, query_routers
+from nedbus.vehicle_events import report_of
 from nedbus_msgs import Selection
 
 from .http_server import Page

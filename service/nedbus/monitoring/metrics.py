@@ -19,7 +19,7 @@ from prometheus_client.registry import Collector
 from nedbus import clock
 from nedbus.client import Health, Histogram, SourceStatus
 from nedbus.daemon import STATES, TOO_MANY, Daemon, SourceMeasures
-from nedbus.events import SEVERITIES, EventLog
+from nedbus.vehicle_events import SEVERITIES, EventLog
 
 from .http_server import Page
 

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from nedbus import clock
 from nedbus.client import Bus, Health, Monitor, RejectionReport, Sample, stream_state
-from nedbus.events import RECENT, EventLog
 from nedbus.timings import TIMINGS
+from nedbus.vehicle_events import RECENT, EventLog
 from nedbus_msgs import Address, Selection
 
 _MAX_WAITING: Final = 200  # queued messages above which the reader is behind

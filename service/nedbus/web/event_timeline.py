@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from nedbus.events import (
+from nedbus.vehicle_events import (
     Condition,
     Event,
     EventLog,

@@ -12,10 +12,10 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from nedbus.client import Health, LogStreamStatus, Monitor, NewestMessage, RejectionReport, StreamState, stream_state
-from nedbus.events import FIXES, MODES, State, rank_vehicle
 from nedbus.fusion import Fusion
 from nedbus.monitoring import Snapshot
 from nedbus.samples import Sample
+from nedbus.vehicle_events import FIXES, MODES, State, rank_vehicle
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.messages import VehicleStatus
 

@@ -28,11 +28,11 @@ from tornado.web import HTTPError, RequestHandler
 from nedbus import clock
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError
-from nedbus.events import Times, once_per_service
 from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, why_refused
 from nedbus.settings import is_loopback
 from nedbus.timings import TIMINGS
+from nedbus.vehicle_events import Times, once_per_service
 from nedbus_msgs import Selection
 
 from .background import Background

@@ -61,6 +61,22 @@ def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: 
     assert health.age == pytest.approx(7.0)
 
 
+@pytest.mark.parametrize("step", [3600, -3600])
+def test_age_ignores_a_wall_clock_step_before_reading(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """A message that waits while the wall clock is set has its real age, not that of the message before it."""
+    now = utc = 10_000 * SECOND
+    monkeypatch.setattr("time.monotonic_ns", lambda: now)
+    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: utc)
+    monitor = Monitor()
+    monitor.add(dataclasses.replace(sample("1"), received=utc))
+    now, utc = now + 5 * SECOND, utc + 5 * SECOND
+    waiting = dataclasses.replace(sample("1"), received=utc)
+    now, utc = now + 2 * SECOND, utc + (2 + step) * SECOND
+    monitor.add(waiting)
+    age = monitor[Address("1", VLP)].age
+    assert age == pytest.approx(2.0 if step > 0 else 0.0)  # a step back hides how long it waited
+
+
 def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples that queue up while a reader starts, and that it then reads together, do not raise the rate."""
     now, start, address = 0, time.time_ns(), Address("1", VLP)
@@ -201,6 +217,24 @@ def test_network_is_asked_once_per_second_at_most() -> None:
     begin = time.monotonic()
     assert sum(each.alive for each in monitor.values()) == 100
     assert len(asked) <= 1 + time.monotonic() - begin
+
+
+def test_network_is_asked_again_after_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The answer about link and publishers holds for a second: a view notices a publisher that has left by then."""
+    now, publishers = 1000.0, nedbus.health.Publishers({Address("1", VLP): 1})
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    monkeypatch.setattr("time.monotonic_ns", lambda: round(now * SECOND))
+    monitor = Monitor()
+    monitor._view.ask = lambda: (True, publishers)
+    monitor.add(sample("1"))
+    stream = monitor[Address("1", VLP)]
+    now += 1.5
+    assert stream.alive
+    publishers = nedbus.health.Publishers()
+    now += 0.4
+    assert stream.alive
+    now += 0.7
+    assert not stream.alive
 
 
 def test_messages_are_read_while_others_are_added(monkeypatch: pytest.MonkeyPatch) -> None:

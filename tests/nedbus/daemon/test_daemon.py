@@ -19,9 +19,9 @@ import zenoh
 
 import nedbus
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import EventLog
 from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
+from nedbus.vehicle_events import EventLog
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition
 from tests.flights.local_position import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
 from tests.flights.messages import VLP, message

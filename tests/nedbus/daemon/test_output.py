@@ -10,8 +10,8 @@ import pytest
 import nedbus
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import EventLog
 from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
+from nedbus.vehicle_events import EventLog
 from nedbus_msgs import BY_TOPIC, Address, Definition, codec_of
 from tests.flights.messages import VLP
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import pytest
@@ -41,19 +42,34 @@ def test_overload_is_reported(run_nedbus: Start, bus: nedbus.Bus, endpoint: str)
         wait_for(is_published, what="positions")
         assert pages.request("/readyz")[0] == 200
         assert source_status(bus).overload == ""
-        service.signal(signal.SIGSTOP)
-        stopped, number = time.monotonic(), 0
-        while time.monotonic() < stopped + 0.8:
-            if time.monotonic() > stopped + number / 100:
-                send()
-                number += 1
-        service.signal(signal.SIGCONT)
-        wait_for(lambda: source_status(bus).overload, what="the overload")
-        status = source_status(bus)
-        assert "host overloaded: messages up to" in status.overload
-        assert "host overloaded" in pages.request("/readyz")[1]
-        assert pages.values("nedbus_source_overloaded") == [1]
+
+        def stop_for_a_while() -> None:
+            service.signal(signal.SIGSTOP)
+            stopped, number = time.monotonic(), 0
+            while time.monotonic() < stopped + 0.8:
+                if time.monotonic() > stopped + number / 100:
+                    send()
+                    number += 1
+            service.signal(signal.SIGCONT)
+
+        def wait_for_report(is_reported: Callable[[], object], what: str) -> None:
+            """Wait for a report of the overload, and cause it again while there is none: the report ends soon."""
+
+            def is_done() -> bool:
+                stop_for_a_while()
+                wait_for(lambda: source_status(bus).overload, what="the overload")
+                return bool(is_reported())
+
+            wait_for(is_done, what=what)
+
+        def shows(text: str, *arguments: str) -> bool:
+            result = run_command(*arguments, "-c", endpoint)
+            return text in result.out + result.err
+
+        wait_for_report(lambda: "host overloaded: messages up to" in source_status(bus).overload, "the status")
+        wait_for_report(lambda: "host overloaded" in pages.request("/readyz")[1], "the readiness")
+        wait_for_report(lambda: pages.values("nedbus_source_overloaded") == [1], "the metric")
         assert pages.values("nedbus_source_dropped_total") == [0]
-        assert "host overloaded" in run_command("info", "-c", endpoint).out
-        assert "host overloaded" in run_command("health", "-c", endpoint).err
-        assert "overloaded" in run_command("why", "-c", endpoint).out
+        wait_for_report(lambda: shows("host overloaded", "info"), "`info`")
+        wait_for_report(lambda: shows("host overloaded", "health"), "`health`")
+        wait_for_report(lambda: shows("overloaded", "why"), "`why`")

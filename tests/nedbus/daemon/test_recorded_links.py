@@ -7,8 +7,8 @@ from typing import Final
 
 import pytest
 
-from nedbus.events import report_of, verdict_of
 from nedbus.flights import read_file_events
+from nedbus.vehicle_events import report_of, verdict_of
 from tests.flights.recorded_link import Service
 from tests.flights.ulogs import LOGS
 

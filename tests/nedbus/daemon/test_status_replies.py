@@ -8,8 +8,8 @@ import pytest
 
 from nedbus.client import QueryServer, ServiceStatus
 from nedbus.daemon.status_replies import StatusReplies
-from nedbus.events import AccountReport
 from nedbus.transport import Session
+from nedbus.vehicle_events import AccountReport
 
 
 class Clock:

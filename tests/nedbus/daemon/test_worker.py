@@ -13,11 +13,11 @@ from nedbus.client import PublisherRegistry
 from nedbus.daemon import PlannedSource
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
-from nedbus.events import EventLog
 from nedbus.health import SourceStatus
 from nedbus.sources import Rejection, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.sources.options import RecordedOptions
 from nedbus.transport import Session
+from nedbus.vehicle_events import EventLog
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition
 from tests.flights.local_position import decode
 from tests.flights.messages import VLP

@@ -12,10 +12,10 @@ from hypothesis import example, given, strategies as st
 
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ClosedError
-from nedbus.events import EventLog
 from nedbus.flights import flight as flight_module, follow, read_file_events
 from nedbus.samples import SourceMessage
 from nedbus.timeline import Order
+from nedbus.vehicle_events import EventLog
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command

@@ -106,6 +106,27 @@ def test_message_whose_timestamp_is_not_first_is_read(tmp_path: Path) -> None:
     assert nedbus.read(path, "wind").tolist() == [(7, 3.5)]
 
 
+@pytest.mark.parametrize("size", [1, 5000])  # in one run, and in several
+def test_reason_of_skipped_messages_is_that_of_the_first(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, size: int
+) -> None:
+    """The warning about unusable messages names what is wrong with the first of them."""
+    path = tmp_path / "a.mcap"
+    valid = b"\x00\x01\x00\x00" + (7).to_bytes(8, "little") + WIND
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("px4_msgs/msg/Wind", "ros2msg", b"uint64 timestamp\nfloat32 north\n")
+        channel = writer.register_channel("/fmu/out/wind", "cdr", schema)
+        for time, payload in enumerate([valid, b"\x00\x09\x00\x00" + valid[4:], *([valid] * size), valid[:9]]):
+            writer.add_message(channel, time, payload, time)
+        writer.finish()
+    assert len(nedbus.read(path, "wind")) == size + 1
+    [warning] = caplog.messages
+    assert f"skipped 2 of {size + 3} messages" in warning
+    assert "starts with 00 09" in warning
+
+
 @pytest.mark.parametrize("annotation", ["@range 5, 0", "@range 0; 9"])
 def test_definition_with_invalid_range_is_read_without_it(tmp_path: Path, annotation: str) -> None:
     """An annotation that would be an error in a .msg file costs only its rule, with a warning, not the topic."""

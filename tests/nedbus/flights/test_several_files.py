@@ -157,3 +157,19 @@ def test_swarm_from_user_report_is_aligned() -> None:
     assert [*streams] == [f"{name}/{VLP}" for name in ("swarm_a", "swarm_b", "3")]
     assert {int(each["timestamp"][0]) for each in streams.values()} == {EPOCH + 60_000_000}
     assert 9.9 < read_file_events(*paths).end < 10.1
+
+
+def test_old_first_message_does_not_shift_a_file(tmp_path: Path) -> None:
+    """A message from long before the log, as PX4 logs one of each topic, does not decide on the start in UTC."""
+    late = UlogWriter()
+    key = b"uint64_t boot_time_utc_us"
+    late.put("I", bytes([len(key)]) + key + struct.pack("<Q", EPOCH))
+    late.define([VLP, OTHER])
+    late.add(OTHER, message(30_000_000, **VALID))
+    for tenth in range(100):
+        late.add(VLP, message(60_000_000 + tenth * 100_000, **VALID))
+    paths = [late.write(tmp_path / "a.ulg"), write_flight(tmp_path / "b.ulg", boot=0, start=60)]
+    with nedbus.open(paths) as flights:
+        assert flights.duration == pytest.approx(9.9)
+        positions = [sample.vehicle for sample in flights(VLP)]
+    assert positions[:6].count("a") == positions[:6].count("b") == 3

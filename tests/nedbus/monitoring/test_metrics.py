@@ -23,7 +23,6 @@ from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.worker import State
-from nedbus.events import AccountReport, EventLog, VehicleReport
 from nedbus.health import SourceStatus, StreamHealth, StreamStatus
 from nedbus.monitoring import Exporter, HttpServer, Page, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page, stream_metrics
@@ -31,6 +30,7 @@ from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import Session
+from nedbus.vehicle_events import AccountReport, EventLog, VehicleReport
 from nedbus_msgs import Address, VehicleLocalPosition
 from nedbus_msgs.messages import VehicleStatus
 from tests.flights.local_position import encode

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.events import KINDS, Event, Times
+from nedbus.vehicle_events import KINDS, Event, Times
 from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
 from tests.flights.messages import VLP, message

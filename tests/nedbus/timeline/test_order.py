@@ -70,6 +70,35 @@ def test_streams_written_in_batches_are_sorted() -> None:
     assert found == stamps
 
 
+@pytest.mark.parametrize("back", [1_500_000, 2_500_000])
+def test_reboot_to_almost_the_same_time_begins_a_new_boot(back: int) -> None:
+    """Times more than 1 s before the last ones are those of a new boot, whose place the recorder's clock shows."""
+    first = [5_000_000 + number * STEP for number in range(50)]
+    again = [stamp - back + first[-1] - first[0] for stamp in first]
+    messages = [Message(stamp, 10**15 + stamp) for stamp in first]
+    messages += [Message(stamp, 10**15 + stamp + 20_000_000) for stamp in again]
+    order = Order[Message]()
+    found = list(order.arrange(messages))
+    assert [each.timestamp for each in found] == first + again
+    elapsed = (again[0] + 20_000_000 - first[-1]) / 1e6
+    assert found[50].at - found[49].at == pytest.approx(elapsed)
+    assert order.axis.boots("1") == 2
+
+
+@pytest.mark.parametrize(("back", "boots"), [(800_000, 1), (1_500_000, 2), (2_500_000, 2)])
+def test_log_that_goes_back_by_more_than_a_second_has_a_new_boot(back: int, boots: int) -> None:
+    """In a log without log times, times up to a second before the last ones are late, earlier ones of a new boot."""
+    first = [5_000_000 + number * STEP for number in range(200)]
+    again = [first[-1] - back + number * STEP for number in range(200)]
+    order = Order[Message](has_log_times=False)
+    found = list(order.arrange([Message(stamp, stamp) for stamp in (*first, *again)]))
+    assert order.axis.boots("1") == boots
+    if boots == 1:
+        assert [each.timestamp for each in found] == sorted([*first, *again])
+    else:
+        assert [each.timestamp for each in found] == first + again
+
+
 @pytest.mark.parametrize("has_log_times", [True, False])
 def test_last_message_after_a_pause_is_a_pause(*, has_log_times: bool) -> None:
     """A last message up to a day later ends a pause; one on no clock of the vehicle is out of order."""

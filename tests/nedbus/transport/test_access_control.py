@@ -32,7 +32,7 @@ from tests.nedbus.client.downsampling import Clock, clock, publish, wait_for_dow
 from tests.nedbus.client.numbered import receive_timestamps
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.certificates import CONFIG, client_tls, pki, secure_endpoint, tls_options, write_config
-from tests.peers.command_line import run_command
+from tests.peers.command_line import run_command, run_until_shown
 from tests.peers.custom_timings import start_with_timings
 from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_endpoint, free_port
@@ -477,13 +477,11 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     assert json.loads(pages.request("/status")[1])["refused"] == ["2"]
     reader = ("--wait", "-c", endpoint, *tls_options(pki, "reader"))
     if certificate == "vehicle-1":  # a certificate without a rule denies the status, too
-        info = run_command("info", *reader)
+        info = run_until_shown("vehicles refused by the router: 2", "info", *reader)
         assert info.exit_code == 0, info.err
-        assert "vehicles refused by the router: 2" in info.out
         assert re.search(rf"2/{VLP} .*refused by the router", info.out)
-        health = run_command("health", *reader)
-        assert health.exit_code == 1
-        assert "the router refuses messages of vehicle 2: allow them in its access rules" in health.err
+        refusal = "the router refuses messages of vehicle 2: allow them in its access rules"
+        assert run_until_shown(refusal, "health", *reader).exit_code == 1
 
     write_access_rules(file, ["1", "2"])
     own = '{ rules: ["vehicle-2-in"], subjects: ["vehicle-2"] }'

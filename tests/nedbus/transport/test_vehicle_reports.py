@@ -132,8 +132,13 @@ def test_events_and_verdicts_of_a_vehicle_are_its_own(fleet: Fleet, run_nedbus: 
     assert service is not None
     with fleet.forging(service):
         # What the page, `events` and `why` show.
-        wait_for(lambda: reader.accounts(within=1e9), what="the report about vehicle 2")
-        reports = reader.accounts(within=1e9)
+        reports: list[nedbus.health.AccountReport] = []
+
+        def has_reports() -> bool:
+            reports[:] = reader.accounts(within=1e9)
+            return any(report.vehicles for report in reports)
+
+        wait_for(has_reports, what="the report about vehicle 2")
         assert {name for report in reports for name in report.vehicles} == {"2"}
         assert {report.service for report in reports if report.vehicles} == {service}
         assert "forged" not in str(reports)

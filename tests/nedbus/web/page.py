@@ -22,10 +22,10 @@ from bokeh.models.widgets import Div
 
 import nedbus
 from nedbus.client import LogStreamStatus, Sample, describe_stream, stream_state
-from nedbus.events import EventLog
 from nedbus.flights import RecordingWriter
 from nedbus.health import Fusion
 from nedbus.monitoring import Snapshot
+from nedbus.vehicle_events import EventLog
 from nedbus.web import PageOptions, serve_live
 from nedbus.web.event_timeline import EventTimeline
 from nedbus.web.fleet import Fleet, FleetSnapshot, StreamView, VehicleView

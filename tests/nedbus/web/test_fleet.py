@@ -12,8 +12,8 @@ import pytest
 
 from nedbus import Sample
 from nedbus.client import LogStreamStatus
-from nedbus.events import EventLog, Times
 from nedbus.monitoring import Snapshot
+from nedbus.vehicle_events import EventLog, Times
 from nedbus.web.event_timeline import EventTimeline
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream, Position

@@ -11,8 +11,8 @@ import pytest
 from bokeh.models import DatetimeTickFormatter, HBar
 
 from nedbus.errors import NedbusError
-from nedbus.events import Event, Span
 from nedbus.flights import RecordingWriter
+from nedbus.vehicle_events import Event, Span
 from nedbus.web.fleet import TRUTH
 from nedbus.web.playback import Player, Recording
 from nedbus.web.style import DARK

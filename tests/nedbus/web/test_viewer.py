@@ -23,9 +23,9 @@ from hypothesis import given, strategies as st
 
 import nedbus
 from nedbus.client import LogStreamStatus, RejectionReport, reply_parts
-from nedbus.events import AccountReport, Event, VehicleReport
 from nedbus.health import Fusion, PositionStatus, QuantityFusion
 from nedbus.transport import Session, open_router
+from nedbus.vehicle_events import AccountReport, Event, VehicleReport
 from nedbus.web.column_data import LINE_TYPES, Track, Tracks
 from nedbus.web.fleet import TRUTH
 from nedbus.web.map import MIN_SIDE

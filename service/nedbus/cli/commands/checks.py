@@ -17,8 +17,8 @@ from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, format_duration
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
 from nedbus.settings import Settings
+from nedbus.vehicle_events import VALID, AccountReport, Expectation, VehicleReport, faults_of
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
 _HOST: Final = socket.gethostname()

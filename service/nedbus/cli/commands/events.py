@@ -1,17 +1,15 @@
 """Commands for vehicle events and their causes: events, why."""
 
 import json
-import math
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from nedbus import clock
+import nedbus
 from nedbus.cli.options import (
     CsvOption,
     DurationOption,
@@ -24,26 +22,14 @@ from nedbus.cli.options import (
 )
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import (
-    SEVERITIES,
-    WINDOW,
-    Event,
-    Story,
-    Times,
-    Verdict,
-    by_vehicle,
-    events_outside,
-    format_duration,
-    once_per_service,
-    report_of,
-    verdict_of,
-)
-from nedbus.flights import FileEvents, read_file_events
+from nedbus.clock import format_duration
+from nedbus.errors import ArgumentError, ConfigError, NedbusError
+from nedbus.health import SEVERITIES, Event, EventHistory, Story, Times, Verdict
 from nedbus_msgs import ANY, Selection, check_vehicle
 
 if TYPE_CHECKING:
-    from nedbus.client import Bus
+    from nedbus import Bus
+    from nedbus.health import LiveEvents
 
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
@@ -53,11 +39,6 @@ _MAX_TEXT: Final = 400  # characters of a peer's text
 _WITHIN: Final = "First show the events of the last SECONDS"
 _ORIGIN: Final = "PX4's own log messages, or events derived by nedbus"
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
-_LOSS_KINDS: Final = frozenset({"lost", "dropout"})
-_LOSS_QUERY: Final = 5.0  # s between queries of the services for losses
-_LOSS_TIMEOUT: Final = 1.0  # s
-_LOSS_WINDOW: Final = 60.0  # s; a loss is reported up to 25 s after it began
-_DAY: Final = 86_400.0
 
 
 @command
@@ -103,31 +84,27 @@ def events(
             write(form(event, times))
 
     if not files:
-        begin(times := Times(is_live=True), {"host"})
-        with open_bus() as bus:
+        with open_bus() as bus, nedbus.events(bus, vehicle=vehicle or ANY, within=within) as live:
+            begin(times := live.times, {"host"})
             if within is not None:
-                reports = [
-                    report
-                    for report in bus.accounts(within=within)
-                    if not report.vehicles or any(map(selection.matches_vehicle, report.vehicles))
-                ]
-                show([event for _, event in once_per_service(reports)], times)
-            _follow(bus, selection, lambda found: show(found, times), duration)
+                show(live.poll(), times)  # before the first message arrives
+            _follow(bus, live, lambda new: show(new, times), duration)
         return
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
-    read, found = _read(files)
-    _require_vehicles(_name(files), read.event_log.vehicles, vehicle or ())
-    found = select(found)
-    unknown = {"boot"} if read.times.remarks.keys() - read.times.offsets.keys() else set()
-    begin(read.times, {read.times.clock(event) for event in found} or unknown)
-    show(found, read.times)
-    vehicles = sorted(each for each in read.event_log.vehicles.items() if selection.matches_vehicle(each[0]))
-    if texts := [f"{name}: {held}, throughout the file" for name, each in vehicles if (held := each.held_from_start)]:
-        write_stderr("\n".join(texts))
-    elif not found:
+    history = _read(files)
+    _require_vehicles(_name(files), history.vehicles, vehicle or ())
+    selected = select(history)
+    times = history.times
+    unknown = {"boot"} if times.remarks.keys() - times.offsets.keys() else set()
+    begin(times, {times.clock(event) for event in selected} or unknown)
+    show(selected, times)
+    initial = {name: text for name, text in history.from_start.items() if selection.matches_vehicle(name)}
+    if initial:
+        write_stderr("\n".join(f"{name}: {text}, throughout the file" for name, text in initial.items()))
+    elif not selected:
         limit = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
-        write_stderr(f"{_name(files)}: no events{limit} in {read.end:.0f} s")
+        write_stderr(f"{_name(files)}: no events{limit} in {history.end:.0f} s")
 
 
 @command
@@ -147,69 +124,67 @@ def why(
     the nedbus services. Exits with 0 even if there are faults.
     """
     if files:
-        read, found = _read(files)
-        reports, times = [report_of(read.event_log, "", "", read.end, within=math.inf)], read.times
+        history = _read(files)
         where, advice = _name(files), _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
     else:
         with open_bus() as bus:
-            reports = bus.accounts(within=_DAY)
+            history = bus.history()
             published = bus.vehicles()
-            routers = " or ".join(bus.routers)
-            absence = "" if by_vehicle(reports) else _explain_absence(bus)
-        found = _in_order(event for report in reports for event in report.events)
-        times, where, advice = Times(is_live=True), "the history of the services", _LIVE_ADVICE
-    reporting, faults, texts = by_vehicle(reports), 0, list[str]()
-    for name in vehicle or ():
-        if not files and name in published and name not in reporting:
-            hint = f"follow it with 'nedbus events --vehicle {name}'"
-            raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
-    if not files and not reporting:
-        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: {absence}")
-    _require_vehicles(where, reporting, vehicle or ())
-    for name in vehicle or reporting:
-        events = [event for event in found if event.vehicle in (name, ANY)]
-        known, end = reporting[name].vehicles[name], reporting[name].now
-        try:
-            moment = None if at is None or not events else times.find(at, events[-1])
-        except ValueError as exc:
-            raise ConfigError("--at", f"{at!r}: {exc}: expected {_AT}") from exc
-        verdict = verdict_of(
-            name, events, known.held, topics=known.topics, unknown=known.unknown, times=times, end=end, at=moment,
-            since=known.first,
-        )  # fmt: skip
+            _require_history(bus, history, published, vehicle or ())
+        where, advice = "the history of the services", _LIVE_ADVICE
+    _require_vehicles(where, history.vehicles, vehicle or ())
+    faults, texts = 0, list[str]()
+    for name in vehicle or history.vehicles:
+        verdict = _verdict(history, name, at)
         if json_output:
-            write(json.dumps({"vehicle": name} | _verdict_fields(verdict, times)))
+            write(json.dumps({"vehicle": name} | _verdict_fields(verdict)))
             continue
         faults += len(verdict.stories)
         texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
         if details:
-            texts += ["\n".join(_describe(name, story, times, end, advice)) for story in verdict.stories]
-            if other := events_outside(verdict.stories, events):
-                texts.append("\n".join([f"{name}: other texts", *(_timed(event, times) for event in other)]))
+            texts += ["\n".join(_describe(verdict, story, advice)) for story in verdict.stories]
+            if verdict.others:
+                lines = [_timed(event, verdict.times) for event in verdict.others]
+                texts.append("\n".join([f"{name}: other texts", *lines]))
     if texts:
         write(("\n\n" if details else "\n").join(texts))
     if faults and not details:
         write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
 
 
-def _explain_absence(bus: "Bus") -> str:
-    from nedbus.cli.absence import explain_absence  # loads Zenoh, which files do not need
+def _verdict(history: EventHistory, vehicle: str, at: str | None) -> Verdict:
+    try:
+        return history.why(vehicle, at=at)
+    except ArgumentError as exc:
+        raise ConfigError("--at", f"{at!r}: {exc.__cause__}: expected {_AT}") from exc
 
-    return explain_absence(bus, ()).reason
+
+def _require_history(bus: "Bus", history: EventHistory, published: Collection[str], vehicles: Collection[str]) -> None:
+    for name in vehicles:
+        if name in published and name not in history.vehicles:
+            hint = f"follow it with 'nedbus events --vehicle {name}'"
+            raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
+    if not history.vehicles:
+        from nedbus.cli.absence import explain_absence  # loads Zenoh, which files do not need
+
+        routers = " or ".join(bus.routers)
+        reason = explain_absence(bus, ()).reason
+        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: {reason}")
 
 
-def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
-    yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
+def _describe(verdict: Verdict, story: Story, advice: str) -> Iterator[str]:
+    times = verdict.times
+    yield fold(f"{verdict.vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {verdict.period(story)}")
     sections = {"evidence": story.before, "meanwhile": story.meanwhile}
     if story.end is not None:
         sections[f"ended at {times.text(story.end)}{' with' * bool(story.after)}"] = story.after
     for title, shown in sections.items():
         if shown or title.startswith("ended"):
             yield f"  {title}"
-        for each in shown:
-            yield _timed(each, times, story.since if title == "evidence" else None)
-    if not (story.before or story.meanwhile) and story.begin is not None:
-        yield f"  no evidence in the {WINDOW:.0f} s before it"
+        for event in shown:
+            yield _timed(event, times, story.since if title == "evidence" else None)
+    if story.remark:
+        yield f"  {story.remark}"
     if story.lacking:
         yield fold("  ", f"missing topics that may explain it: {', '.join(story.lacking)}; {advice}")
 
@@ -245,79 +220,35 @@ def _before(event: Event, time: float) -> str:
     return f"{_shown(event)} ({distance} {'before' if event.time <= time else 'after'})"
 
 
-def _follow(
-    bus: "Bus", selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None
-) -> None:
+def _follow(bus: "Bus", live: "LiveEvents", show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
     from nedbus.cli.follow import follow
-    from nedbus.monitoring import Observer
 
-    observer, seen = Observer(bus, selection), 0
     known: set[str] = set()
-    losses = _LinkLosses(bus)
 
     def show_new() -> None:
-        nonlocal seen
-        observer.poll()
-        new, seen = observer.event_log.events_since(seen)
-        show(event.later(clock.to_utc()) for event in new)
-        show(losses.poll())
-        known.intersection_update(observer.event_log.vehicles)
-        for name, each in list(observer.event_log.vehicles.items()):
-            if name not in known and each.main is not None:
-                known.add(name)
-                if initial := each.held_from_start:
-                    write_stderr(f"{name}: {initial}, from the start")
+        show(live.poll())
+        from_start = live.from_start
+        known.intersection_update(from_start)
+        for name, text in from_start.items():
+            if name not in known and text:
+                write_stderr(f"{name}: {text}, from the start")
+        known.update(from_start)
 
-    with observer.subscription as subscription:
-        follow(bus, subscription, observer.add, count=None, duration=duration, each_second=show_new)
-
-
-class _LinkLosses:
-    """Losses on the links of vehicles and logging dropouts: only the services that receive the vehicles know them."""
-
-    def __init__(self, bus: "Bus") -> None:
-        self._bus = bus
-        self._shown: set[tuple[object, ...]] = set()
-        self._next_query = 0.0
-        self.poll()  # earlier ones are shown by --within
-
-    def poll(self) -> list[Event]:
-        """Return what the services have reported since the last call; ask them at most every 5 s."""
-        now = time.monotonic()
-        if now < self._next_query:
-            return []
-        self._next_query = now + _LOSS_QUERY
-        found = {
-            (report.service, event.vehicle, *event.identity): _on_link(event, report.service)
-            for report in self._bus.accounts(within=_LOSS_WINDOW, timeout=_LOSS_TIMEOUT)
-            for event in report.events
-            if event.kind in _LOSS_KINDS
-        }
-        new = [event for key, event in found.items() if key not in self._shown]
-        self._shown |= found.keys()
-        return _in_order(new)
-
-
-def _on_link(event: Event, service: str) -> Event:
-    return replace(event, text=f"{event.text}, on the link to the service {service}")
+    follow(bus, live.subscription, live.add, count=None, duration=duration, each_second=show_new)
 
 
 def _name(files: Sequence[Path]) -> str:
     return ", ".join(map(str, files))
 
 
-def _read(files: Sequence[Path]) -> tuple[FileEvents, list[Event]]:
-    read = read_file_events(*files)
-    found, total = read.event_log.events_since(0)
-    for warning in read.warnings:
+def _read(files: Sequence[Path]) -> EventHistory:
+    history = nedbus.events(files)
+    for warning in history.warnings:
         write_stderr(warning)
-    if total > len(found):
-        write_stderr(f"{_name(files)}: showing the last {len(found)} of {total} events")
-    return read, _in_order(found)
-
-
-def _in_order(events: Iterable[Event]) -> list[Event]:
-    return sorted(events, key=lambda event: event.time)
+    if history.dropped:
+        total = history.dropped + len(history)
+        write_stderr(f"{_name(files)}: showing the last {len(history)} of {total} events")
+    return history
 
 
 def _to_fields(event: Event, times: Times) -> dict[str, object]:
@@ -338,9 +269,9 @@ def _to_csv(event: Event, times: Times) -> str:
     return csv_line([fields[name] for name in _HEAD])
 
 
-def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
+def _verdict_fields(verdict: Verdict) -> dict[str, object]:
     def fields(events: Iterable[Event | None]) -> list[dict[str, object] | None]:
-        return [None if event is None else _to_fields(event, times) for event in events]
+        return [None if event is None else _to_fields(event, verdict.times) for event in events]
 
     faults = [
         {

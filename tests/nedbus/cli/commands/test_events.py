@@ -8,11 +8,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import re
 import struct
 import time
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +18,9 @@ import pytest
 
 import nedbus
 from nedbus import Address
-from nedbus.cli.commands.events import _LinkLosses
-from nedbus.client import QueryServer, reply_parts
-from nedbus.events import KINDS, EventLog, report_of
 from nedbus.flights import format_of, read_file_events
 from nedbus.transport import Session
-from nedbus_msgs import status_key
+from nedbus.vehicle_events import KINDS
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, cached_events
 from tests.peers.command_line import CommandResult, run_command
@@ -81,7 +76,7 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cache the parsed real log for all tests: only the output of the commands is tested."""
-    target = "nedbus.cli.commands.events.read_file_events"
+    target = "nedbus.event_sources.read_file_events"
     monkeypatch.setattr(target, lambda path: (cached_events if path == REAL else read_file_events)(path))
 
 
@@ -421,32 +416,6 @@ def test_events_live_are_printed_as_they_happen(
     lines = [line.split(None, 2)[1:] for line in follower.out.splitlines()]
     assert [line[0] for line in lines] == ["7"] * len(lines)
     assert lines[0][1].startswith("BAD    xy not valid")
-
-
-def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """Live `events` shows losses that a service reports, once each: begin, duration, count and the service."""
-    event_log, address = EventLog(), Address("7", VLP)
-    server = QueryServer(zenoh_session)
-    server.answer_json(
-        status_key("gcs", vehicle="7"),
-        lambda _: reply_parts(report_of(event_log, "gcs", "host", 200.0, within=math.inf, to_utc=1.7e9)),
-    )
-
-    def lose(start: int) -> None:
-        for second in range(8):
-            event_log.add(address, message(second), float(start + second), lost=100)
-        event_log.settle(start + 20.0)
-
-    with closing(server):
-        lose(100)
-        losses = _LinkLosses(bus)
-        lose(150)
-        losses._next_query = 0.0
-        shown = losses.poll()
-        again = losses.poll()
-    text = f"800 messages lost in 7.0 s ({VLP}), on the link to the service gcs"
-    assert [(event.vehicle, event.text, event.time) for event in shown] == [("7", text, 1.7e9 + 150)]
-    assert again == []
 
 
 def test_events_live_filter_by_vehicle_and_severity(

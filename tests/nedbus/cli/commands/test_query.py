@@ -22,7 +22,7 @@ from nedbus.transport import liveliness, open_router
 from nedbus_msgs import ANY
 from tests.flights.local_position import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
-from tests.peers.command_line import fork_command, run_command
+from tests.peers.command_line import fork_command, run_command, run_until_shown
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import DEADLINE, wait_for
@@ -165,10 +165,10 @@ def test_get_shows_the_last_message(simulation: str) -> None:
 @pytest.mark.process
 def test_info_shows_the_services(simulation: str) -> None:
     """`info` prints the router, the vehicles, and the services with their sources."""
-    info = run_command("info", "-c", simulation)
+    info = run_until_shown("running", "info", "-c", simulation)
     assert info.exit_code == 0, info.err
     assert all(text in info.out for text in (f"router    {simulation}", "vehicles  1", "SOURCE", "running"))
-    machine = run_command("info", "-c", simulation, "--json")
+    machine = run_until_shown('"state": "running"', "info", "-c", simulation, "--json")
     assert json.loads(machine.out)["sources"][0]["source"] == "sim:"
 
 

@@ -27,7 +27,7 @@ from nedbus.timings import Timings
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.flights.messages import VALID, VLP, message
-from tests.peers.command_line import fork_command, run_command
+from tests.peers.command_line import fork_command, run_command, run_until_shown
 from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import ForkServer, Start, without_coverage
@@ -215,7 +215,7 @@ def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_s
     gone = [f"wing-1/vehicle_local_position_{number}" for number in range(5)]
     sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
     service = answer(zenoh_session, "nedbus/@service/wing-1/s/status", {"service": "s", "sources": sources})
-    info = run_command("info", "-c", endpoint)
+    info = run_until_shown("5 gone", "info", "-c", endpoint)
     assert info.exit_code == 0, info.err
     assert "  5 gone\n" in info.out
     assert f"\ngone: {', '.join(gone)}\n" in info.out
@@ -321,9 +321,12 @@ def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, t
     hz = start_with_timings(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
     timings.stale = 0.5
-    listed = run_command("list", "-c", endpoint)
-    assert [line.split()[3] for line in listed.out.splitlines()[1:]] == ["stale:"] * 5
-    assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5
+
+    def listed() -> list[str]:
+        return [line.split()[3] for line in run_command("list", "-c", endpoint).out.splitlines()[1:]]
+
+    wait_for(lambda: listed() == ["stale:"] * 5, what="the streams in `list`")
+    wait_for(lambda: run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5, what="them in `info`")
 
 
 def answer(zenoh_session: Session, key: str, status: object) -> object:

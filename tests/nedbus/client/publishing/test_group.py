@@ -72,6 +72,14 @@ def test_quick_succession_forms_groups_after_its_first_messages(clock: Clock) ->
     assert clock.numbers == list(range(16 + 3 * MAX_GROUP))
 
 
+def test_pause_ends_a_quick_succession(clock: Clock) -> None:
+    """After a pause, the first 16 messages of the next quick succession are put at once again."""
+    clock.publish(16 + MAX_GROUP, pause=QUICK)
+    clock.publish(1, pause=1.0)
+    clock.publish(15 + MAX_GROUP, pause=QUICK)
+    assert clock.sizes == ([1] * 16 + [MAX_GROUP]) * 2
+
+
 @pytest.mark.parametrize(("room", "size"), [(37, 37), (1, 1), (0, 1), (-5, 1)])
 def test_group_ends_where_flow_control_is_due(clock: Clock, room: int, size: int) -> None:
     """A group has no more messages than flow control allows until it is due, but at least one."""

@@ -37,6 +37,7 @@ from tests.waits import DEADLINE, wait_for
 
 from .raw_samples import (
     INVALID,
+    KEY,
     OTHER_KEY,
     SOURCE,
     VALID,
@@ -144,6 +145,27 @@ def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
         inbox.on_retransmission(writer, {number: raw(number, timestamp=number)}, ended=True, now=now)
     assert timestamps(inbox) == [1, 1, 2, 3, 4, 5, 6]
     assert inbox.counts == Counts(received=7)
+
+
+@pytest.mark.parametrize(("is_link_changed", "requested"), [(False, range(5, 6)), (True, range(6))])
+def test_heartbeat_of_an_unknown_publisher_requests_what_the_outage_may_have_lost(
+    is_link_changed: bool, requested: range
+) -> None:
+    """After a link change, an unknown publisher may have sent all its messages during the outage, else only the last.
+
+    What it no longer caches predates the subscription, and is not lost.
+    """
+    inbox = make_queue("every")
+    if is_link_changed:
+        inbox.on_link_change()
+    inbox.on_heartbeat(KEY, name_of("b"), 5)
+    [writer] = inbox.gaps.requesting
+    assert inbox.next_request(writer, 100.0) == requested
+    answered = {number: raw(number, timestamp=number, publisher="b") for number in requested}
+    inbox.on_retransmission(writer, answered, ended=True, now=100.0)
+    assert inbox.next_request(writer, 101.0) is None
+    assert timestamps(inbox) == list(requested)
+    assert inbox.counts == Counts(received=len(requested))
 
 
 @pytest.mark.parametrize("when", ["during a gap", "after it"])

@@ -41,7 +41,7 @@ from tests.flights.local_position import (
 )
 from tests.flights.messages import VLP, message
 from tests.nedbus.bridges.test_ros2 import Peer, flight, peer, plain_session
-from tests.peers.command_line import run_command
+from tests.peers.command_line import run_command, run_until_shown
 from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
@@ -270,7 +270,7 @@ def test_user_definition_adds_a_message(
     zenoh_session.put(key, b"")
     wait_for(lambda: source_status(bus).not_carried == ("WheelEncoders",), what="the unsupported message")
     assert source_status(bus).rejected == 0
-    assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
+    run_until_shown("not carried: WheelEncoders", "info", "--connect", endpoint)
     token.undeclare()
     wait_for(lambda: source_status(bus).not_carried == (), what="no unsupported message")
     service.kill()

@@ -113,7 +113,8 @@ def test_delay_includes_the_time_that_messages_wait(tmp_path: Path, monkeypatch:
                     break
             asked = time.monotonic()
     least, delay, most = compared[1]  # the clock is measured during the first second
-    assert least - 0.05 <= delay <= most + 0.05
+    tolerance = 0.05 + px4.lateness  # the vehicle's time is measured by its replies, which a busy machine delays
+    assert least - tolerance <= delay <= most + tolerance
     assert delay > 0.1
 
 

@@ -16,10 +16,10 @@ from nedbus import Bus, Counts, Sample, Selection
 from nedbus.client import PublisherRegistry, Publishers
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import from_json
 from nedbus.monitoring import Observer
 from nedbus.settings import load_settings
 from nedbus.sources import Rejection, SourceMessage
+from nedbus.vehicle_events import from_json
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VALID, VLP, message
 

@@ -84,6 +84,13 @@ class Story:
         """Sort key, worst first."""
         return rank(self.spans[0], self.until)
 
+    @property
+    def remark(self) -> str:
+        """The text that no evidence was found; "" if there is some, or the fault began before the data."""
+        if self.before or self.meanwhile or self.begin is None:
+            return ""
+        return f"no evidence in the {WINDOW:.0f} s before it"
+
     def has_ended(self, now: float) -> bool:
         """Return True if it is over, and not a single event of the last minute."""
         return not any(span.holds(now) for span in self.spans)

@@ -31,14 +31,24 @@ class Verdict:
     `usable`: False if the fault kept the vehicle from its task, True if not; None if the data has no position validity.
     `begin`, `end`: events that began and ended the worst fault, None if it was active in the first or last message.
     `cause`: its evidence. `stories`: all faults. Both are in chronological order.
+    `vehicle`, `times`, `checked`: the vehicle, the clock of its events, and the time to which the verdict refers: now,
+    or the end of the file, on the clock of `event.time` [s]. `others`: PX4's texts that are in no story.
     """
 
     text: str
     usable: bool | None
+    vehicle: str
+    times: Times
+    checked: float
     begin: Event | None = None
     end: Event | None = None
     cause: tuple[Event, ...] = ()
     stories: tuple[Story, ...] = ()
+    others: tuple[Event, ...] = ()
+
+    def period(self, story: Story) -> str:
+        """Format the period of one of its stories, such as "from 14:05:01.2 UTC, until now (3.4 s)"."""
+        return story.when(self.times, self.checked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +149,7 @@ def verdict_of(
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
         remark = "" if known else f"; {_describe_unknown(topics)}"
-        return Verdict(f"{_without_faults(held, times, end, since)}{remark}", known)
+        return Verdict(f"{_without_faults(held, times, end, since)}{remark}", known, vehicle, times, end)
     is_now = times.is_live and at is None
     past = [story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)]
     ranked = sorted(stories, key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank))
@@ -157,7 +167,7 @@ def verdict_of(
     others = tuple(_others(worst, ranked, cause, stories, times))
     is_another_bad = sum(story.is_bad for story in stories) > 1
     text = _Parts(state, tuple(ordered), none, missing, others, is_another_bad).render(times)
-    return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
+    return Verdict(text, usable, vehicle, times, end, worst.begin, worst.end, cause, tuple(stories))
 
 
 def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Event, Story, Times, stories_of, unit_of
+from nedbus.vehicle_events import Event, Story, Times, stories_of, unit_of
 
 from .flight import ARMED, Flight, lose_gps
 
@@ -74,6 +74,21 @@ def test_estimate_fault_that_outlasts_another_is_a_story() -> None:
     flight.status(ARMED, failsafe=True)
     flight.wait(2.0).send(xy_valid=False)
     assert [each.what for each in why(flight)] == ["z not valid", "xy not valid"]
+
+
+def test_wild_end_without_its_begin_leaves_an_earlier_fault() -> None:
+    """A condition of one message, whose begin a full event log has dropped, does not remove an earlier fault's end."""
+    flight = Flight()
+    flight.send()
+    flight.wait(1.0).send(xy_valid=False)
+    flight.wait(4.0).send()
+    flight.fly(15)
+    flight.wait(0.1).send(xy_valid=False)
+    flight.wait(0.1).send()
+    begin, end, _, wild = flight.event_log.events
+    assert ("one_message" in wild.numbers, "one_message" in end.numbers) == (True, False)
+    [story] = stories_of([begin, end, wild])
+    assert (story.what, story.until) == ("xy not valid", end.time)
 
 
 def test_reboot_ends_a_story() -> None:

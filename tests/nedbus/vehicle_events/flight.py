@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Final
 
-from nedbus.events import Event, EventLog
+from nedbus.vehicle_events import Event, EventLog
 from nedbus_msgs import Address, get_topic
 from tests.flights.messages import VALID, VLP, message
 

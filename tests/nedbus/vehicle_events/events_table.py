@@ -1,11 +1,11 @@
 """Independent table of events in PX4 logs: first differences of single topics, with pyulog and NumPy, without nedbus.
 
-    python -m tests.nedbus.events.events_table FOLDER...    # rewrites tests/data/events.json from all logs there
+    python -m tests.nedbus.vehicle_events.events_table FOLDER...  # rewrites tests/data/events.json from its logs
 
-It was written from PX4's message definitions by an author who had not seen `nedbus.events`. Each row is a difference
-between two consecutive messages of a topic (instance 0); the first message has none. Down is positive. A reset has the
-step between the samples minus the motion by their rates or, if the deltas agree with that, the deltas of the message;
-it has no size for a position whose origin changed at the same time.
+It was written from PX4's message definitions by an author who had not seen `nedbus.vehicle_events`. Each row is a
+difference between two consecutive messages of a topic (instance 0); the first message has none. Down is positive. A
+reset has the step between the samples minus the motion by their rates or, if the deltas agree with that, the deltas of
+the message; it has no size for a position whose origin changed at the same time.
 """
 
 from __future__ import annotations

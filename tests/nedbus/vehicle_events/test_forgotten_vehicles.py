@@ -11,11 +11,11 @@ from nedbus import Bus, Counts, Sample, Selection
 from nedbus.client import PublisherRegistry, Publishers
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
-from nedbus.events.event_log import MAX_GONE
 from nedbus.monitoring import Observer
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
 from nedbus.timings import TIMINGS
+from nedbus.vehicle_events.event_log import MAX_GONE
 from nedbus.web.fleet import Fleet
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VALID, VLP, message

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from nedbus.events.detectors import ChangeDetector, Fields, Finding
+from nedbus.vehicle_events.detectors import ChangeDetector, Fields, Finding
 
 
 def test_detection_runs_only_when_a_compared_field_or_missing_changes() -> None:

@@ -11,7 +11,8 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import example, given
 
-from nedbus.events import (
+from nedbus.timings import TIMINGS
+from nedbus.vehicle_events import (
     ALL,
     KEPT,
     KINDS,
@@ -21,9 +22,8 @@ from nedbus.events import (
     Event,
     EventLog,
 )
-from nedbus.events.event_log import MAX_GONE
-from nedbus.events.rules import KIND_CHANGES, PAUSE
-from nedbus.timings import TIMINGS
+from nedbus.vehicle_events.event_log import MAX_GONE
+from nedbus.vehicle_events.rules import KIND_CHANGES, PAUSE
 from nedbus_msgs import RESET_COUNTERS, Address
 from tests.flights.messages import VALID, message
 

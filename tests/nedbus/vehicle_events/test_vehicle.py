@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
-from nedbus.events.rules import PAUSE
+from nedbus.vehicle_events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
+from nedbus.vehicle_events.rules import PAUSE
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP
-from tests.nedbus.events.flight import ARMED, Flight
+from tests.nedbus.vehicle_events.flight import ARMED, Flight
 
 MAIN = Address("1", VLP)
 GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0}
@@ -44,6 +44,28 @@ class SimpleVehicle:
 @pytest.fixture
 def vehicle() -> SimpleVehicle:
     return SimpleVehicle()
+
+
+@pytest.mark.parametrize(("interval", "is_wild"), [(0.1, True), (0.3, True), (0.5, False), (2.0, False)])
+@pytest.mark.parametrize("fields", [{"xy_valid": False}, {"ref_lat": 46.0, "ref_timestamp": 9}])
+def test_only_a_value_of_less_than_half_a_second_is_marked_as_that_of_one_message(
+    fields: dict[str, Any], interval: float, *, is_wild: bool
+) -> None:
+    """A condition, or a moved origin, of one message that the next one takes back is doubtful if that follows soon."""
+    flight = Flight()
+    flight.status(ARMED)
+    for number in range(8):
+        flight.wait(interval).send(**fields if number == 5 else {})
+    changes = [event for event in flight.event_log.events if event.kind in ("xy_invalid", "origin_moved")]
+    assert len(changes) == 2
+    assert ["one_message" in event.numbers for event in changes] == [False, is_wild]
+    assert len(flight_stories(flight)) == (0 if is_wild else 1)
+
+
+def flight_stories(flight: Flight) -> list[str]:
+    """Return the faults of a flight, those with the same text once."""
+    held = flight.event_log.vehicles["1"].held
+    return [*dict.fromkeys(story.what for story in stories_of(flight.event_log.events, held))]
 
 
 def test_flags_not_provided_are_neither_valid_nor_invalid(vehicle: SimpleVehicle) -> None:

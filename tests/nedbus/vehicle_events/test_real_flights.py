@@ -20,7 +20,10 @@ from pyulog import ULog
 
 import nedbus
 from nedbus import clock
-from nedbus.events import (
+from nedbus.flights import FileEvents
+from nedbus.monitoring import Observer
+from nedbus.transport import Session
+from nedbus.vehicle_events import (
     Event,
     EventLog,
     Story,
@@ -33,17 +36,14 @@ from nedbus.events import (
     stories_of,
     verdict_of,
 )
-from nedbus.flights import FileEvents
-from nedbus.monitoring import Observer
-from nedbus.transport import Session
 from nedbus_msgs import ANY, ResetTracker, Selection
 from nedbus_msgs.frames import wrap
 from tests.flights import ulogs
 from tests.flights.local_position import upgrade
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
-from tests.nedbus.events import events_table
-from tests.nedbus.events.events_table import Row
+from tests.nedbus.vehicle_events import events_table
+from tests.nedbus.vehicle_events.events_table import Row
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for_matching

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nedbus.events import KINDS, Event, Kind, spans_of, state_at, stories_of
+from nedbus.vehicle_events import KINDS, Event, Kind, spans_of, state_at, stories_of
 
 from .flight import Flight
 

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import pytest
 
-from nedbus.events import Event
+from nedbus.vehicle_events import Event
 
 from .flight import ARMED, DISARMED, GOOD_GPS, Flight
 

@@ -12,7 +12,10 @@ import pytest
 from hypothesis import given
 
 from nedbus.client import ServiceStatus, SourceStatus, StreamHealth, StreamStatus, reply_parts
-from nedbus.events import (
+from nedbus.monitoring.pages import vehicles_page
+from nedbus.timings import TIMINGS
+from nedbus.transport import MAX_REPLY_BYTES
+from nedbus.vehicle_events import (
     ALL,
     KEPT,
     MAX_VEHICLES,
@@ -29,9 +32,6 @@ from nedbus.events import (
     report_of,
     stories_of,
 )
-from nedbus.monitoring.pages import vehicles_page
-from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_REPLY_BYTES
 from tests.flights.messages import VLP
 
 from .flight import ARMED, Flight

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import (
+from nedbus.flights import read_file_events
+from nedbus.vehicle_events import (
     ALL,
     Condition,
     Event,
@@ -23,8 +24,7 @@ from nedbus.events import (
     report_of,
     verdict_of,
 )  # fmt: skip
-from nedbus.events.detectors import Finding
-from nedbus.flights import read_file_events
+from nedbus.vehicle_events.detectors import Finding
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
 

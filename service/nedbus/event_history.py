@@ -1,0 +1,126 @@
+"""The events of files, samples or services, with the state of each vehicle, and the verdict on each vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from nedbus.vehicle_events import (
+    ALL,
+    AccountReport,
+    Event,
+    Times,
+    VehicleReport,
+    Verdict,
+    by_vehicle,
+    events_outside,
+    verdict_of,
+)
+from nedbus_msgs import ANY, AddressError, ArgumentError, Selection, VehicleNames, vehicle_name
+
+_AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
+_MAX_NAMED: Final = 20  # vehicles in an error
+
+
+@dataclass(frozen=True, slots=True)
+class EventHistory:
+    """Events of vehicles in chronological order, over which it iterates; `nedbus.events` or `bus.history` returns one.
+
+    `events`: times are seconds since the first message of the files or samples, or Unix times of the services.
+    `reports`: by vehicle, worst first, the report that describes it; `vehicles` has the states.
+    `times`: conversion of event times to UTC. `from_start`: by vehicle, the conditions that are active since its first
+    message and cause no event, as text. `dropped`: oldest events left out, because there are more than 100,000.
+    `warnings`: damage of the files, and what was left out.
+    """
+
+    events: tuple[Event, ...]
+    reports: Mapping[str, AccountReport]
+    times: Times
+    from_start: Mapping[str, str] = field(default_factory=dict)
+    dropped: int = 0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def vehicles(self) -> dict[str, VehicleReport]:
+        """The state of each vehicle at the end, worst first."""
+        return {name: report.vehicles[name] for name, report in self.reports.items()}
+
+    @property
+    def end(self) -> float:
+        """The time of the last message, or in live data now, on the clock of `event.time` [s]."""
+        return max((report.now for report in self.reports.values()), default=0.0)
+
+    def utc(self, event: Event) -> float | None:
+        """Return the Unix time of an event [s], None if unknown."""
+        return self.times.utc(event)
+
+    def of(self, selection: Selection) -> EventHistory:
+        """Return the part about selected vehicles, with the events of the link and of the reader.
+
+        Raises AddressError for a vehicle that is not in `vehicles`.
+        """
+        if selection.vehicles == (ANY,):
+            return self
+        for name in selection.vehicles:
+            self._require(name)
+        return replace(
+            self,
+            events=tuple(each for each in self.events if each.vehicle in (ALL, *selection.vehicles)),
+            reports={name: self.reports[name] for name in selection.vehicles},
+            from_start={name: text for name, text in self.from_start.items() if name in selection.vehicles},
+        )
+
+    def why(self, vehicle: str | int, *, at: str | None = None) -> Verdict:
+        """Return the verdict on a vehicle: usable or not, since when, for how long, and why.
+
+        `at`: the time in question: "14:05:12" (UTC), "123.4" (seconds since boot) or, in a file, "+12.3" (seconds since
+        the start of the recording). By default, a file is judged as a whole, and live data by its present state.
+
+        Raises AddressError for a vehicle that is not in `vehicles`, ArgumentError for `at` if it is no such time, or if
+        the data has no such clock.
+        """
+        name = vehicle_name(vehicle)
+        self._require(name)
+        report = self.reports[name]
+        events = [event for event in self.events if event.vehicle in (name, ALL)]
+        known_state = report.vehicles[name]
+        verdict = verdict_of(
+            name, events, known_state.held, topics=known_state.topics, unknown=known_state.unknown, times=self.times,
+            end=report.now, at=self._moment(at, events), since=known_state.first,
+        )  # fmt: skip
+        return replace(verdict, others=tuple(events_outside(verdict.stories, events)))
+
+    def verdicts(self, vehicle: VehicleNames = ANY, *, at: str | None = None) -> dict[str, Verdict]:
+        """Return the verdict on each vehicle, worst first, or on the named ones in this order; errors as of `why`."""
+        names = Selection(vehicle=vehicle).vehicles
+        if names == (ANY,):
+            names = tuple(self.reports)
+        return {name: self.why(name, at=at) for name in names}
+
+    def _require(self, vehicle: str) -> None:
+        if vehicle not in self.reports:
+            known = ", ".join([*self.reports][:_MAX_NAMED])
+            expected = f"one of {known}" if known else "a vehicle with messages, but there is none"
+            raise AddressError("vehicle", vehicle, expected, problem="is not in this history")
+
+    def _moment(self, at: str | None, events: list[Event]) -> float | None:
+        """Return the time in question on the clock of the events; None for all."""
+        if at is None or not events:
+            return None
+        try:
+            return self.times.find(at, events[-1])
+        except ValueError as exc:
+            raise ArgumentError("at", at, _AT, problem=f"is not in this data ({exc})") from exc
+
+    def __iter__(self) -> Iterator[Event]:
+        return iter(self.events)
+
+    def __len__(self) -> int:
+        return len(self.events)
+
+
+def history_of_services(reports: Collection[AccountReport]) -> EventHistory:
+    """Return the history of all services as one; times are Unix times by the clocks of the hosts [s]."""
+    events = sorted((event for report in reports for event in report.events), key=lambda event: event.time)
+    return EventHistory(tuple(events), by_vehicle(reports), Times(is_live=True))

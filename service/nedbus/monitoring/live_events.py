@@ -1,0 +1,135 @@
+"""Events of live vehicles as they happen, with the losses that services report on the links of vehicles."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
+from typing import Any, Final, Self
+
+from nedbus import clock
+from nedbus.client import Bus, Sample, Subscription
+from nedbus.errors import NoDataError
+from nedbus.vehicle_events import ALL, AccountReport, Event, Times, once_per_service
+from nedbus_msgs import Selection
+
+from .observer import Observer
+
+_POLL_INTERVAL: Final = 0.5  # s
+_LOSS_KINDS: Final = frozenset({"lost", "dropout"})
+_LOSS_QUERY: Final = 5.0  # s between queries of the services for losses
+_LOSS_TIMEOUT: Final = 1.0  # s
+_LOSS_WINDOW: Final = 60.0  # s; a loss is reported up to 25 s after it began
+
+
+class LiveEvents(AbstractContextManager["LiveEvents"]):
+    """Events of live vehicles as they happen; `nedbus.events(bus)` returns one. Iterate over it until it is closed.
+
+    `event.time` is Unix time by this host's clock [s]. Events of the router link and of this reader have the vehicle
+    "*". A program with its own loop passes each sample of `subscription` to `add`, and calls `poll` once a second.
+    """
+
+    def __init__(self, bus: Bus, selection: Selection, within: float | None) -> None:
+        self._selection = selection
+        self._history = [] if within is None else self._past(bus.accounts(within=within))
+        self._observer, self._seen = Observer(bus, selection), 0
+        self._losses = LinkLosses(bus)
+        self._waiting = deque[Event]()  # of the last poll, for the iterator
+        self._next_poll = 0.0
+
+    @property
+    def times(self) -> Times:
+        """The conversion of event times to UTC."""
+        return Times(is_live=True)
+
+    @property
+    def subscription(self) -> Subscription[Any]:
+        """The subscription to all topics of the selected vehicles, in mode "every"."""
+        return self._observer.subscription
+
+    @property
+    def from_start(self) -> dict[str, str]:
+        """By vehicle whose position is known, the conditions that are active since its first message, as text."""
+        vehicles = list(self._observer.event_log.vehicles.items())
+        return {name: vehicle.held_from_start for name, vehicle in vehicles if vehicle.main is not None}
+
+    def add(self, sample: Sample[Any]) -> None:
+        """Add a sample of `subscription`."""
+        self._observer.add(sample)
+
+    def poll(self) -> list[Event]:
+        """Check for silence, losses and the link, and return the events since the last call, in order.
+
+        The first call also returns the past events of `within` seconds. Queries the services every 5 s.
+        """
+        past, self._history = self._history, []
+        self._observer.poll()
+        new, self._seen = self._observer.event_log.events_since(self._seen)
+        own = [event.later(clock.to_utc()) for event in new]
+        return [event for event in (*past, *own, *self._losses.poll()) if self._is_selected(event)]
+
+    def close(self) -> None:
+        """End the subscription; a second call does nothing."""
+        self.subscription.close()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Event:
+        while not self._waiting:
+            if self.subscription.closed:
+                raise StopIteration
+            now = time.monotonic()
+            if now >= self._next_poll:
+                self._next_poll = now + _POLL_INTERVAL
+                self._waiting.extend(self.poll())
+                continue
+            with suppress(NoDataError):
+                self.add(self.subscription.receive(self._next_poll - now))
+        return self._waiting.popleft()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _is_selected(self, event: Event) -> bool:
+        return event.vehicle == ALL or self._selection.matches_vehicle(event.vehicle)
+
+    def _past(self, reports: list[AccountReport]) -> list[Event]:
+        """Return the events in reports about selected vehicles, those of a service once."""
+        selected = [
+            report
+            for report in reports
+            if not report.vehicles or any(map(self._selection.matches_vehicle, report.vehicles))
+        ]
+        return [event for _, event in once_per_service(selected)]
+
+
+class LinkLosses:
+    """Losses on the links of vehicles and logging dropouts: only the services that receive the vehicles know them."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._shown: set[tuple[object, ...]] = set()
+        self._next_query = 0.0
+        self.poll()  # earlier ones are in the history
+
+    def poll(self) -> list[Event]:
+        """Return what the services have reported since the last call; ask them at most every 5 s."""
+        now = time.monotonic()
+        if now < self._next_query:
+            return []
+        self._next_query = now + _LOSS_QUERY
+        reported = {
+            (report.service, event.vehicle, *event.identity): _on_link(event, report.service)
+            for report in self._bus.accounts(within=_LOSS_WINDOW, timeout=_LOSS_TIMEOUT)
+            for event in report.events
+            if event.kind in _LOSS_KINDS
+        }
+        new = [event for key, event in reported.items() if key not in self._shown]
+        self._shown |= reported.keys()
+        return sorted(new, key=lambda event: event.time)
+
+
+def _on_link(event: Event, service: str) -> Event:
+    return replace(event, text=f"{event.text}, on the link to the service {service}")

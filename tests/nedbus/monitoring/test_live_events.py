@@ -1,0 +1,41 @@
+"""Live events: losses on the links of vehicles, which only the services know."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+
+import nedbus
+from nedbus import Address
+from nedbus.client import QueryServer, reply_parts
+from nedbus.monitoring import LinkLosses
+from nedbus.transport import Session
+from nedbus.vehicle_events import EventLog, report_of
+from nedbus_msgs import status_key
+from tests.flights.messages import VLP, message
+
+
+def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """Live `events` shows losses that a service reports, once each: begin, duration, count and the service."""
+    event_log, address = EventLog(), Address("7", VLP)
+    server = QueryServer(zenoh_session)
+    server.answer_json(
+        status_key("gcs", vehicle="7"),
+        lambda _: reply_parts(report_of(event_log, "gcs", "host", 200.0, within=math.inf, to_utc=1.7e9)),
+    )
+
+    def lose(start: int) -> None:
+        for second in range(8):
+            event_log.add(address, message(second), float(start + second), lost=100)
+        event_log.settle(start + 20.0)
+
+    with closing(server):
+        lose(100)
+        losses = LinkLosses(bus)
+        lose(150)
+        losses._next_query = 0.0
+        shown = losses.poll()
+        again = losses.poll()
+    text = f"800 messages lost in 7.0 s ({VLP}), on the link to the service gcs"
+    assert [(event.vehicle, event.text, event.time) for event in shown] == [("7", text, 1.7e9 + 150)]
+    assert again == []
