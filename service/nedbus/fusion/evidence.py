@@ -237,7 +237,7 @@ class FusionTracker:
         variance = _number(self._echo[6][0]) if echo.is_echoed and self._echo[6] else math.nan
         return Fusion(
             vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias,
-            tuple(self._remarks(states, variance, is_sent=sent is not None and sent.rate > 0)), tuple(self._missing(echo)),
+            tuple(self._remarks(states, variance, is_sent=bool(echo.is_sent))), tuple(self._missing(echo)),
         )  # fmt: skip
 
     def diagnosis(self, topic: str) -> str:
