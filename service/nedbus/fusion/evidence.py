@@ -235,10 +235,10 @@ class FusionTracker:
             since = aid.since / 1e6 if aid.since and aid.state != "unknown" else None
             quantities.append(QuantityFusion(name, aid.state, since, aid.ratio, cause))
         variance = _number(self._echo[6][0]) if echo.is_echoed and self._echo[6] else math.nan
-        is_sent = sent is not None and sent.rate > 0
-        remarks = tuple(self._remarks(states, variance, is_sent=is_sent))
-        missing = tuple(self._missing(echo))
-        return Fusion(vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias, remarks, missing)
+        return Fusion(
+            vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias,
+            tuple(self._remarks(states, variance, is_sent=bool(echo.is_sent))), tuple(self._missing(echo)),
+        )  # fmt: skip
 
     def diagnosis(self, topic: str) -> str:
         """Return why what a topic reports is not fused, without the remedy; "" if nothing explains it.

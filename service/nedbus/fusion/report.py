@@ -35,8 +35,8 @@ class Fusion:
     `quantities`: position, height, velocity, yaw. `sent`: what a service sends into the vehicle, None if unknown.
     `echoed`: messages per second that PX4 received, from vehicle_visual_odometry. `eph`: of the estimate [m].
     `variance`: of the received horizontal position [m^2]. `bias`: of vision against GNSS, north and east [m].
-    `remarks`: what is wrong as a whole, such as what is fused without effect. `missing`: evidence that the data lacks,
-    and how to get it.
+    `remarks`: what is wrong as a whole, such as what is fused without effect.
+    `missing`: evidence that the data lacks, and how to get it.
     Numbers that are unknown are NaN.
     """
 

@@ -3,8 +3,8 @@
 import math
 import struct
 from collections import Counter, deque
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
@@ -320,9 +320,7 @@ class _Delay:
 
 def odometry_of(position: Position) -> Odometry:
     """Convert a position; raises ValueError, with field, value and remedy, for what PX4 would ignore silently."""
-    if isinstance(position, VehicleOdometry):
-        return _of_odometry(position)
-    return _of_local_position(position)
+    return _CONVERSIONS[type(position)](position)
 
 
 def _of_odometry(position: VehicleOdometry) -> Odometry:
@@ -444,3 +442,12 @@ def _covariance(variances: Sequence[float]) -> list[float]:
 
 def _known(values: Sequence[float]) -> bool:
     return all(map(math.isfinite, values))
+
+
+_CONVERSIONS: Final[Mapping[type, Callable[[Any], Odometry]]] = {
+    VehicleOdometry: _of_odometry,
+    VehicleOdometry.DEFINITION.row: _of_odometry,
+    VehicleLocalPosition: _of_local_position,
+    VehicleLocalPosition.DEFINITION.row: _of_local_position,
+}
+"""The conversion of each message, as a model or as a row."""

@@ -95,7 +95,7 @@ class PositionSender:
         self._sequence = 0  # of MAVLink
         self._reported = Counter[str]()
         self._answered = -math.inf  # time of an answer to TIMESYNC by another client
-        self._decode = codec_of(BY_TOPIC[self._address.topic]).decode
+        self._decode = codec_of(BY_TOPIC[self._address.topic]).decode_row  # faster than a model
         self._target, self._target_due = Target(), -math.inf
         self._sender = SenderName(self._address.topic)
         self._stop, self._reader = threading.Event(), cast("KeyReader | None", None)
@@ -209,20 +209,18 @@ class SenderName:
 
     def __init__(self, topic: str) -> None:
         self._definition = BY_TOPIC[topic]
-        self._session: object = None
-        self._encoding: object = None
+        self._publisher: object = None  # as Zenoh identifies it
         self._name = ""
 
     def of(self, raw: RawSample) -> str:
         """Return the publisher of a sample."""
-        session = None if raw.timestamp is None else raw.timestamp.get_id()
-        encoding = raw.encoding
-        if session != self._session or encoding != self._encoding or not self._name:
-            self._session, self._encoding = session, encoding
-            source = provenance_of(self._definition, str(encoding)[:_MAX_ENCODING]).source
+        publisher = None if raw.source_info is None else raw.source_info.source_id
+        if publisher != self._publisher or not self._name:
+            self._publisher = publisher
+            source = provenance_of(self._definition, str(raw.encoding)[:_MAX_ENCODING]).source
             self._name = source or "a publisher"
-            if session is not None:
-                self._name += f" (session {str(session)[:_SHORT_ID]})"
+            if publisher is not None:
+                self._name += f" (session {str(publisher.zid)[:_SHORT_ID]})"
         return self._name
 
 

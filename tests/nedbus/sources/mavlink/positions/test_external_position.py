@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus import VehicleLocalPosition, VehicleOdometry
 from nedbus.mavlink import MAX_AGE, MAX_RATE, UNKNOWN_VARIANCE, ExternalPosition
 from nedbus.mavlink.external_position import Outcome, odometry_of
+from nedbus_msgs import codec_of
 
 NAN = math.nan
 SECOND = 1_000_000  # us
@@ -90,6 +91,15 @@ def test_frame_is_that_of_pymavlink(fields: dict[str, Any], system: int, sequenc
     encoder.seq = sequence
     message = dialect.MAVLink(None).decode(bytearray(frame))
     assert message.pack(encoder) == frame
+
+
+@pytest.mark.parametrize("model", [odometry(), local_position()])
+def test_row_is_converted_like_its_model(model: Any) -> None:
+    """A service decodes positions as rows, which take less processor time than models."""
+    codec = codec_of(type(model).DEFINITION)
+    row = codec.decode_row(codec.encode(model))
+    assert type(row) is not type(model)
+    assert repr(odometry_of(row)) == repr(odometry_of(model))
 
 
 @pytest.mark.parametrize(("pose", "velocity", "frames"), [(2, 2, (20, 20)), (1, 3, (1, 12)), (2, 3, (20, 12))])
