@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .columns import Columns, Decoded
     from .conversion import convert, convert_flight
     from .events import (
         EVENT_OPTIONS,
@@ -23,20 +22,19 @@ if TYPE_CHECKING:
     )
     from .flight import Flight, FlightSamples, open_flight, open_messages
     from .merge import no_utc, require_files
-    from .readers import FileStream, FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
+    from .readers import FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
     from .utc import find_utc, utc_of
     from .writer import RecordingWriter
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
-        ("", "columns"): "Columns Decoded",
         ("mcap", "conversion"): "convert convert_flight",
         ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents detect_sample_events follow follow_flight"
         " read_file_events read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",
         ("", "merge"): "no_utc require_files",
-        ("", "readers"): "FileStream FlightReader ReadOptions check_recording find_format format_of open_reader",
+        ("", "readers"): "FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
         ("mcap", "writer"): "RecordingWriter",

@@ -98,9 +98,9 @@ class Flight(AbstractContextManager["Flight"]):
     # yields messages or columns, as the caller needs; what it has shown is kept.
 
     def __init__(self, paths: Sequence[Path], options: ReadOptions = _BUILT_IN, *, vehicle: str = ANY) -> None:
+        self._readers: list[FlightReader] = []  # of the first pass, one for each file
         self._paths, self._options, self._vehicle = require_files(paths), options, vehicle
         self._selection = Selection(vehicle=vehicle)
-        self._readers: list[FlightReader] = []  # of the first pass, one for each file
         self._watches: list[FileUtc] = []  # the UTC of each file, from the first pass
         self._columns: list[dict[Address, Columns]] = []  # of each file, if the first pass is one of columns
         self._ended: set[str] = set()  # vehicles without further messages in the first pass
@@ -194,13 +194,15 @@ class Flight(AbstractContextManager["Flight"]):
     def close(self) -> None:
         """Close the flight and its samples, which then raise ClosedError; a second call does nothing."""
         self._is_closed = True
-        for reader in self._readers:
-            reader.close()
+        close_all(self._readers)
         for samples in list(self._samples):
             samples.abort()
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def __del__(self) -> None:
+        close_all(self._readers)
 
     def _begin(self, *, watches_utc: bool = False) -> None:
         """Begin the first pass with messages; raise the errors of unreadable files.
@@ -258,11 +260,14 @@ class Flight(AbstractContextManager["Flight"]):
         """Begin another pass, over some topics or all (None), on the axis of the first one."""
         if self._is_closed:
             raise ClosedError
-        readers = []
-        for path, first in zip(self._paths, self._readers, strict=True):
-            reader = open_reader(path, replace(self._options, topics=topics))
-            reader.begin(whole=first.order.axis)
-            readers.append(reader)
+        options = replace(self._options, topics=topics)
+        readers = [open_reader(path, options) for path in self._paths]
+        try:
+            for reader, first in zip(readers, self._readers, strict=True):
+                reader.begin(whole=first.order.axis)
+        except BaseException:
+            close_all(readers)
+            raise
         return readers
 
     def _merge(self, readers: Sequence[FlightReader], on_end: Callable[[Names], object]) -> Iterator[SourceMessage]:
@@ -340,10 +345,11 @@ class Flight(AbstractContextManager["Flight"]):
         """Return damage, omissions and renamed vehicles that a pass has met so far, each with its file."""
         found = []
         for reader, names in zip(readers, self._names, strict=True):
-            texts = [*reader.warnings, *reader.remarks]
+            texts = []
             for own, name in names.items():
                 if own != name:
-                    texts.insert(0, f"vehicle {own} is named {name} here, because several files have a vehicle {own}")
+                    texts.append(f"vehicle {own} is named {name} here, because several files have a vehicle {own}")
+            texts += [*reader.warnings, *reader.remarks]
             found += [f"{reader.path}: {text}" for text in texts]
         return tuple(found)
 
@@ -424,8 +430,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
     def close(self) -> None:
         """Close the files; a second call does nothing."""
         self._messages.close()
-        for reader in self._readers:
-            reader.close()
+        close_all(self._readers)
 
     def __iter__(self) -> Self:
         return self
@@ -472,8 +477,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
                 time = to_unix_ns(message.time, boot_utc_of(readers))
                 yield address, definition, encoded, time, _provenance(message.source, encoded.missing)
         finally:
-            for reader in readers:
-                reader.close()
+            close_all(readers)
         if not is_found:
             where = readers[0].path if len(readers) == 1 else f"any of the {len(readers)} files"
             matching(where, sorted(flight._definitions_of(readers)), self._selection)  # raises an AddressError
@@ -481,6 +485,12 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
 def _provenance(source: str | None, missing: frozenset[str]) -> Provenance:
     return Provenance(source, missing)
+
+
+def close_all(readers: Sequence[FlightReader]) -> None:
+    """Close files."""
+    for reader in readers:
+        reader.close()
 
 
 def boot_utc_of(readers: Sequence[FlightReader]) -> int:

@@ -107,15 +107,21 @@ def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), t
     heights = [_FRAME + _ROW * len(each) for each in (rows, marks) if each]
     figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    mosaic: list[HashableList[str]] = [
-        ["track", "altitude"], ["track", "speed"], ["flags", "flags"], ["events", "events"]
-    ]  # fmt: skip
+    mosaic: list[HashableList[str]] = [["track", "altitude"], ["track", "speed"]]
+    lowest = "speed"
+    if rows:
+        lowest = "flags"
+        mosaic.append([lowest, lowest])
+    if marks:
+        lowest = "events"
+        mosaic.append([lowest, lowest])
     ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights]
-    axes = figure.subplot_mosaic(mosaic[: len(ratios)], height_ratios=ratios, width_ratios=[1, 1.2])
+    axes = figure.subplot_mosaic(mosaic, height_ratios=ratios, width_ratios=[1, 1.2])
     for name in axes.keys() - {"track", "altitude"}:
         axes[name].sharex(axes["altitude"])
     _draw_estimates(axes, drawn)
-    _draw_flags(axes["flags"], rows)
+    if rows:
+        _draw_flags(axes["flags"], rows)
     by_time = sorted((mark for own in marks.values() for mark in own), key=lambda mark: mark.begin)
     _mark_events(axes, drawn, by_time)
     # Below the label of the axis; inside the axes it would cover the track.
@@ -124,7 +130,7 @@ def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), t
     margin = 0.02 * (np.ptp(seconds) or 1.0)
     axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
     label = _label_times(axes["altitude"], drawn, start / 1e6, times)
-    for name in ("speed", "events" if marks else "flags"):
+    for name in {"speed", lowest}:
         axes[name].set_xlabel(label)
     figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may contain any bytes
     missing = {each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))] for each in drawn}

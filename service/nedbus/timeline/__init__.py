@@ -10,6 +10,8 @@
 | WILD | no message confirms this time | as received |
 | REBOOT | the vehicle rebooted; `boot` is the number of the new one | since the new boot |
 | STEP | a synchronised (Unix) time was set: no reboot | as received |
+
+`RebootDetector` tells a reboot from the times of streams without a common order, as on a bus.
 """
 
 from typing import TYPE_CHECKING
@@ -20,6 +22,7 @@ from .arrivals import arrivals
 from .axis import Axis
 from .order import Order
 from .pace import MAX_PAUSE, Pace
+from .reboots import MAX_REORDERED, RebootDetector, RebootSign
 from .utc_offset import UTC_COLUMNS, UtcOffset, provides_utc, to_unix_ns, unix_seconds, utc_text
 from .vehicle_clock import Reading, RecentTimes, TimeKind, VehicleClock, is_boot_possible
 

@@ -11,7 +11,7 @@ from statistics import median
 from typing import Final
 
 from nedbus.fusion import AID_TOPICS, FusionTracker
-from nedbus.timeline import is_boot_possible
+from nedbus.timeline import MAX_REORDERED, RebootDetector, RebootSign
 from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
 
 from . import detectors, rules
@@ -27,7 +27,6 @@ EVENT_TOPICS: Final = (*TOPICS, detectors.EKF_SELECTOR, AIR_DATA, MAGNETOMETER, 
 """Topics from which events are derived: all built-in ones, and others that PX4 logs."""
 
 _EKF: Final = "estimator_status_flags"
-_REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
 _MAX_PAUSE: Final = 2_000_000  # us between positions, after which missing EVIDENCE is timed anew
 _REPLACED: Final = 1_000_000  # us for another topic to replace missing EVIDENCE, such as sensor_gps
 _MIN_STEPS: Final = 3  # intervals until the usual one of EVIDENCE is known
@@ -83,7 +82,8 @@ class Vehicle:
         self._main_time = math.inf  # time of the last position
         self._invalid = -math.inf  # last time when a quantity of the estimate was invalid
         self._rebooted = -math.inf
-        self._suspect: _Suspect | None = None
+        self._reboots = RebootDetector()
+        self._held: _Held | None = None  # what a message shows that may be the first one after a reboot
         self._changes: dict[tuple[str, object], deque[Event]] = {}  # by condition or likeness, and by kind
         self._suppressed: Counter[tuple[str, object]] = Counter()  # number of suppressed events, by the same keys
         self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
@@ -132,10 +132,15 @@ class Vehicle:
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
             found = iter([*(found or ()), *self._comparison.add_estimate(stamp, message, missing)])
-        if not is_queued and (stamp < before - _REBOOT or self._suspect is not None):
-            suspect = _Suspect(address, before, [*(found or ())])
-            known = self._check_reboot(suspect, stamp, earlier, time, elapsed)
-            found = detector.add(message, missing) if known is None else iter(known)
+        if not is_queued and (stamp < before - MAX_REORDERED or self._held is not None):
+            # Only the previous message was damaged unless another one of this or another stream is later as well.
+            other = earlier or self._newest_but(address)
+            sign = self._reboots.add(address, stamp, before=before, other=other, elapsed=elapsed)
+            if sign is RebootSign.REBOOT:
+                self._begin_boot(address, time)
+                found = detector.add(message, missing)
+            else:
+                found = self._hold(sign, address, [*(found or ())])
         self._emit_all(found or (), address, time)
 
     def count_lost(self, count: int, stream: str, time: float) -> None:
@@ -477,7 +482,7 @@ class Vehicle:
     def _set_boot(self, boot: float, time: float, *, is_queued: bool) -> None:
         """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
         expected = boot if self.boot is None else self.boot + time - self.time
-        was_off, self._is_off = self._is_off, is_queued or abs(boot - expected) > 1e-6 * _REBOOT
+        was_off, self._is_off = self._is_off, is_queued or abs(boot - expected) > 1e-6 * MAX_REORDERED
         self.time, self.boot = time, boot if was_off or is_queued or not self._is_off else expected
 
     def _emit_all(self, found: Iterable[Finding], address: Address, time: float) -> None:
@@ -488,33 +493,33 @@ class Vehicle:
             if each.kind == "ekf_changed":
                 self._use_ekf(int(each.numbers["to"]))
 
-    def _check_reboot(
-        self, new: _Suspect, stamp: int, earlier: int, time: float, elapsed: float
-    ) -> list[Finding] | None:
-        """Return the findings to report now; None after a reboot, which a second message must confirm.
+    def _newest_but(self, address: Address) -> int:
+        """Return the newest timestamp of the other streams [us]; 0 if there are none."""
+        newest = 0
+        for other, detector in self._detectors.items():
+            if detector is not None and other != address:
+                newest = max(newest, detector.stamp, detector.earlier)
+        return newest
 
-        `elapsed`: time since the last message [s].
-        """
-        # Only the previous message was damaged unless another one before it, or of another stream, is later as well.
-        others = (each for at, each in self._detectors.items() if each is not None and at != new.address)
-        support = earlier or max((max(each.stamp, each.earlier) for each in others), default=0)
-        is_earlier = min(new.before, support) > stamp + _REBOOT
-        if (old := self._suspect) is None:
-            is_earlier = is_earlier and is_boot_possible(stamp, elapsed)
-            self._suspect = new if is_earlier else None
-            return [] if is_earlier else new.found
-        is_back = stamp >= old.before - _REBOOT
-        if is_back and new.address == old.address:  # only the previous time was damaged
-            self._suspect = None
-            return old.found + new.found
-        if is_back or not (is_earlier or new.address == old.address):
-            return new.found
-        self._suspect = None
-        suspected = self._detectors.get(old.address)
-        initial = [] if suspected is None or new.address == old.address else [*suspected.again({})]
-        self._reboot(old.before, time)
-        self._emit_all(initial, old.address, time)
-        return None
+    def _hold(self, sign: RebootSign, address: Address, found: list[Finding]) -> Iterator[Finding]:
+        """Return the findings to report now: those of a first message after a possible reboot are held back."""
+        held = self._held
+        if sign is RebootSign.FIRST:
+            self._held = _Held(address, found)
+            return iter(())
+        if sign is RebootSign.DAMAGED and held is not None:
+            self._held = None
+            return iter(held.found + found)
+        return iter(found)
+
+    def _begin_boot(self, address: Address, time: float) -> None:
+        """Reset the state after a reboot, which a message of this address has confirmed."""
+        held, self._held = self._held, None
+        first = None if held is None or held.address == address else self._detectors.get(held.address)
+        initial = [] if first is None else [*first.again({})]
+        self._reboot(self._reboots.before, time)
+        if held is not None:
+            self._emit_all(initial, held.address, time)
 
     def _reboot(self, before: int, time: float) -> None:
         """Reset the state; report the reboot once, even if delayed messages from before it follow."""
@@ -575,11 +580,10 @@ def _keys_of(found: Finding) -> list[tuple[str, str]]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Suspect:
-    """A message whose time went back: its address, the time before it [us], and its findings."""
+class _Held:
+    """What the first message after a possible reboot shows, until the next one decides."""
 
     address: Address
-    before: int
     found: list[Finding]
 
 

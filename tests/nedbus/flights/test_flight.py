@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -117,6 +118,18 @@ def test_samples_end_with_their_flight(tmp_path: Path) -> None:
         next(samples)
     links = [link for link in Path("/proc/self/fd").iterdir() if os.path.lexists(link)]
     assert path not in [link.readlink() for link in links]
+
+
+def test_dropped_flight_closes_its_file(tmp_path: Path) -> None:
+    """A script that opens many files without `with` does not run out of file descriptors."""
+    path = write_log(tmp_path / "a.ulg", steps(1_000_000, 20_000))
+    gc.disable()  # which would close them, too, but later
+    try:
+        nedbus.open(path)
+        links = [link for link in Path("/proc/self/fd").iterdir() if os.path.lexists(link)]
+        assert path not in [link.readlink() for link in links]
+    finally:
+        gc.enable()
 
 
 def test_rows_do_not_change_the_samples(tmp_path: Path) -> None:

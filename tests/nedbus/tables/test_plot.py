@@ -114,6 +114,16 @@ def test_never_valid_estimate_sets_axis_limits() -> None:
     assert parts["speed"].get_ylim()[0] < 1.0 < parts["speed"].get_ylim()[1]
 
 
+@pytest.mark.parametrize("events", [[], [event_of("few_satellites", "begin", "watch", 5.0)]])
+def test_flight_without_flags_is_drawn(events: list[Event]) -> None:
+    """LOCAL_POSITION_NED without ESTIMATOR_STATUS has no flags: the plot has no rows for them."""
+    address, array = flight_of()
+    names = tuple(name for name in array.dtype.names or () if array.dtype[name].kind == "b" or "reset" in name)
+    messages = array.view(np.dtype(array.dtype.descr, metadata={"missing": (*names, "heading_reset_counter")}))
+    axes = drawn([(address, messages)], events)
+    assert axes.keys() == {"track", "altitude", "speed"} | ({"events"} if events else set())
+
+
 def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
     """The altitude plot has lines for resets of z and vz; the rows below show all resets."""
     address, array = flight_of()

@@ -57,6 +57,25 @@ def test_order_and_duration_are_those_of_the_vehicle(parts: list[tuple[int, str,
     assert not order.unordered
 
 
+@pytest.mark.parametrize("host", [0, 7_000_000])
+def test_some_messages_have_the_axis_of_all(host: int) -> None:
+    """A pass over one topic, which begins later, counts from the first message of the file, whatever the host's clock.
+
+    Its first message is from before the start: the last one of a topic that PX4 rarely publishes.
+    """
+    whole = Order[Message]()
+    list(whole.arrange([Message(stamp, stamp) for stamp in range(5_000_000, 9_000_000, STEP)]))
+    own = [
+        Message(1_000_000, 8_000_000 + host),
+        *(Message(each, each + host) for each in range(8_000_000, 9_000_000, STEP)),
+    ]
+    order = Order[Message]()
+    order.whole = whole.axis
+    found = list(order.arrange(own))
+    assert [each.at for each in found[1:]] == pytest.approx([(each.timestamp - 5_000_000) / 1e6 for each in found[1:]])
+    assert order.duration == pytest.approx(whole.duration)
+
+
 def test_streams_written_in_batches_are_sorted() -> None:
     """Batches of two streams become one sequence in the order of the timestamps, also around a step of the host."""
     host = [0 if number < 300 else -3_000_000 for number in range(600)]
