@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         EVENT_OPTIONS,
         MAX_FILE_EVENTS,
         FileEvents,
-        detect_sample_events,
         follow,
         read_file_events,
         read_flight_events,
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from .flight import Flight, FlightSamples, open_flight
     from .merge import FlightFile, MergedFlights, distinct_names, no_utc, renamed, require_files
     from .readers import FileStream, FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
+    from .sample_events import detect_sample_events
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
     from .utc import find_utc, utc_of
     from .writer import RecordingWriter
@@ -31,11 +31,11 @@ else:
     _NAMES = {
         ("", "columns"): "Columns Decoded",
         ("mcap", "conversion"): "convert",
-        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents detect_sample_events follow read_file_events"
-        " read_flight_events times_of",
+        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow read_file_events read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight",
         ("", "merge"): "FlightFile MergedFlights distinct_names no_utc renamed require_files",
         ("", "readers"): "FileStream FlightReader ReadOptions check_recording find_format format_of open_reader",
+        ("", "sample_events"): "detect_sample_events",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
         ("mcap", "writer"): "RecordingWriter",
