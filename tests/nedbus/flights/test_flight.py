@@ -6,7 +6,7 @@ import math
 import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 from hypothesis import example, given, strategies as st
@@ -198,7 +198,7 @@ def test_warning_names_the_first_reason_of_invalid_messages(tmp_path: Path) -> N
     writer = UlogWriter()
     writer.define([VLP])
     for number in range(10):
-        fields: dict[str, object] = dict(VALID)
+        fields: dict[str, Any] = dict(VALID)
         if number in (3, 7):
             fields |= {"x": math.nan} if number == 3 else {"vz": math.nan}
         writer.add(VLP, message(1_000_000 + 100_000 * number), **fields)

@@ -147,17 +147,21 @@ def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
     assert inbox.counts == Counts(received=7)
 
 
-@pytest.mark.parametrize(("is_link_changed", "requested"), [(False, range(5, 6)), (True, range(6))])
+@pytest.mark.parametrize(
+    ("seconds", "requested"), [(None, range(5, 6)), (0.0, range(6)), (9.0, range(6)), (11.0, range(5, 6))]
+)
 def test_heartbeat_of_an_unknown_publisher_requests_what_the_outage_may_have_lost(
-    is_link_changed: bool, requested: range
+    seconds: float | None, requested: range
 ) -> None:
-    """After a link change, an unknown publisher may have sent all its messages during the outage, else only the last.
+    """For 10 s after a link change, an unknown publisher may have sent all its messages during the outage.
 
     What it no longer caches predates the subscription, and is not lost.
     """
-    inbox = make_queue("every")
-    if is_link_changed:
+    now = 100.0
+    inbox = make_queue("every", clock=lambda: now)
+    if seconds is not None:
         inbox.on_link_change()
+        now += seconds
     inbox.on_heartbeat(KEY, name_of("b"), 5)
     [writer] = inbox.gaps.requesting
     assert inbox.next_request(writer, 100.0) == requested
