@@ -14,7 +14,6 @@ from nedbus.flights import (
     detect_sample_events,
     read_file_events,
     read_flight_events,
-    require_files,
 )
 from nedbus.samples import Sample
 from nedbus_msgs import ANY, Selection, VehicleNames
@@ -83,5 +82,5 @@ def _detect(source: object) -> FileEvents:
         expected = "a file, several files, an open flight, samples, or a connected bus"
         raise ArgumentError("source", source, expected)
     if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
-        return read_file_events(*require_files([Path(each).expanduser() for each in source]))
+        return read_file_events(*[Path(each).expanduser() for each in source])
     return detect_sample_events(source)

@@ -168,3 +168,16 @@ def read() -> None:
     nedbus.read("flight.ulg", dataframe="arrow")  # type: ignore[call-overload] # neither pandas nor polars
     nedbus.connect(tls_ca="ca.crt")  # type: ignore[call-arg] # use tls=Tls(...)
     nedbus.raed  # type: ignore[attr-defined] # no such name
+
+
+def explain(bus: nedbus.Bus, flight: nedbus.Flight) -> None:
+    """Events and verdicts: a history from files, an open flight and samples, an iterator from a bus."""
+    assert_type(nedbus.events("flight.ulg"), nedbus.health.EventHistory)
+    assert_type(nedbus.events(flight, vehicle=7), nedbus.health.EventHistory)
+    assert_type(nedbus.events(list(flight("*"))), nedbus.health.EventHistory)
+    assert_type(nedbus.events(bus, within=60.0), nedbus.health.LiveEvents)
+    assert_type(nedbus.why(bus), dict[str, nedbus.health.Verdict])
+    assert_type(bus.why("7"), nedbus.health.Verdict)
+    for event in nedbus.events(bus):
+        assert_type(event, nedbus.health.Event)
+    nedbus.events("flight.ulg", within=60.0)  # type: ignore[call-overload] # only of a bus

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
         EVENT_OPTIONS,
         MAX_FILE_EVENTS,
         FileEvents,
-        detect_sample_events,
         follow,
         follow_flight,
         read_file_events,
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from .flight import Flight, FlightSamples, open_flight, open_messages
     from .merge import no_utc, require_files
     from .readers import FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
+    from .sample_events import detect_sample_events
     from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
     from .utc import find_utc, utc_of
     from .writer import RecordingWriter
@@ -30,11 +30,12 @@ else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("mcap", "conversion"): "convert convert_flight",
-        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents detect_sample_events follow follow_flight"
-        " read_file_events read_flight_events times_of",
+        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events"
+        " read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",
         ("", "merge"): "no_utc require_files",
         ("", "readers"): "FlightReader ReadOptions check_recording find_format format_of open_reader",
+        ("", "sample_events"): "detect_sample_events",
         ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
         ("mcap", "writer"): "RecordingWriter",

@@ -1,4 +1,4 @@
-"""Event detection in logs, recordings and lists of samples, by replaying them."""
+"""Event detection in logs and recordings, by replaying them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ import math
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from nedbus.errors import ArgumentError, InvalidMessageError
+from nedbus.errors import InvalidMessageError
 from nedbus.event_history import EventHistory
-from nedbus.samples import Sample, SourceMessage
-from nedbus.timeline import Order
+from nedbus.samples import SourceMessage
 from nedbus.vehicle_events import EVENT_TOPICS, EventLog, Times, by_vehicle, report_of
-from nedbus_msgs import Address, is_unix_time
 
 from .flight import Flight, open_messages
 from .readers import ReadOptions
@@ -79,56 +77,6 @@ def read_flight_events(flight: Flight) -> FileEvents:
     return FileEvents(event_log, times_of(flight), end, flight.warnings)
 
 
-@dataclass(slots=True)
-class _Received:
-    """A sample, as the order of a flight needs it; `time`: when it was received [us]."""
-
-    sample: Sample[Any]
-    address: Address
-    time: int
-    logged: object  # distinguishes the streams
-    at: float = 0.0
-    error: str | None = None
-
-    @property
-    def timestamp(self) -> int:
-        return int(self.sample.message.timestamp)
-
-
-def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
-    """Detect the events in samples that end; they are put in the order of the vehicles' clocks.
-
-    A retained sample is left out, because its stream may have ended long before the others began. UTC is that of
-    `sample.received`, unless this is a time since boot, as in a log without UTC.
-
-    Raises ArgumentError for anything but a sample.
-    """
-    event_log, offsets, due = EventLog(MAX_FILE_EVENTS), dict[str, float](), 0.0
-    checks = _Checks(event_log)
-    for each in Order[_Received]().arrange(_received(samples)):
-        sample, due = each.sample, each.at
-        checks.advance(due)
-        event_log.add(
-            sample.address, sample.message, due, missing=sample.missing, lost=sample.lost, source=sample.source
-        )
-        if is_unix_time(each.time) and not is_unix_time(each.timestamp):
-            offset = (each.time - each.timestamp) / 1e6
-            offsets[sample.vehicle] = min(offset, offsets.get(sample.vehicle, math.inf))  # with the least delay
-    checks.end(due)
-    event_log.label_first_events()
-    return FileEvents(event_log, Times(offsets=offsets), due, ())
-
-
-def _received(samples: Iterable[Sample[Any]]) -> Iterator[_Received]:
-    topics, streams = {*EVENT_TOPICS}, dict[Address, Address]()
-    for sample in samples:
-        if not isinstance(sample, Sample):
-            raise ArgumentError("source", sample, "a sample; a list of files contains only str and Path")
-        if sample.topic in topics and not sample.retained:
-            stream = streams.setdefault(sample.address, sample.address)  # one object, which identifies the stream
-            yield _Received(sample, stream, sample.received // 1000, stream)
-
-
 def times_of(flight: Flight) -> Times:
     """Return the clocks of the vehicles of a flight, with remarks on them; reads the files."""
     offsets, remarks = dict[str, float](), dict[str, str]()
@@ -155,7 +103,7 @@ def follow(
 
     `ended`: vehicles without further messages, which do not count as silent.
     """
-    checks, due = _Checks(event_log, ended), 0.0
+    checks, due = Checks(event_log, ended), 0.0
     for message in messages:
         if message.dropout:
             event_log.add_dropout(message.address.vehicle, message.dropout, due)
@@ -173,7 +121,7 @@ def follow(
     checks.end(due)
 
 
-class _Checks:
+class Checks:
     """Checks of an event log for silence and settled events, twice a second of flight time."""
 
     def __init__(self, event_log: EventLog, ended: Collection[str] = ()) -> None:

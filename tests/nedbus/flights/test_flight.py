@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 from hypothesis import example, given, strategies as st
@@ -18,6 +19,7 @@ from nedbus.samples import SourceMessage
 from nedbus.timeline import Order
 from nedbus.vehicle_events import EventLog
 from nedbus_msgs import VehicleLocalPosition
+from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
 
@@ -230,3 +232,19 @@ def test_no_event_is_invented_by_any_sequence_of_clocks(parts: list[tuple[str, i
     texts = [each.text for each in event_log.events]
     assert sorted(kind for kind, _ in found) == sorted(kind for kind, _ in expected), texts
     assert sorted(time for _, time in found) == pytest.approx(sorted(time / 1e6 for _, time in expected), abs=0.5)
+
+
+def test_warning_names_the_first_reason_of_invalid_messages(tmp_path: Path) -> None:
+    """Invalid messages of a stream are skipped with one warning: their number, and what is wrong with the first."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for number in range(10):
+        fields: dict[str, Any] = dict(VALID)
+        if number in (3, 7):
+            fields |= {"x": math.nan} if number == 3 else {"vz": math.nan}
+        writer.add(VLP, message(1_000_000 + 100_000 * number), **fields)
+    with nedbus.open(writer.write(tmp_path / "a.ulg")) as flight:
+        samples = flight()
+        assert len(list(samples)) == 8
+        [warning] = samples.warnings
+    assert warning.startswith(f"skipped 2 messages of 1/{VLP} as invalid (x: must be finite")

@@ -449,3 +449,25 @@ def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:
     assert found is not None
     assert (found.source, str(found.at(6_000_000))) == ("sensor_gps/1", "2023-11-14 22:13:21+00:00")
     assert nedbus.utc_of(bus.latest("*", vehicle="8")) is None
+
+
+@pytest.mark.parametrize(("late", "is_restart"), [(1, False), (2, False), (6, True), (20, True)])
+def test_more_than_one_percent_of_earlier_timestamps_are_a_restart(late: int, *, is_restart: bool) -> None:
+    """Up to 1 % of the messages may be out of order; more of them are those of another boot, which raises."""
+    stamps = [10_000_000 + 10_000 * number for number in range(200 - late)] + [
+        10_000 * number for number in range(late)
+    ]
+    arrays = {VLP: array_of(VLP, *({"timestamp": stamp} for stamp in stamps))}
+    if is_restart:
+        with pytest.raises(ConfigError, match="timestamps restart"):
+            nedbus.align(arrays)
+    else:
+        assert len(nedbus.align(arrays)) == 200
+
+
+@pytest.mark.parametrize(("wild", "rows"), [(45_000_000, 441), (500_000_000, 100)])
+def test_wild_timestamp_does_not_extend_a_table(wild: int, rows: int) -> None:
+    """A rate fills the time of the messages; one timestamp far beyond the others is left out."""
+    stamps = [1_000_000 + 100_000 * number for number in range(100)]
+    arrays = {VLP: array_of(VLP, *({"timestamp": stamp} for stamp in (*stamps, wild)))}
+    assert len(nedbus.align(arrays, on=10.0)) == rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -1030,3 +1031,25 @@ def test_measurement_of_another_ekf_is_ignored() -> None:
         flight.send(AID, instance=1, fused=False, innovation_rejected=True, estimator_instance=1)
     assert flight.new_events() == []
     assert flight.kinds == []
+
+
+def test_vehicle_with_few_events_loses_none_to_make_room_for_others() -> None:
+    """At the limit, the vehicle with the most events loses its oldest; if none has over 20, the oldest of all goes."""
+    event_log = EventLog(keep=45)
+
+    def add(vehicle: str, count: int, begin: float) -> None:
+        for number in range(2 * count):
+            fields = VALID | {"xy_valid": number % 2 == 0}
+            address = Address(vehicle, POSITION.topic)
+            stamp = begin + 60.0 * number  # slow enough that no change is suppressed
+            event_log.add(address, {"timestamp": round(stamp * 1e6), **fields}, stamp)
+
+    add("old", 8, 100.0)
+    add("other", 10, 200.0)
+    add("third", 8, 300.0)
+    kept = Counter(event.vehicle for event in event_log.events)
+    assert kept == {"old": 45 - 19 - 15, "other": 19, "third": 15}  # none has more than 20
+    add("busy", 30, 400.0)
+    kept = Counter(event.vehicle for event in event_log.events)
+    assert kept["busy"] == 20
+    assert kept.total() == 45

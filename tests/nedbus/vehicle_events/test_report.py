@@ -98,6 +98,17 @@ def test_report_has_all_events_of_its_period() -> None:
     assert report(flight, within=math.nan).events == ()
 
 
+def test_evidence_has_the_clock_of_its_event() -> None:
+    """In a report, the times of events and of their evidence are Unix times, so that their distance remains."""
+    flight = flying(dead_reckoning=True)
+    flight.wait(3.0).send(dead_reckoning=True, xy_valid=False)
+    sent = report_of(flight.event_log, "s", "h", flight.now, within=1e9, to_utc=1.7e9)
+    invalid = through_json(sent).events[-1]
+    [cause] = invalid.evidence
+    assert (invalid.kind, cause.kind) == ("xy_invalid", "dead_reckoning")
+    assert (invalid.time, cause.time) == pytest.approx((1.7e9 + flight.now, 1.7e9 + flight.now - 3.0))
+
+
 def test_topics_of_a_vehicle_are_limited_to_those_of_a_verdict() -> None:
     """A report names at most 30 topics, first those that decide whether evidence and position are missing."""
     flight = flying(xy_valid=False)

@@ -545,6 +545,22 @@ def test_large_reset_in_flight_makes_the_vehicle_unusable() -> None:
             assert found.text.startswith("not usable: reset of xy by 20.0 m (20.0 north, 0.0 east) at ")
 
 
+@pytest.mark.parametrize(("tenths", "severity"), [(5, "watch"), (9, "watch"), (12, "bad"), (25, "bad")])
+def test_large_reset_is_a_recovery_for_a_second_after_an_invalid_estimate(tenths: int, severity: str) -> None:
+    """A reset of 10 m that follows the end of an invalid estimate within a second recovers it; a later one is bad."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.fly(2)
+    for _ in range(10):
+        flight.wait(0.1).send(xy_valid=False)
+    flight.wait(0.1).send()  # valid again
+    for _ in range(tenths - 1):
+        flight.wait(0.1).send()
+    flight.wait(0.1).send(x=20.0, xy_reset_counter=1)
+    [reset] = [event for event in flight.event_log.events if event.kind == "reset"]
+    assert reset.severity == severity
+
+
 def test_fault_in_flight_leads_before_one_on_the_ground() -> None:
     """In a file, a fault between take-off and disarming leads before a worse one on the ground; live, the present one.
 

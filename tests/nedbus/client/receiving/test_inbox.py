@@ -147,17 +147,21 @@ def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
     assert inbox.counts == Counts(received=7)
 
 
-@pytest.mark.parametrize(("is_link_changed", "requested"), [(False, range(5, 6)), (True, range(6))])
+@pytest.mark.parametrize(
+    ("seconds", "requested"), [(None, range(5, 6)), (0.0, range(6)), (9.0, range(6)), (11.0, range(5, 6))]
+)
 def test_heartbeat_of_an_unknown_publisher_requests_what_the_outage_may_have_lost(
-    is_link_changed: bool, requested: range
+    seconds: float | None, requested: range
 ) -> None:
-    """After a link change, an unknown publisher may have sent all its messages during the outage, else only the last.
+    """For 10 s after a link change, an unknown publisher may have sent all its messages during the outage.
 
     What it no longer caches predates the subscription, and is not lost.
     """
-    inbox = make_queue("every")
-    if is_link_changed:
+    now = 100.0
+    inbox = make_queue("every", clock=lambda: now)
+    if seconds is not None:
         inbox.on_link_change()
+        now += seconds
     inbox.on_heartbeat(KEY, name_of("b"), 5)
     [writer] = inbox.gaps.requesting
     assert inbox.next_request(writer, 100.0) == requested
@@ -663,3 +667,22 @@ def test_samples_and_batches_report_each_loss_once() -> None:
     assert [sample.lost for sample in drain(inbox)] == [1]
     put(inbox, [raw(12)])
     assert take_batch(inbox).lost == 0
+
+
+def test_superseded_messages_free_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In mode `latest`, only the newest message of a key counts towards the limit of bytes."""
+    monkeypatch.setattr(unread_module, "MAX_UNREAD_BYTES", 5 * len(VALID) // 2)
+    inbox = make_queue("latest")
+    for number in range(3):
+        put(inbox, [raw(number, timestamp=number + 1)])
+    assert timestamps(inbox) == [3]
+    assert inbox.counts == Counts(received=1, dropped=2)
+
+
+@pytest.mark.parametrize(("back", "is_late"), [(1, True), (1000, True), (65_536, True), (65_537, False)])
+def test_step_back_by_more_than_65_536_numbers_is_a_restart(back: int, *, is_late: bool) -> None:
+    """A message up to 65,536 numbers back is late, and discarded; beyond that, its publisher has restarted."""
+    inbox = make_queue("every")
+    put(inbox, [raw(100_000), raw(100_001 - back)])
+    assert inbox.counts.discarded == is_late
+    assert len(drain(inbox)) == 2 - is_late

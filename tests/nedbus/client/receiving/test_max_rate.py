@@ -108,6 +108,16 @@ def test_message_after_restart_with_an_earlier_clock_passes() -> None:
     assert timestamps(queue) == [1_000_000, 5000, 5200]
 
 
+@pytest.mark.parametrize(("earlier", "expected"), [(1.5, [10_000, 11_000]), (3.0, [10_000, 7_000, 11_000])])
+def test_downsampled_message_that_the_last_one_overtook_is_omitted(earlier: float, expected: list[int]) -> None:
+    """The query for the last message may be 2 s ahead of the stream; an earlier message shows a clock set back."""
+    queue = make_queue()
+    queue.put_last([at(10.0, None, key=KEY)])
+    queue.put([at(10.0 - earlier, 0), at(11.0, 1)])
+    assert timestamps(queue) == expected
+    assert queue.counts == Counts(received=len(expected))
+
+
 def passed(rate: float, times: list[float]) -> list[float]:
     """Return the times that pass a gate [s]."""
     gate = RateGate(rate)
