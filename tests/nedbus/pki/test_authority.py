@@ -437,7 +437,7 @@ def test_rules_command_sets_adds_and_removes_vehicles(file: Path, pki: Path, tmp
     assert rules("--add", "2", "1")[0] == ["+ 1"]
     assert rules("--remove", "wing", "10")[0] == ["- 10", "- wing"]
     assert rules()[0] == ["1", "2"]
-    assert rules("--from", str(pki))[0] == ["+ 200", "+ 99"]
+    assert rules("--from", str(pki))[0] == ["+ 200", "+ 99", "+ mocap"]
     assert stat.S_IMODE(file.stat().st_mode) == 0o640
     before = file.read_bytes()
     assert "its access rules do not name vehicle '7'" in rules("--remove", "7", code=2)[1]
