@@ -76,7 +76,10 @@ class SequenceCounter:
         self._rate = PacketRate()
 
     def add(self, sequence: int, now: float) -> int:
-        """Return the number of messages lost before this one; below 0 if so many had been counted but are not lost."""
+        """Return the number of messages lost before this one.
+
+        A number below 0 corrects an earlier count: that many messages arrived after all.
+        """
         main = self._main_at(now)
         if main is None:
             self._rate = PacketRate()

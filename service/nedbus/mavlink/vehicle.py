@@ -136,7 +136,7 @@ class Vehicle:
         self._next_round = now + _REQUEST_INTERVAL
 
     def count_lost(self, lost: int, now: float, *, counted: int | None = None, link: int = 0) -> None:
-        """Count the messages of any type lost before one that arrived at time `now`, -1 if it had been counted as lost.
+        """Count the messages of any type lost before one that arrived at `now`; a negative number corrects the count.
 
         `counted`: those that the ULog stream has counted, if this is one of its messages. `link`: its number, from 0,
         or `REPEATED`.

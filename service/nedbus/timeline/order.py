@@ -179,7 +179,9 @@ class _Track(Generic[M]):
         return self.base + max(0, log - self.log)
 
     def _outliers(self, items: Iterable[_Item[M]], newest: int) -> _Placed[M]:
-        """Place messages that do not continue the clock: late ones by their time, all others as in the file.
+        """Place messages that do not continue the clock: late and old ones by their time, all others as in the file.
+
+        A log keeps the order of each stream, in which the vehicle wrote it.
 
         `newest`: the newest timestamp before them.
         """

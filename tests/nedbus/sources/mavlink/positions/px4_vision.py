@@ -177,6 +177,6 @@ class Px4OnLink:
     def _send(self, message: Any) -> None:
         try:
             self._socket.send(message.pack(self._encoder))
-        except OSError:  # nobody listens yet
+        except OSError:  # no service has opened the port yet
             return
         self._encoder.seq = (self._encoder.seq + 1) % 256
