@@ -436,12 +436,15 @@ def test_ended_stream_has_no_age(monkeypatch: pytest.MonkeyPatch, state: State, 
         assert {each.labels["vehicle"] for each in found[f"nedbus_{name}"].samples} == vehicles, name
 
 
-def test_report_of_a_thousand_vehicles_is_complete(endpoint: str) -> None:
-    """A report of many megabytes arrives with every vehicle, its faults and their events."""
+def test_report_of_950_vehicles_is_complete(endpoint: str) -> None:
+    """A report of many megabytes arrives with every vehicle, its faults and their events.
+
+    Two events of each vehicle leave room in the log of 2,000 for those of the simulated vehicle and of the host's load.
+    """
     daemon = Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0")
     running = threading.Thread(target=daemon.run)
     running.start()
-    names = {f"vehicle-{number}" for number in range(999)}
+    names = {f"vehicle-{number}" for number in range(950)}
     try:
         with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
             wait_for(bus.services, what="the service")
@@ -461,7 +464,7 @@ def test_report_of_a_thousand_vehicles_is_complete(endpoint: str) -> None:
         running.join()
     vehicles = {name: vehicle for report in reports for name, vehicle in report.vehicles.items()}
     assert all({"xy_invalid", "z_invalid"} <= set(vehicles[name].kinds) for name in names)
-    assert sum(len(report.events) for report in reports) >= 1998
+    assert sum(len(report.events) for report in reports) >= 1900
 
 
 def test_scrape_takes_one_snapshot_per_stream(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
