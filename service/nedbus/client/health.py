@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import pairwise
 from statistics import fmean, median
 from typing import Any, Final, Literal, get_args
@@ -104,11 +105,22 @@ _FlagCounts = Counter[tuple[bool | None, ...]]  # messages by the values of all 
 
 
 def _flag_shares(counts: _FlagCounts) -> dict[str, float]:
-    shares, known = {}, [*counts.items()]  # copied: another thread may add to them
+    if len(counts) == 1:  # usual: no flag has changed
+        (flags,) = counts
+        return _shares_of_one(flags).copy()
+    shares = {}
     for index, flag in enumerate(DOUBT_FLAGS):
-        if total := sum(count for flags, count in known if flags[index] is not None):
-            shares[flag] = sum(count for flags, count in known if flags[index]) / total
+        known = sum(count for flags, count in counts.items() if flags[index] is not None)
+        if known:
+            shares[flag] = sum(count for flags, count in counts.items() if flags[index]) / known
     return shares
+
+
+@lru_cache(maxsize=256)
+def _shares_of_one(flags: tuple[bool | None, ...]) -> dict[str, float]:
+    """Return the shares of messages that all have these flags."""
+    pairs = zip(DOUBT_FLAGS, flags, strict=True)
+    return {name: float(is_set) for name, is_set in pairs if is_set is not None}
 
 
 @dataclass(slots=True, eq=False)
@@ -120,9 +132,21 @@ class _Window:
     intervals: tuple[int, float, float] = (0, 0.0, 0.0)  # number, mean [s], sum of squared differences from the mean
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
     flags: _FlagCounts = field(default_factory=Counter)
+    _sorted: list[float] | None = None  # the latencies; None after a new one
+
+    def add_latency(self, latency: float) -> None:
+        """Add a latency [s]."""
+        self.latencies.append(latency)
+        self._sorted = None
+
+    def sorted_latencies(self) -> list[float]:
+        """Return the latencies in ascending order [s]."""
+        if self._sorted is None:
+            self._sorted = sorted(self.latencies)
+        return self._sorted
 
     def add_intervals(self, intervals: Collection[float]) -> None:
-        """Add intervals [s] by Chan's method; the tuple is replaced as a whole, because other threads read it."""
+        """Add intervals [s] by Chan's method."""
         (number, mean, squares), added = self.intervals, len(intervals)
         own, total = fmean(intervals), number + added
         squares += sum([(interval - own) ** 2 for interval in intervals]) + (own - mean) ** 2 * number * added / total
@@ -165,6 +189,7 @@ class StreamHealth:
         self._is_regular = True  # by these steps, updated with their median
         self._rebooted: int | None = None  # when the first message after the last reboot arrived
         self._intervals = deque[float](maxlen=_USUAL)  # s between arrivals
+        self._usual_interval: float | None = None  # their median; None after a new one
         self._usual_rate: float | None = None
         self._flags: _FlagCounts = Counter()
         self._seen: tuple[tuple[int | None, ...], Collection[str]] = (), ()  # counters of the last, and missing fields
@@ -196,8 +221,12 @@ class StreamHealth:
     def _measure(self) -> None:
         """Measure the waiting messages, which are of one window."""
         with self._lock:
-            if waiting := [self._waiting.popleft() for _ in range(len(self._waiting))]:
-                self._measure_all(*zip(*waiting, strict=True))
+            self._measure_waiting()
+
+    def _measure_waiting(self) -> None:
+        """Measure them for a caller that holds the lock."""
+        if waiting := [self._waiting.popleft() for _ in range(len(self._waiting))]:
+            self._measure_all(*zip(*waiting, strict=True))
 
     def _measure_all(
         self,
@@ -217,10 +246,11 @@ class StreamHealth:
             intervals = [(later - earlier) / 1e9 for earlier, later in pairwise(times)]
             window.add_intervals(intervals)
             self._intervals.extend(intervals)
+            self._usual_interval = None
         self._received = received[-1]
         for latency in latencies:
             if latency is not None:
-                window.latencies.append(latency)
+                window.add_latency(latency)
                 self._latencies.add(latency)
         for each, absent, arrived in zip(values, missing, received, strict=True):
             rebooted = self._add_time(int(each[0]), arrived)
@@ -255,8 +285,14 @@ class StreamHealth:
     @property
     def usual_interval(self) -> float | None:
         """As in Health."""
-        self._measure()
-        return median(self._intervals) if len(self._intervals) >= _MIN_STEPS else None
+        with self._lock:
+            self._measure_waiting()
+            return self._median_interval()
+
+    def _median_interval(self) -> float | None:
+        if self._usual_interval is None and len(self._intervals) >= _MIN_STEPS:
+            self._usual_interval = median(self._intervals)
+        return self._usual_interval
 
     @property
     def stale_after(self) -> float:
@@ -270,11 +306,16 @@ class StreamHealth:
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
-        self._measure()
         now = time.monotonic_ns() if now is None else now
+        with self._lock:
+            self._measure_waiting()
+            return self._health(now)
+
+    def _health(self, now: int) -> Health:
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
-        latencies, (number, mean, squares) = sorted(window.latencies), window.intervals
+        latencies = window.sorted_latencies()
+        number, mean, squares = window.intervals
         is_live = mean > 0 and age is not None and age < max(TIMINGS.stale, 2 * mean)
         return Health(
             rate=1 / mean if is_live else None,
@@ -291,9 +332,9 @@ class StreamHealth:
             flags=_flag_shares(window.flags) if self._is_position and window.messages else None,
             flags_ever=_flag_shares(self._flags) if self._is_position and self._messages else None,
             usual_rate=self._usual_rate,
-            resets=dict(self._resets),
+            resets=self._resets.copy(),
             on_change=self._is_on_change,
-            usual_interval=self.usual_interval,
+            usual_interval=self._median_interval(),
             reboot_age=None if self._rebooted is None else (now - self._rebooted) / 1e9,
         )
 

@@ -137,6 +137,7 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         self._to_utc = clock.utc_ns() - self._latest  # from the monotonic to the wall clock [ns]
         self._streams: dict[Address, NewestMessage[Any]] = {}  # least recently updated first
         self._by_topic: defaultdict[str, dict[Address, NewestMessage[Any]]] = defaultdict(dict)
+        self._sorted: list[Address] | None = None  # addresses of the streams; None after a new or removed one
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
         """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`.
@@ -188,8 +189,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
         """Return the health of each measured stream, by address, now or at `now` [ns] of the clock used in `add`."""
-        streams = self._copy()
-        return {each: health.snapshot(now) for each in sorted(streams) if (health := streams[each]._measured)}
+        with self._lock:
+            streams = [self._streams[address] for address in self._sorted_addresses()]
+        return {stream.sample.address: stream._measured.snapshot(now) for stream in streams if stream._measured}
 
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latency histogram of a stream since the start [s]; None if it is not measured."""
@@ -210,9 +212,16 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
                 if len(self._streams) >= MAX_KEYS:
                     self._evict()
                 stream = self._by_topic[address.topic][address] = NewestMessage(sample, self._view)
+                self._sorted = None
             self._streams[address] = stream
             stream._put(sample, self._arrival(sample) if received is None else received)
         return stream
+
+    def _sorted_addresses(self) -> list[Address]:
+        """Return the addresses of all streams in order; the caller holds the lock."""
+        if self._sorted is None:
+            self._sorted = sorted(self._streams)
+        return self._sorted
 
     def _copy(self) -> dict[Address, NewestMessage[Any]]:
         with self._lock:
@@ -242,6 +251,7 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
 
     def _remove(self, address: Address) -> None:
         del self._streams[address], self._by_topic[address.topic][address]
+        self._sorted = None
         if not self._by_topic[address.topic]:
             del self._by_topic[address.topic]
 
