@@ -15,7 +15,7 @@ import zenoh
 from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import Session, token_keys
 
-DEADLINE = 30.0
+DEADLINE = 60.0
 """Seconds that a test waits for a condition before it fails."""
 
 
