@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Final
 
+from .text import counted
+
 _MAX_SHOWN: Final = 200  # characters of a value; a peer's key may be 64 kB long
 
 
@@ -49,7 +51,7 @@ class UnknownLayoutError(DecodeError):
 
     def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
         readable = ", ".join(map(str, known))
-        fields = f"{count} field{'s' * (count != 1)}"
+        fields = counted(count, "field")
         super().__init__(f"unknown layout {layout} with {fields} (known: {readable}); update nedbus_msgs", message)
         self.layout = layout
         self.count = count

@@ -141,7 +141,9 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     values, counter = _VALUES[name], RESET_COUNTERS[name]
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
     delta = after[f"delta_{name}"]
-    announced = [delta if isinstance(delta, tuple) else (delta,)] * ((after[counter] - before[counter]) % 256 == 1)
+    announced = []
+    if (after[counter] - before[counter]) % 256 == 1:
+        announced.append(delta if isinstance(delta, tuple) else (delta,))
     if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str([after[each] for each in _ORIGIN]):
         shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])
         announced += [(0.0,) * len(values), shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],)]

@@ -258,7 +258,9 @@ def _other_topic(name: str) -> Topic:
         if re.search(r"(^|/)(in|out)/", name):
             raise AddressError("topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix")
         base, _, instance = name.partition("/")
-        expected = f"one of {', '.join(topics)}" + ", or another PX4 topic in lower_snake_case" * (topics is TOPICS)
+        expected = f"one of {', '.join(topics)}"
+        if topics is TOPICS:
+            expected += ", or another PX4 topic in lower_snake_case"
         raise AddressError("topic", name, f"{base} with instance {instance}" if base in TOPICS else expected)
     if meant := get_close_matches(name, TOPICS, 3, _TYPO_SIMILARITY):
         raise AddressError("topic", name, f"{' or '.join(meant)} (looks like a misspelling)")

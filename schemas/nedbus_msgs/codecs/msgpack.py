@@ -18,6 +18,7 @@ from nedbus_msgs.model.definition import Definition, M, upgrade_with
 from nedbus_msgs.model.message import fill
 from nedbus_msgs.model.px4_types import BASES, FieldType, decode_text
 from nedbus_msgs.model.validation import Values
+from nedbus_msgs.text import counted
 
 PAYLOAD_LIMIT: Final = 4096
 """Maximum size of a payload [bytes]."""
@@ -211,7 +212,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
     if names is None:
         raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
     if len(values) != len(names):
-        raise reject(f"{len(values)} field{'s' * (len(values) != 1)}, expected {len(names)} for layout {layout}")
+        raise reject(f"{counted(len(values), 'field')}, expected {len(names)} for layout {layout}")
     fields: dict[str, object] = {}
     for name, value in zip(names, values, strict=True):
         # No field has nested arrays, and formatting a deeply nested value would overflow the stack.

@@ -140,7 +140,9 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
         count = _LENGTH.fullmatch(line.length)
         if parts.get(line.base) and level < _MAX_NESTING and (count or not line.length):
             for index in range(int(count[1])) if count else [None]:
-                inner = f"{prefix}{line.name}_" + f"{index}_" * (index is not None)
+                inner = f"{prefix}{line.name}_"
+                if index is not None:
+                    inner += f"{index}_"
                 yield from _flatten(parts, line.base, inner, level + 1)
             continue
         yield MsgField(prefix + line.name, _type_of(line), line.comment, line.number, line.column)

@@ -12,6 +12,7 @@ from nedbus.client import Subscription
 from nedbus.errors import ClosedError, NoDataError
 from nedbus.flights import RecordingWriter, check_recording
 from nedbus.samples import Batch
+from nedbus_msgs.text import counted
 
 _FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
@@ -40,7 +41,7 @@ class Recorder:
         counts = [f"{count} {name}" for name in names if (count := getattr(self._subscription.counts, name))]
         if self._writer is not None and self._writer.omitted:
             counts.append(f"{self._writer.omitted} not recorded")
-        return ", ".join([f"{self.messages} message{'s' * (self.messages != 1)}", *counts])
+        return ", ".join([f"{counted(self.messages, 'message')}", *counts])
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
         """Record until `stop` is set, for `duration` seconds, or until the subscription is closed; then drain it.

@@ -14,8 +14,9 @@ from nedbus.daemon import Daemon
 from nedbus.log_event import UnexpectedErrors
 from nedbus.monitoring import why_not_ready
 from nedbus.timings import TIMINGS
+from nedbus_msgs.text import counted
 
-from .output.streams import MAX_TEXT, counted, to_text
+from .output.streams import MAX_TEXT, to_text
 
 _log = logging.getLogger("nedbus")
 

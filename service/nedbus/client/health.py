@@ -29,6 +29,7 @@ from nedbus_msgs import (
     describe_flags,
     get_topic,
 )
+from nedbus_msgs.text import counted
 
 StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"]  # worst first
 
@@ -98,7 +99,9 @@ class Health:
 def _stale_after(nominal: float, rate: float | None, interval: float | None, *, on_change: bool) -> float:
     if not nominal and (on_change or (rate or 0) < _MIN_PERIODIC_RATE):
         return math.inf
-    return max(TIMINGS.stale, _FACTOR * (interval or 0.0))
+    if interval is None:
+        return TIMINGS.stale
+    return max(TIMINGS.stale, _FACTOR * interval)
 
 
 _FlagCounts = Counter[tuple[bool | None, ...]]  # messages by the values of all flags, None for unknown ones
@@ -448,11 +451,15 @@ def describe_stream(health: Health, state: StreamState) -> str:
     A reboot is mentioned for 60 s.
     """
     doubts = "ok" if health.flags is None else describe_flags(health.flags)
-    is_recent = health.reboot_age is not None and health.reboot_age < _RECENT
-    reboots = health.reboots if is_recent else 0
-    counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (reboots, "reboots")
-    events = [f"{n} {name.removesuffix('s' * (n == 1))}" for n, name in counts if n and state.name != "duplicate"]
-    return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
+    texts = [text for text in (str(state), doubts) if text != "ok"]
+    if state.name != "duplicate":
+        if health.gaps:
+            texts.append(counted(health.gaps, "gap"))
+        if health.out_of_order:
+            texts.append(f"{health.out_of_order} out of order")
+        if health.reboots and health.reboot_age is not None and health.reboot_age < _RECENT:
+            texts.append(counted(health.reboots, "reboot"))
+    return ", ".join(texts) or "ok"
 
 
 def health_of_last(sample: Sample[Message], *, age: float | None = None, measured: Health | None = None) -> Health:

@@ -261,7 +261,7 @@ class SourceOutput:
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"
-            text = f"{where}{' rejected' * (rejection.count > 0)}: {reason}"
+            text = f"{where} rejected: {reason}" if rejection.count else f"{where}: {reason}"
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:

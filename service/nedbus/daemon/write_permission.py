@@ -19,6 +19,7 @@ from nedbus.log_event import UnexpectedErrors, about
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
 from nedbus.transport import CONFIRMED, Session, Tls, Verdict, probe_at_router, routers_of, secure_endpoints
+from nedbus_msgs.text import plural
 
 _log = logging.getLogger(__name__)
 
@@ -138,4 +139,4 @@ class WritePermission:
 
 def _list_vehicles(vehicles: Sequence[str]) -> str:
     more = f" and {len(vehicles) - _MAX_NAMED} more" if len(vehicles) > _MAX_NAMED else ""
-    return f"vehicle{'s' * (len(vehicles) > 1)} {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"
+    return f"vehicle{plural(len(vehicles))} {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"

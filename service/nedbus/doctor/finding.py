@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
+from nedbus_msgs.text import counted
+
 State = Literal["ok", "unknown", "warning", "wrong"]
 _STATES: Final[tuple[State, ...]] = get_args(State)  # worst last
 FIRST_PARTNER: Final = (
@@ -49,7 +51,7 @@ def limit_findings(findings: Iterable[Finding]) -> list[Finding]:
     ordered = sort_findings(_merge_equal(findings))
     rest, kept = ordered[:-_MAX_FINDINGS], ordered[-_MAX_FINDINGS:]
     if rest:
-        text = f"{len(rest)} more finding{'s' * (len(rest) > 1)} of this check"
+        text = f"{counted(len(rest), 'more finding')} of this check"
         kept.insert(0, Finding(kept[0].check, "", worst_state(rest), text))
     return kept
 

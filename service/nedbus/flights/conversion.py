@@ -12,6 +12,7 @@ from nedbus.errors import OutputError, SourceError
 from nedbus.log_event import about
 from nedbus.samples import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
+from nedbus_msgs.text import counted
 
 from .flight import Flight, boot_utc_of
 from .readers import check_recording
@@ -72,7 +73,8 @@ def convert(
                 raise SourceError(str(path), f"not written, because all {rejected} messages are rejected: {reason}")
     except OSError as exc:  # an OutputError names the temporary file
         raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
-    return f"{writer.messages} message{'s' * (writer.messages != 1)}" + (f", {rejected} rejected" if rejected else "")
+    written = counted(writer.messages, "message")
+    return f"{written}, {rejected} rejected" if rejected else written
 
 
 def _write(

@@ -13,6 +13,7 @@ from .log_reassembly import Chunk
 from .senders import Senders
 
 _SIGNATURE: Final = 13  # bytes
+_CHECKSUM: Final = 2  # bytes
 _HEADER, _OLD_HEADER = 10, 6  # bytes, of MAVLink 2 and 1
 _LOG_HEADER: Final = struct.Struct("<H4B")  # the fields of ULog data before the data
 
@@ -200,8 +201,10 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
         number = int.from_bytes(msgbuf[7:10], "little") if is_v2 else msgbuf[5]
         if (layout := _LAYOUTS.get(number)) is None:
             return super().decode(bytearray(msgbuf))
-        end = len(msgbuf) - 2 - _SIGNATURE * (is_v2 and bool(msgbuf[2] & dialect.MAVLINK_IFLAG_SIGNED))
-        if dialect.x25crc(msgbuf[1:end] + layout.extra).crc != int.from_bytes(msgbuf[end : end + 2], "little"):
+        end = len(msgbuf) - _CHECKSUM
+        if is_v2 and msgbuf[2] & dialect.MAVLINK_IFLAG_SIGNED:
+            end -= _SIGNATURE
+        if dialect.x25crc(msgbuf[1:end] + layout.extra).crc != int.from_bytes(msgbuf[end : end + _CHECKSUM], "little"):
             raise dialect.MAVError("invalid CRC")
         kind = _LogData if number in _LOG_DATA else _Frame
         return kind(number, layout, bytes(msgbuf), bytes(msgbuf[_HEADER if is_v2 else _OLD_HEADER : end]))

@@ -73,7 +73,8 @@ def request_rates(rate: float, baud: int | None, topics: Collection[str]) -> dic
         if not set(needed.split()).isdisjoint(topics)
     }
     others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
-    free = _USABLE_SHARE * (baud or math.inf) / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    capacity = math.inf if baud is None else _USABLE_SHARE * baud / _BITS_PER_BYTE  # bytes/s
+    free = capacity - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
     for index, number in enumerate(others):
         level = free / sum(STREAMS[each][0] for each in others[index:])
         wanted[number] = min(wanted[number], max(_MIN_RATE, level))

@@ -8,6 +8,7 @@ from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.extras import import_optional
 from nedbus.vehicle_events import AccountReport, Expectation, by_vehicle, faults_of, format_since
+from nedbus_msgs.text import plural
 
 from .http_server import Page
 
@@ -66,7 +67,9 @@ def _health(daemon: Daemon) -> Page:
 
 def _refusals(daemon: Daemon) -> list[str]:
     refused = sorted(vehicle for vehicle, is_refused in daemon.refused.items() if is_refused)
-    return [f"the router refuses messages of vehicle{'s' * (len(refused) > 1)} {', '.join(refused)}"] if refused else []
+    if not refused:
+        return []
+    return [f"the router refuses messages of vehicle{plural(len(refused))} {', '.join(refused)}"]
 
 
 def _metrics(daemon: Daemon) -> Page:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pydantic import ValidationError, ValidatorFunctionWrapHandler, field_validator
 from pydantic_core import PydanticUseDefault
 
+from nedbus_msgs.text import counted
+
 
 class UntrustedReply:
     """Base of untrusted replies: an invalid value becomes the default, and invalid items of a list are dropped."""
@@ -64,7 +66,7 @@ class LogStreamStatus(UntrustedReply):
             f"{self.rate / 1000:.1f} KB/s" if self.received else "",
             "" if self.delay is None else f"delay {self.delay * 1000:.0f} ms",
             "" if self.header_time is None else f"header {self.header_time:.1f} s",
-            f"{self.gaps} gap{'s' * (self.gaps > 1)}, {lost}" if self.gaps else "",
+            f"{counted(self.gaps, 'gap')}, {lost}" if self.gaps else "",
             f"{self.undecodable} without a definition" if self.undecodable else "",
             f"saved to {self.saved}" if self.saved else "",
             f"{self.unsaved} bytes not saved" if self.unsaved else "",

@@ -14,6 +14,7 @@ import zenoh
 from nedbus.errors import AddressError, ConnectError
 from nedbus.log_event import about
 from nedbus_msgs import Address, Selection, address_of_alive_key
+from nedbus_msgs.text import counted
 
 from .fleet_tokens import FleetTokens
 from .liveliness import LivelinessTokens
@@ -89,7 +90,7 @@ class VehicleDirectory:
         publishers.complete = self._tokens is not None and self._tokens.complete
         is_listing = self._tokens is None or self._tokens.is_listing
         if is_listing and timeout and not self._logged:
-            text = "the router listed only %d stream%s within %g s; it may be slow, or forbid listing others"
-            _log.warning(text, len(publishers), "s" * (len(publishers) != 1), timeout, extra=about("incomplete"))
+            text = "the router listed only %s within %g s; it may be slow, or forbid listing others"
+            _log.warning(text, counted(len(publishers), "stream"), timeout, extra=about("incomplete"))
         self._logged = is_listing and (self._logged or timeout > 0)
         return publishers

@@ -322,7 +322,7 @@ def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
     return {
         "few_satellites": (few, f"only {count}", count, {"satellites": satellites}),
         "jamming": (jamming, f"{jam}{state}", "GNSS jamming ended", {"indicator": indicator, "state": jammed}),
-        "spoofing": (2 * (spoofed > 1), spoof, "GNSS spoofing ended", {"state": spoofed}),
+        "spoofing": (2 if spoofed > 1 else 0, spoof, "GNSS spoofing ended", {"state": spoofed}),
     }
 
 

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from nedbus_msgs.text import counted
+
 from .event import ALL, without_wild
 from .report import AccountReport, VehicleReport, by_vehicle, once_per_service
 from .times import format_duration, format_since, format_utc
@@ -79,4 +81,4 @@ def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> I
             lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_RECENT]
     if (more := len(lines) - _MAX_RECENT) > 0:
-        yield f"{more} more event{'s' * (more > 1)} in the last {expected.within:g} s"
+        yield f"{counted(more, 'more event')} in the last {expected.within:g} s"

@@ -13,6 +13,7 @@ from typing import Final
 from nedbus.fusion import AID_TOPICS, FusionTracker
 from nedbus.timeline import MAX_REORDERED, RebootDetector, RebootSign
 from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
+from nedbus_msgs.text import counted
 
 from . import detectors, rules
 from .contradictions import AIR_DATA, REFERENCES, Comparison, ReferenceDetector
@@ -166,7 +167,7 @@ class Vehicle:
             if time - burst.end <= rules.PAUSE and (kind != "lost" or time - burst.begin <= rules.MAX_BURST):
                 continue
             del self._bursts[kind]
-            messages = f"{burst.count} message{'s' * (burst.count > 1)}"
+            messages = counted(burst.count, "message")
             numbers: dict[str, float] = {"messages": burst.count}
             if kind == "lost":
                 names = tuple(sorted(burst.topics - {""}))
@@ -226,7 +227,8 @@ class Vehicle:
             age, was_late = now - max(newest, self._resumed) if newest else 0, supply.is_late
             supply.is_late = age > limit
             if ("no_messages", name) in self.conditions:
-                resumed += [name] * (not supply.is_late)
+                if not supply.is_late:
+                    resumed.append(name)
             elif supply.is_late and not was_late:  # another topic may replace it
                 self._detectors = {each: found for each, found in self._detectors.items() if found}
             elif age > limit + _REPLACED:

@@ -12,7 +12,7 @@ import typer
 
 from nedbus import __version__
 from nedbus.cli.options import JsonOption, command
-from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
+from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, format_duration
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
@@ -20,6 +20,7 @@ from nedbus.errors import ConfigError, NedbusError
 from nedbus.settings import Settings
 from nedbus.vehicle_events import VALID, AccountReport, Expectation, VehicleReport, faults_of
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
+from nedbus_msgs.text import counted
 
 _HOST: Final = socket.gethostname()
 _REQUIRED: Final = "Require a message of this vehicle, from any publisher"

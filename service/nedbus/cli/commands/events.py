@@ -26,6 +26,7 @@ from nedbus.clock import format_duration
 from nedbus.errors import ArgumentError, ConfigError, NedbusError
 from nedbus.health import SEVERITIES, Event, EventHistory, Story, Times, Verdict
 from nedbus_msgs import ANY, Selection, check_vehicle
+from nedbus_msgs.text import counted
 
 if TYPE_CHECKING:
     from nedbus import Bus
@@ -149,7 +150,7 @@ def why(
     if texts:
         write(("\n\n" if details else "\n").join(texts))
     if faults and not details:
-        write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
+        write_stderr(f"--all shows {counted(faults, 'fault')} in detail")
 
 
 def _verdict(history: EventHistory, vehicle: str, at: str | None) -> Verdict:

@@ -10,10 +10,11 @@ import typer
 
 from nedbus import clock, pki as certificates
 from nedbus.cli.options import JsonOption, allow_one, command
-from nedbus.cli.output.streams import counted, write, write_stderr
+from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.output.table import to_table
 from nedbus.errors import ConfigError, PkiError
 from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
+from nedbus_msgs.text import counted
 
 pki = typer.Typer(help="Manage keys, certificates and access rules for tls/ endpoints.", no_args_is_help=True)
 

@@ -11,7 +11,7 @@ import typer
 from nedbus.cli.absence import explain_absence
 from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
-from nedbus.cli.output.streams import counted, to_text, write, write_stderr
+from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
 from nedbus.client import (
     Bus,
@@ -27,6 +27,7 @@ from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
+from nedbus_msgs.text import counted
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")

@@ -16,9 +16,10 @@ from typing import Final, TextIO
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import EVENTS, About, about
+from nedbus_msgs.text import counted
 
 from . import LogFormat, LogLevel
-from .streams import MAX_TEXT, STRUCTURED, counted, printable, to_text
+from .streams import MAX_TEXT, STRUCTURED, printable, to_text
 
 BURST: Final = 50  # lines of one kind that may be logged at once
 PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a burst

@@ -14,8 +14,9 @@ from nedbus.daemon import Daemon
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
+from nedbus_msgs.text import counted
 
-from .streams import counted, is_log_structured, write_stderr
+from .streams import is_log_structured, write_stderr
 
 _log = logging.getLogger("nedbus")
 

@@ -36,11 +36,6 @@ def to_text(value: object, limit: int = _MAX_CELL) -> str:
     return printable(short.replace("\n", "\\n"))[: 4 * limit]
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: 1 source, 2 sources."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def csv_line(cells: Iterable[object]) -> str:
     """Format cells as a line of CSV, quoted where necessary; None is an empty cell.
 

@@ -109,7 +109,9 @@ class LogStream:
             return
         self._received += len(chunk.data)
         self._window_bytes += len(chunk.data)
-        undecodable, omitted, problem = self._parser.undecodable, self._texts.limit.omitted, self._texts.problem
+        undecodable = self._parser.undecodable
+        omitted = self._texts.limit.omitted
+        problem = self._texts.problem
         try:
             records = self._parser.feed(chunk.data)
         except ulog.UlogError as exc:  # raised once for each stream
@@ -125,21 +127,31 @@ class LogStream:
         self._save_definitions(records, now, others=len(records) - len(sizes))
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
-                subscription, payload = record
-                if subscription not in self._streams:
-                    yield from self._open_stream(subscription)
-                if (stream := self._streams[subscription]) is not None:
-                    given = None
-                    if stream.converted or subscription.layout.has_unset_bools(payload):
-                        given = yield from self._decode(stream, payload)
-                    yield self._message(stream, payload, given, now)
+                yield from self._messages(*record, now)
             elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
             elif isinstance(record, ulog.Damage):
                 yield self._reject(record.reason)
-        count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
-        yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
-        yield from [Rejection(where, self._texts.problem, count=0)] * (self._texts.problem != problem)
+        where = f"{self._name} {ulog.LOG_MESSAGE.name}"
+        if self._texts.limit.omitted > omitted:
+            count = self._texts.limit.omitted - omitted
+            yield Rejection(where, "more than 100 log messages per second", count=count)
+        if self._texts.problem != problem:
+            yield Rejection(where, self._texts.problem, count=0)
+
+    def _messages(
+        self, subscription: ulog.Subscription, payload: bytes, now: float
+    ) -> Iterator[SourceMessage | Rejection]:
+        """Yield the message of a data record, unless its topic is not read, and what is rejected on the way."""
+        if subscription not in self._streams:
+            yield from self._open_stream(subscription)
+        stream = self._streams[subscription]
+        if stream is None:
+            return
+        given = None
+        if stream.converted or subscription.layout.has_unset_bools(payload):
+            given = yield from self._decode(stream, payload)
+        yield self._message(stream, payload, given, now)
 
     def _reject(self, reason: str) -> Rejection:
         """Return the rejection of a damaged record; all beyond the first 100 reasons have the same one."""

@@ -66,8 +66,11 @@ class _VehicleQueue:
         chunk = received.chunk
         self.lost += received.lost + received.parts
         if chunk is not None:
-            self.lost_chunks += chunk.lost + received.parts * (chunk.verdict in ("delivered", "unsynchronised"))
-            self.is_cut, self.is_undefined = True, self.is_undefined or chunk.begins
+            self.lost_chunks += chunk.lost
+            if chunk.verdict in ("delivered", "unsynchronised"):
+                self.lost_chunks += received.parts
+            self.is_cut = True
+            self.is_undefined = self.is_undefined or chunk.begins
 
     def resume(self, received: Received) -> Received:
         """Return the next message, with all losses before it; after a dropped chunk, data begins with a record."""
