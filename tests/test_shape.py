@@ -35,7 +35,9 @@ def test_packages_are_imported_through_their_interface() -> None:
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             for top, *inner in (name.split(".") for name in names):
                 if top == "nedbus_msgs" and package == "nedbus":
-                    assert inner in ([], ["arrays"], ["frames"], ["messages"], ["text"]), f"{path}: import from nedbus_msgs"
+                    assert inner in ([], ["arrays"], ["frames"], ["messages"], ["text"]), (
+                        f"{path}: import from nedbus_msgs"
+                    )
                 if top == "nedbus" and inner and layer != "__init__.py":
                     assert inner[0] == layer or len(inner) == 1, f"{path}: import from nedbus.{inner[0]}"
 
