@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, overload
 
 from nedbus.errors import ArgumentError, ClosedError, NedbusError, NoDataError
-from nedbus.fusion import FUSION_TOPICS, Fusion, FusionTracker
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import (
@@ -50,6 +49,7 @@ from .subscription import Subscription
 
 if TYPE_CHECKING:
     from nedbus.event_history import EventHistory
+    from nedbus.fusion import Fusion
     from nedbus.vehicle_events import AccountReport, Verdict
 
 
@@ -253,7 +253,11 @@ class Bus(AbstractContextManager["Bus"]):
         The evidence is in topics of PX4's log stream, such as estimator_aid_src_ev_pos; `missing` lists what lacks.
         Raises NoDataError if no message of the vehicle arrives.
         """
-        name, tracker, end = vehicle_name(vehicle), FusionTracker(), time.monotonic() + duration
+        from nedbus.fusion import FUSION_TOPICS, FusionTracker
+
+        name = vehicle_name(vehicle)
+        tracker = FusionTracker()
+        end = time.monotonic() + duration
         is_received = False
         with self.subscribe(*FUSION_TOPICS, vehicle=name, mode="every") as subscription:
             while (left := end - time.monotonic()) > 0:

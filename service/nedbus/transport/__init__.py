@@ -1,8 +1,10 @@
 """Zenoh transport: sessions, routers, TLS, queries, liveliness tokens, and the keys of rmw_zenoh."""
 
-from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
+from typing import TYPE_CHECKING
 
-from .access_control import AccessControl
+from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
+from nedbus.extras import lazy_exports
+
 from .key_reader import KeyReader
 from .liveliness import LivelinessTokens, token_keys
 from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
@@ -35,3 +37,8 @@ from .tls import UNKNOWN_CA, Tls, check_pem, read_certificate
 from .vehicle_directory import Publishers, VehicleDirectory
 from .write_probe import CONFIRMED, Verdict, is_refused, probe_at_router, probe_writes, routers_of, secure_endpoints
 from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload
+
+if TYPE_CHECKING:
+    from .access_control import AccessControl
+else:
+    __getattr__ = lazy_exports("nedbus.transport", {"AccessControl": ("", "access_control")})

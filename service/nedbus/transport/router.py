@@ -1,5 +1,7 @@
 """Embedded Zenoh router, with default settings or a configuration file of `zenohd`; state of reachable routers."""
 
+from __future__ import annotations
+
 import json
 import logging
 import os
@@ -10,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
@@ -19,10 +21,12 @@ from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
-from .access_control import AccessControl
 from .queries import query
 from .session import COMMON_SETTINGS, Session, error_reason, insert_settings, open_session, random_backoff
 from .tls import Tls
+
+if TYPE_CHECKING:
+    from .access_control import AccessControl
 
 _log = logging.getLogger(__name__)
 
@@ -137,6 +141,8 @@ def read_router_config(path: Path | None = None) -> RouterConfig:
 
     Raises ConfigError, with line and column, for a malformed file.
     """
+    from .access_control import AccessControl
+
     config = zenoh.Config() if path is None else _parse_config(path)
     sessions = int(_get(config, "transport/unicast/max_sessions"))
     access = AccessControl(_get(config, "access_control"), _get(config, "low_pass_filter"))
