@@ -11,8 +11,7 @@ from typing import Any, Final
 
 import zenoh
 
-from nedbus import clock, transport
-from nedbus.client import Bus, Sample, Subscription
+from nedbus import Bus, Sample, Subscription, clock, transport
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS

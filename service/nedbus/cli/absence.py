@@ -3,7 +3,9 @@
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from nedbus.client import Bus, ServiceStatus, SourceStatus, prefix_of
+from nedbus import Bus
+from nedbus.client import prefix_of
+from nedbus.health import ServiceStatus, SourceStatus
 from nedbus.transport import token_keys
 
 from .output.streams import to_text

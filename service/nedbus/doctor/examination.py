@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from nedbus import client
+from nedbus import Tls, client
 from nedbus.errors import NedbusError
 from nedbus.extras import import_optional
 from nedbus.log_event import about
@@ -17,7 +17,7 @@ from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.timings import TIMINGS
-from nedbus.transport import AccessControl, Tls, probe_writes, read_router_config
+from nedbus.transport import AccessControl, probe_writes, read_router_config
 
 from .access_rules import explain_permissions
 from .configuration import check_sources

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import ServiceStatus, SourceStatus, prefix_of
+from nedbus.client import prefix_of
+from nedbus.health import ServiceStatus, SourceStatus
 from nedbus.vehicle_events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 

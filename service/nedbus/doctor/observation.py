@@ -11,8 +11,8 @@ from typing import Final, TypeVar
 import zenoh
 
 from nedbus import client, clock, transport
+from nedbus.health import AccountReport
 from nedbus.timings import TIMINGS
-from nedbus.vehicle_events import AccountReport
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
 T = TypeVar("T")

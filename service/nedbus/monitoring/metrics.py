@@ -17,9 +17,9 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
 from nedbus import clock
-from nedbus.client import Health, Histogram, SourceStatus
 from nedbus.daemon import STATES, TOO_MANY, Daemon, SourceMeasures
-from nedbus.vehicle_events import SEVERITIES, EventLog
+from nedbus.health import SEVERITIES, Health, Histogram, SourceStatus
+from nedbus.vehicle_events import EventLog
 
 from .http_server import Page
 

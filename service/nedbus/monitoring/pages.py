@@ -7,7 +7,8 @@ from typing import Final
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.extras import import_optional
-from nedbus.vehicle_events import AccountReport, Expectation, by_vehicle, faults_of, format_since
+from nedbus.health import AccountReport
+from nedbus.vehicle_events import Expectation, by_vehicle, faults_of, format_since
 
 from .http_server import Page
 

@@ -15,7 +15,8 @@ from matplotlib.lines import Line2D
 
 from nedbus.atomic_write import atomic_write
 from nedbus.errors import ConfigError, OutputError
-from nedbus.vehicle_events import KINDS, SEVERITIES, Event, Severity, Times, format_utc, spans_of, unit_of
+from nedbus.health import SEVERITIES, Event, Times
+from nedbus.vehicle_events import KINDS, Severity, format_utc, spans_of, unit_of
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
 

@@ -5,21 +5,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from nedbus.vehicle_events import (
-    Condition,
-    Event,
-    EventLog,
-    Span,
-    Story,
-    Times,
-    Verdict,
-    format_utc,
-    spans_of,
-    stories_of,
-    story_of,
-    unit_of,
-    verdict_of,
-)
+from nedbus.health import Condition, Event, Span, Story, Times, Verdict
+from nedbus.vehicle_events import EventLog, format_utc, spans_of, stories_of, story_of, unit_of, verdict_of
 
 PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
