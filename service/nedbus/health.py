@@ -22,8 +22,12 @@ if TYPE_CHECKING:
         ServiceStatus,
         SourceStatus,
         StreamHealth,
+        StreamState,
         StreamStatus,
         Vehicles,
+        describe_stream,
+        health_of_last,
+        stream_state,
     )
     from .event_history import EventHistory
     from .fusion import Fusion, QuantityFusion
@@ -42,7 +46,8 @@ if TYPE_CHECKING:
 else:
     _NAMES = {
         "client": "Health Histogram LinkCallback LogStreamStatus Monitor NewestMessage PositionStatus Publishers"
-        " RejectionReport Rejections ServiceStatus SourceStatus StreamHealth StreamStatus Vehicles",
+        " RejectionReport Rejections ServiceStatus SourceStatus StreamHealth StreamState StreamStatus Vehicles"
+        " describe_stream health_of_last stream_state",
         "vehicle_events": "SEVERITIES AccountReport Condition Event Span Story Times VehicleReport Verdict",
         "event_history": "EventHistory",
         "fusion": "Fusion QuantityFusion",
@@ -56,5 +61,6 @@ __all__ = [
     "SEVERITIES", "AccountReport", "Condition", "Event", "EventHistory", "Fusion", "Health", "Histogram",
     "LinkCallback", "LiveEvents", "LogStreamStatus", "Monitor", "NewestMessage", "PositionStatus", "Publishers",
     "QuantityFusion", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "Span", "Story",
-    "StreamHealth", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict",
+    "StreamHealth", "StreamState", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict", "describe_stream",
+    "health_of_last", "stream_state",
 ]  # fmt: skip

@@ -7,17 +7,16 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
+from nedbus.endpoints import check_endpoints, dial_endpoint, split_http
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
-from nedbus.transport import Tls, check_endpoints, dial_endpoint, router_endpoints
+from nedbus.transport import Tls, router_endpoints
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_name
 
 _log = logging.getLogger(__name__)
@@ -39,22 +38,6 @@ def split_sources(value: object) -> object:
 def split_values(value: object) -> object:
     """Split a string at commas."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
-
-
-def split_http(where: str) -> tuple[str, int]:
-    """Parse HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
-    host, _, port = where.rpartition(":")
-    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
-        raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
-    return bare, int(port)
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a server on this address is reachable from this host only."""
-    with suppress(ValueError):
-        return ip_address(host).is_loopback
-    return host == "localhost"
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:

@@ -10,10 +10,10 @@ import pytest
 
 import nedbus
 from nedbus import Tls
-from nedbus.endpoints import resolution_error
+from nedbus.endpoints import is_loopback, resolution_error
 from nedbus.errors import ConfigError, ConnectError, ListenError
 from nedbus.pki import make_authority, make_certificate
-from nedbus.settings import is_loopback, load_settings
+from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
 from tests.peers.command_line import run_command

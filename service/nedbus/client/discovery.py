@@ -193,14 +193,6 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     return list(found.values())
 
 
-def prefix_of(key: str) -> str:
-    """Return the prefix of the key of a message or of a publisher's token; "" if it has none, as in plain ROS 2."""
-    vehicle, alive, _ = key.partition("/@alive/")
-    before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
-    is_ros2_domain = bool(before) and before[0].isdecimal()  # `<domain>/fmu/out/vehicle_local_position`
-    return "" if is_ros2_domain else "/".join(before)
-
-
 def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
     """Query all services for their event reports of the last `within` seconds, one report per vehicle and service.
 

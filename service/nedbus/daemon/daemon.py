@@ -10,11 +10,12 @@ from typing import Final, Literal
 
 from nedbus import clock
 from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
+from nedbus.endpoints import dial_endpoint
 from nedbus.errors import ConfigError, ConnectError
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting, locate_source
 from nedbus.sources import ReplaySource, Source, parse_source
-from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
+from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
 from nedbus.vehicle_events import AccountReport, EventLog, report_of
 
 from .status_replies import StatusReplies

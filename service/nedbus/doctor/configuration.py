@@ -7,11 +7,12 @@ from contextlib import closing
 from pathlib import Path
 
 from nedbus.daemon import PlannedSource, plan_sources
+from nedbus.endpoints import check_endpoints, split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, position_at
 from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
-from nedbus.transport import RouterConfig, check_endpoints, read_router_config, router_endpoints, split_endpoint
+from nedbus.transport import RouterConfig, read_router_config, router_endpoints
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .access_rules import find_rule_mistakes

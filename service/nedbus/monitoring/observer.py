@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from nedbus import Bus, Sample, clock
-from nedbus.client import stream_state
-from nedbus.health import Health, Monitor, RejectionReport
+from nedbus.health import Health, Monitor, RejectionReport, stream_state
 from nedbus.timings import TIMINGS
 from nedbus.vehicle_events import RECENT, EventLog
 from nedbus_msgs import Address, Selection

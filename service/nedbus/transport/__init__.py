@@ -1,7 +1,5 @@
 """Zenoh transport: sessions, routers, TLS, queries, liveliness tokens, and the keys of rmw_zenoh."""
 
-from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
-
 from .access_control import AccessControl
 from .key_reader import KeyReader
 from .liveliness import LivelinessTokens, token_keys

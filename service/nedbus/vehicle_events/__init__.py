@@ -16,6 +16,6 @@ from .report import (
 )
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, events_outside, is_alarm, spans_of, state_at, stories_of, story_of
-from .times import Times, format_duration, format_since, format_utc, unit_of
+from .times import Times
 from .vehicle import EVENT_TOPICS
 from .verdict import Verdict, verdict_of

@@ -12,8 +12,16 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from nedbus import Sample
-from nedbus.client import StreamState, stream_state
-from nedbus.health import Fusion, Health, LogStreamStatus, Monitor, NewestMessage, RejectionReport
+from nedbus.health import (
+    Fusion,
+    Health,
+    LogStreamStatus,
+    Monitor,
+    NewestMessage,
+    RejectionReport,
+    StreamState,
+    stream_state,
+)
 from nedbus.monitoring import Snapshot
 from nedbus.vehicle_events import FIXES, MODES, State, rank_vehicle
 from nedbus_msgs import DEFAULT_TOPIC, Address

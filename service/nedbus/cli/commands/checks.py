@@ -14,7 +14,7 @@ from nedbus import Bus, Sample, __version__
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import format_duration
+from nedbus.clock import format_duration
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.health import AccountReport, VehicleReport

@@ -10,8 +10,8 @@ from nedbus.cli.follow import follow
 from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, allow_one, command
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import live_table
-from nedbus.client import StreamState, describe_stream, format_duration, stream_state
-from nedbus.health import Health, Monitor
+from nedbus.clock import format_duration
+from nedbus.health import Health, Monitor, StreamState, describe_stream, stream_state
 from nedbus_msgs import DOUBT_FLAGS, Address, Selection
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")

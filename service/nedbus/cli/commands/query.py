@@ -14,10 +14,17 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOptio
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import describe_stream, health_of_last, stream_state
 from nedbus.clock import format_duration
 from nedbus.errors import AddressError, ConfigError, ConnectError
-from nedbus.health import Health, ServiceStatus, SourceStatus, StreamStatus
+from nedbus.health import (
+    Health,
+    ServiceStatus,
+    SourceStatus,
+    StreamStatus,
+    describe_stream,
+    health_of_last,
+    stream_state,
+)
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
 

@@ -15,12 +15,13 @@ from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
 from nedbus.daemon import Daemon
 from nedbus.doctor import check_service
+from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus.transport import DEFAULT_ENDPOINT, Uplinks, log_refusals, open_router, router_endpoints
+from nedbus.transport import Uplinks, log_refusals, open_router, router_endpoints
 
 from .bridges import serve_pages
 from .checks import report_mistakes

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from nedbus import Sample
-from nedbus.client import format_duration
+from nedbus.clock import format_duration
 from nedbus.errors import ConfigError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, Message, message_doubts
