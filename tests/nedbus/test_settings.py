@@ -280,6 +280,17 @@ def test_malformed_endpoint_raises(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("index", "where"),
+    [(0, ", line 1, column 1"), (5, ", line 2, column 2"), (-1, "")],
+    ids=["first", "second", "none"],
+)
+def test_error_in_a_text_has_line_and_column(index: int, where: str) -> None:
+    """`ConfigError.in_text` converts an index to line and column, both from 1; -1 names only the file."""
+    error = ConfigError.in_text(Path("a.toml"), "wrong", "abc\ndef", index)
+    assert str(error) == f"a.toml{where}: wrong"
+
+
+@pytest.mark.parametrize(
     ("host", "expected"),
     [("127.0.0.1", True), ("127.0.0.2", True), ("::1", True), ("localhost", True), ("0.0.0.0", False),  # noqa: S104
      ("::", False), ("192.0.2.1", False), ("ground", False)],

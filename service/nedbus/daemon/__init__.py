@@ -1,5 +1,12 @@
-"""The service: a Daemon runs one Worker per source and replies to status queries."""
+"""The service of `nedbus serve`, to run in a program of your own: a Daemon publishes the sources of its settings.
+
+daemon = Daemon(load_settings(source=["sim:"]), version="1.0")
+threading.Thread(target=daemon.run).start()
+...
+daemon.stop()
+"""
 
 from .daemon import Daemon, plan_sources
-from .output import TOO_MANY
 from .worker import STATES, PlannedSource, SourceMeasures
+
+__all__ = ["STATES", "Daemon", "PlannedSource", "SourceMeasures", "plan_sources"]

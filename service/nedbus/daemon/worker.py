@@ -28,7 +28,7 @@ from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.vehicle_events import EventLog
 
-from .output import SourceOutput
+from .output import TOO_MANY, SourceOutput
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +40,7 @@ _MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
 
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
+"""States of a source, in `SourceStatus.state`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,11 @@ class SourceMeasures:
 
     status: SourceStatus
     durations: Histogram
+
+    @property
+    def beyond_limit(self) -> int:
+        """Messages of a replay that are rejected because their address is beyond the limit of 10,000."""
+        return self.status.rejections.get(TOO_MANY, 0)
 
     @property
     def states(self) -> dict[str, str]:

@@ -10,7 +10,7 @@ from nedbus.daemon import PlannedSource, plan_sources
 from nedbus.endpoints import check_endpoints, split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, position_at
+from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source
 from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
 from nedbus.transport import RouterConfig, read_router_config, router_endpoints
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -64,13 +64,13 @@ def check_router_file(
     text = path.read_text(errors="replace")
     subjects = max(0, text.find("cert_common_names"))  # names of certificates also occur before
     located = [
-        (mistake.reason, position_at(text, text.find(f'"{mistake.certificate}"', subjects)))
+        (mistake.reason, text.find(f'"{mistake.certificate}"', subjects))
         for mistake in find_rule_mistakes(config.access)
     ]
     if not offline:
         found = _check_router_access(config, replaced)
-        located += [(reason, position_at(text, text.find(value))) for value, reason in found if reason]
-    return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
+        located += [(reason, text.find(value)) for value, reason in found if reason]
+    return [ConfigError.in_text(path, reason, text, index) for reason, index in located]
 
 
 def _check_router_access(config: RouterConfig, replaced: Collection[str]) -> list[tuple[str, str]]:
