@@ -26,12 +26,14 @@ if TYPE_CHECKING:
         StreamStatus,
         Vehicles,
         describe_stream,
+        find_services,
         health_of_last,
         stream_state,
     )
     from .event_history import EventHistory
     from .fusion import Fusion, QuantityFusion
     from .monitoring import LiveEvents
+    from .transport import RouterState, query_routers
     from .vehicle_events import (
         SEVERITIES,
         AccountReport,
@@ -47,11 +49,12 @@ else:
     _NAMES = {
         "client": "Health Histogram LinkCallback LogStreamStatus Monitor NewestMessage PositionStatus Publishers"
         " RejectionReport Rejections ServiceStatus SourceStatus StreamHealth StreamState StreamStatus Vehicles"
-        " describe_stream health_of_last stream_state",
+        " describe_stream find_services health_of_last stream_state",
         "vehicle_events": "SEVERITIES AccountReport Condition Event Span Story Times VehicleReport Verdict",
         "event_history": "EventHistory",
         "fusion": "Fusion QuantityFusion",
         "monitoring": "LiveEvents",
+        "transport": "RouterState query_routers",
     }
     __getattr__ = lazy_exports(
         "nedbus", {name: ("", module) for module, names in _NAMES.items() for name in names.split()}
@@ -60,7 +63,7 @@ else:
 __all__ = [
     "SEVERITIES", "AccountReport", "Condition", "Event", "EventHistory", "Fusion", "Health", "Histogram",
     "LinkCallback", "LiveEvents", "LogStreamStatus", "Monitor", "NewestMessage", "PositionStatus", "Publishers",
-    "QuantityFusion", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "Span", "Story",
+    "QuantityFusion", "RejectionReport", "Rejections", "RouterState", "ServiceStatus", "SourceStatus", "Span", "Story",
     "StreamHealth", "StreamState", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict", "describe_stream",
-    "health_of_last", "stream_state",
+    "find_services", "health_of_last", "query_routers", "stream_state",
 ]  # fmt: skip

@@ -177,7 +177,11 @@ def _status_type() -> TypeAdapter[ServiceStatus]:
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
-    """Query the status of all nedbus services; ignore oversized replies, and statements about other vehicles."""
+    """Query the status of all nedbus services, as `bus.services`, over a session from `bus.open_session`.
+
+    Large replies then do not delay the messages of the bus. Ignores oversized replies, and what a service says of
+    other vehicles than that of the key.
+    """
     found: dict[tuple[str | None, str], ServiceStatus] = {}
     for vehicle, service, content in _find(session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout):
         if not isinstance(content, dict):

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
@@ -12,6 +12,7 @@ from nedbus.client import Histogram, PositionStatus, PublisherRegistry, SourceSt
 from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.log_event import about
 from nedbus.sources import (
+    SOURCE_KINDS,
     LinkCopies,
     LinkLoad,
     LiveItem,
@@ -22,11 +23,13 @@ from nedbus.sources import (
     Source,
     SourceMessage,
     UnavailableTopics,
+    parse_source,
 )
 from nedbus.timeline import MAX_PAUSE, Pace
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.vehicle_events import EventLog
+from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .output import TOO_MANY, SourceOutput
 
@@ -51,6 +54,23 @@ class PlannedSource:
     text: str
     vehicle: str
     source: Source = field(compare=False)
+
+    def addresses(self, *, offline: bool = False) -> Collection[Address]:
+        """Return the addresses of a replay, or the position addresses of vehicles named in a live source's options.
+
+        `offline`: no file is read, and the addresses of a log or recording are unknown.
+
+        Raises SourceError or OSError if the file cannot be read.
+        """
+        spec = parse_source(self.text)
+        if isinstance(self.source, LiveSource):
+            named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
+            return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
+        if offline and SOURCE_KINDS[spec.kind].target == "FILE":
+            return ()
+        run = self.source.open()
+        with closing(run.messages):  # type: ignore[type-var] # replays are generators
+            return run.addresses
 
 
 @dataclass(frozen=True, slots=True)

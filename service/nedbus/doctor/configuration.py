@@ -3,7 +3,6 @@
 import logging
 import socket
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 
 from nedbus.daemon import PlannedSource, plan_sources
@@ -11,9 +10,8 @@ from nedbus.endpoints import check_endpoints, split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source
-from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
 from nedbus.transport import RouterConfig, read_router_config, router_endpoints
-from nedbus_msgs import DEFAULT_TOPIC, Address
+from nedbus_msgs import Address
 
 from .access_rules import find_rule_mistakes
 from .finding import Finding
@@ -97,7 +95,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
     publishers: dict[Address, PlannedSource] = {}
     for planned in plan:
         try:
-            addresses, reason = _addresses(planned, offline=offline), ""
+            addresses, reason = planned.addresses(offline=offline), ""
         except (NedbusError, OSError) as exc:
             addresses, reason = (), str(exc)
         same = next((address for address in addresses if address in publishers), None)
@@ -108,19 +106,6 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
             yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
         for address in addresses:
             publishers.setdefault(address, planned)
-
-
-def _addresses(planned: PlannedSource, *, offline: bool) -> Collection[Address]:
-    """Return all addresses of a replay, or the position addresses of vehicles named in a live source's options."""
-    spec = parse_source(planned.text)
-    if isinstance(planned.source, LiveSource):
-        named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
-        return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
-    if offline and SOURCE_KINDS[spec.kind].target == "FILE":
-        return ()
-    run = planned.source.open()
-    with closing(run.messages):  # type: ignore[type-var] # replays are generators
-        return run.addresses
 
 
 def _try_listen(endpoint: str) -> Finding | None:

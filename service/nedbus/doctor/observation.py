@@ -10,8 +10,8 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus import client, clock, transport
-from nedbus.health import AccountReport
+from nedbus import Bus, Newest, clock, transport
+from nedbus.health import AccountReport, ServiceStatus, SourceStatus
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
@@ -44,7 +44,7 @@ class Observation:
     version: str
     vehicle: str | None
     verdict: transport.Verdict | None = None
-    services: list[client.ServiceStatus] = field(default_factory=list)
+    services: list[ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
@@ -58,11 +58,11 @@ class Observation:
     listened: float = 0.0
 
     @property
-    def sources(self) -> list[client.SourceStatus]:
+    def sources(self) -> list[SourceStatus]:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
 
-    def observe(self, bus: client.Bus, session: transport.Session) -> None:
+    def observe(self, bus: Bus, session: transport.Session) -> None:
         """Send the queries, and receive messages for at least 3 s; `session`: that of the bus."""
         prefix, start = self.prefix, time.monotonic()
         newest = bus.newest(ANY)
@@ -91,7 +91,7 @@ class Observation:
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
-    def _add(self, newest: client.Newest) -> None:
+    def _add(self, newest: Newest) -> None:
         for each in newest.update():
             address = each.sample.address
             if not each.sample.retained and (address in self.delays or len(self.delays) < _MAX_KEYS):

@@ -12,11 +12,9 @@ from typing import Any, Final
 from prometheus_client.core import Metric
 
 from nedbus import Bus, Session, clock
-from nedbus.client import find_services
 from nedbus.errors import NedbusError
-from nedbus.health import LogStreamStatus, PositionStatus
+from nedbus.health import LogStreamStatus, PositionStatus, RouterState, find_services, query_routers
 from nedbus.timings import TIMINGS
-from nedbus.transport import RouterState, query_routers
 from nedbus.vehicle_events import report_of
 from nedbus_msgs import Selection
 
