@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from nedbus.daemon import PlannedSource, plan_sources
-from nedbus.endpoints import check_endpoints, split_endpoint
+from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source
-from nedbus.transport import RouterConfig, read_router_config, router_endpoints
+from nedbus.transport import RouterConfig, read_router_config
 from nedbus_msgs import Address
 
 from .access_rules import find_rule_mistakes
@@ -33,10 +33,10 @@ def check_service(
         replaced = {name for name in ("listen", "connect") if getattr(settings, name)}
         mistakes += check_router_file(settings.router_config, offline=offline, replaced=replaced)
         try:
-            endpoints = endpoints or router_endpoints((), settings.router_config)
+            endpoints = endpoints or settings.router_endpoints
         except ConfigError as exc:
             mistakes.append(exc)
-    mistakes += check_sources(settings, endpoints or router_endpoints(), offline=offline)
+    mistakes += check_sources(settings, endpoints or (DEFAULT_ENDPOINT,), offline=offline)
     if offline:
         return mistakes
     found = [
