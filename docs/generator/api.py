@@ -20,11 +20,18 @@ from .markdown import cell, code, docstring, page, section, table
 PUBLIC_MODULES: Final = (
     "nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus.vehicle_events", "nedbus.fusion",
     "nedbus.settings", "nedbus.daemon", "nedbus.monitoring", "nedbus.pki", "nedbus.doctor",
+    "nedbus.rmw_zenoh",
 )  # fmt: skip
 """The modules whose `__all__` is the public API; the others, and further names of these, may change at any time."""
 
 _SECTIONS: Final = {  # by title: the packages of the names
-    "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.samples", "nedbus.transport"),
+    "The bus, subscriptions and publishers": (
+        "nedbus.client",
+        "nedbus.samples",
+        "nedbus.transport.router",
+        "nedbus.transport.tls",
+        "nedbus.transport.vehicle_directory",
+    ),
     "Files": ("nedbus.flights", "nedbus.tables"),
     "Events": (
         "nedbus.vehicle_events",
@@ -33,10 +40,11 @@ _SECTIONS: Final = {  # by title: the packages of the names
         "nedbus.monitoring.live_events",
     ),
     "External positions": ("nedbus.fusion",),
-    "A service in your program": ("nedbus.settings", "nedbus.daemon"),
+    "A service in your program": ("nedbus.settings", "nedbus.daemon", "nedbus.transport.router_log"),
     "Metrics and health": ("nedbus.monitoring",),
     "Certificates": ("nedbus.pki",),
     "Checks of settings and networks": ("nedbus.doctor",),
+    "ROS 2 over Zenoh": ("nedbus.transport.rmw_zenoh", "nedbus.transport.liveliness", "nedbus.transport.session"),
     "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
     "Messages, arrays, frames and resets": ("nedbus_msgs",),
 }

@@ -6,7 +6,8 @@ with nedbus.connect() as bus:
     for sample in bus.subscribe():
         print(sample.vehicle, sample.message.position)  # north, east and down; None while it is invalid
 
-Further public names are in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
+Further public names are in `nedbus.frames`, `nedbus.health` and `nedbus.errors`. The reference lists modules for
+programs that show events, run a service or manage a fleet, such as `nedbus.vehicle_events` and `nedbus.daemon`.
 """
 
 from importlib import import_module as _import_module

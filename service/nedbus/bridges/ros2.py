@@ -14,8 +14,7 @@ import zenoh
 from nedbus import Bus, Sample, Session, Subscription, clock
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
-from nedbus.timings import TIMINGS
-from nedbus.transport import (
+from nedbus.rmw_zenoh import (
     BRIDGED_ENCODING,
     NO_HASH,
     Attachment,
@@ -27,6 +26,7 @@ from nedbus.transport import (
     token_keys,
     translate_zenoh_errors,
 )
+from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     BY_TOPIC,
     DEFAULT,

@@ -12,14 +12,9 @@ import zenoh
 
 from nedbus import Bus, Newest, Session, clock
 from nedbus.health import AccountReport, Publishers, RouterState, ServiceStatus, SourceStatus, query_routers
+from nedbus.rmw_zenoh import PublisherToken, px4_publishers_key_expr, token_keys, translate_zenoh_errors
 from nedbus.timings import TIMINGS
-from nedbus.transport import (
-    PublisherToken,
-    Verdict,
-    px4_publishers_key_expr,
-    token_keys,
-    translate_zenoh_errors,
-)
+from nedbus.transport import Verdict
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
 T = TypeVar("T")
