@@ -75,7 +75,6 @@ if TYPE_CHECKING:
         Conversion,
         Flight,
         FlightSamples,
-        RecordingWriter,
         convert_files as convert,
         open_flight as open,  # noqa: A004 - as in nedbus.open(path)
         utc_of,
@@ -119,7 +118,6 @@ __all__ = [
     "Publisher",
     "Quantity",
     "ReceiveError",
-    "RecordingWriter",
     "ResetTracker",
     "Row",
     "Sample",
@@ -155,7 +153,7 @@ _MODULES = {
     "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest Publisher Subscription connect"
     " connect_async",
     "nedbus.event_sources": "events why",
-    "nedbus.flights": "Conversion Flight FlightSamples RecordingWriter convert open utc_of",
+    "nedbus.flights": "Conversion Flight FlightSamples convert open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.timeline": "UtcOffset",
     "nedbus.transport": "Session Tls",

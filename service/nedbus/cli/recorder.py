@@ -7,8 +7,9 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
-from nedbus import Batch, RecordingWriter, Subscription, clock
+from nedbus import Batch, Subscription, clock
 from nedbus.errors import ClosedError, NoDataError
+from nedbus.flights import RecordingWriter, check_recording
 
 _FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
@@ -21,7 +22,7 @@ class Recorder:
     """
 
     def __init__(self, subscription: Subscription[Any], path: Path) -> None:
-        RecordingWriter.check_name(path)
+        check_recording(path)
         self._subscription, self._path = subscription, path
         self._writer: RecordingWriter | None = None
 

@@ -1,15 +1,18 @@
 """Convert flights to an MCAP recording, validating each message."""
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
 from nedbus.atomic_write import atomic_write
 from nedbus.errors import OutputError, SourceError
+from nedbus.extras import import_optional
 from nedbus.log_event import about
 from nedbus.samples import SourceMessage
 from nedbus_msgs import (
@@ -26,7 +29,9 @@ from nedbus_msgs import (
 from .flight import Flight, boot_utc_of, open_messages
 from .readers import ReadOptions, check_recording
 from .selection import absent_topics, parse_topics, topics_of
-from .writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from .writer import RecordingWriter
 
 _log = logging.getLogger(__name__)
 
@@ -66,10 +71,11 @@ def convert_files(
 
     Raises the errors of `nedbus.open` for the files, AddressError for an invalid topic or vehicle, ConfigError for an
     output with another suffix, OutputError if the output exists or cannot be written, SourceError if all messages are
-    rejected. No partial file is left behind.
+    rejected. No partial file is left behind. Needs the extra `mcap`, else raises ConfigError.
     """
     sources = [source] if isinstance(source, str | Path) else source
     paths = [Path(each).expanduser() for each in sources]
+    _load_writer()  # raises ConfigError without the extra, before the files are read
     names = parse_topics(topics if isinstance(topics, str) else ",".join(topics))
     name = None if vehicle is None else check_vehicle(vehicle_name(vehicle))
     with open_messages(paths, ReadOptions(topics_of(names), name)) as flight:
@@ -119,7 +125,7 @@ def convert(
     try:
         with (
             atomic_write(path) as part,
-            RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts) as writer,
+            _load_writer()(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts) as writer,
         ):
             rejected, reason = _write(messages, writer, starts or {}, source=source, on_progress=on_progress)
             if rejected and not writer.messages:
@@ -127,6 +133,12 @@ def convert(
     except OSError as exc:  # an OutputError names the temporary file
         raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
     return f"{writer.messages} message{'s' * (writer.messages != 1)}" + (f", {rejected} rejected" if rejected else "")
+
+
+def _load_writer() -> type[RecordingWriter]:
+    """Import the writer, which needs the extra `mcap`; raise ConfigError without it."""
+    writer: type[RecordingWriter] = import_optional("mcap", f"{__package__}.writer").RecordingWriter
+    return writer
 
 
 def _write(

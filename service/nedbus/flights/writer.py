@@ -26,8 +26,6 @@ from nedbus_msgs import Address, Definition, Layout, Message, Provenance, defini
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.messages import LogMessage
 
-from .readers import check_recording
-
 _log = logging.getLogger(__name__)
 
 _CHUNK: Final = 2**23  # bytes; flushing every second makes smaller chunks
@@ -97,11 +95,6 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
         self._numbers: Counter[str] = Counter()  # of channels, by vehicle
         self._log_channels = dict[str, int]()  # by vehicle; RecordingReader ignores these
-
-    @staticmethod
-    def check_name(path: Path) -> None:
-        """Raise ConfigError unless the name of a recording ends with .mcap; no method of the writer requires it."""
-        check_recording(path)
 
     def write(
         self,
