@@ -7,11 +7,13 @@ import importlib
 import inspect
 import re
 import typing
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import nedbus
+from docs.generator.api import PUBLIC_MODULES
 from nedbus_msgs import MESSAGES
 
 ROOT = Path(__file__).parents[1]
@@ -25,22 +27,23 @@ OURS = {
 ALLOWED = {"Definition", "FieldType", "Layout", "RenamedField", "Rule"}
 
 
-MODULES = {
-    name: importlib.import_module(name) for name in ("nedbus", "nedbus.frames", "nedbus.health", "nedbus.errors")
-}
+MODULES = {name: importlib.import_module(name) for name in PUBLIC_MODULES}
 PUBLIC = {name: module for module in MODULES.values() for name in module.__all__}
 
 
 @pytest.mark.parametrize("name", [*MODULES, "nedbus_msgs"])
 def test_all_lists_every_public_name(name: str) -> None:
-    """Each name of __all__ exists once and has a docstring, and no public name is missing."""
+    """Each name of __all__ exists once and has a docstring, and no name of nedbus and nedbus_msgs is missing.
+
+    The other packages also have names for nedbus itself, which are not public.
+    """
     module = importlib.import_module(name)
     assert len(module.__all__) == len(set(module.__all__))
     for word in module.__all__:
         public = getattr(module, word)
         ours = (inspect.isclass(public) or inspect.isfunction(public)) and public.__module__.startswith("nedbus")
         assert not ours or public.__doc__, word
-    if hasattr(module, "__path__"):
+    if name in {"nedbus", "nedbus_msgs"}:
         public = {word for word in vars(module) if not word.startswith("_")}
         submodules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
         assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
@@ -52,21 +55,30 @@ def test_dir_of_nedbus_lists_at_most_75_names() -> None:
     assert shown == {*nedbus.__all__, *MESSAGES, "errors", "frames", "health"}
     assert len(shown) <= 75
     assert all(hasattr(nedbus, name) for name in shown)
-    assert [nedbus.frames, nedbus.health, nedbus.errors] == list(MODULES.values())[1:]
+    assert [nedbus.errors, nedbus.frames, nedbus.health] == list(MODULES.values())[1:4]
 
 
-def annotations_of(public: object) -> typing.Iterator[str]:
+def annotations_of(public: object) -> Iterator[str]:
     """Yield the annotations of a function, or of the public methods and fields of a class, as source text."""
     if inspect.isfunction(public):
         yield from map(str, inspect.get_annotations(public).values())
     elif inspect.isclass(public):
-        yield from (str(text) for name, text in inspect.get_annotations(public).items() if not name.startswith("_"))
+        annotations = inspect.get_annotations(public)
+        yield from (text_of(annotation) for name, annotation in annotations.items() if not name.startswith("_"))
         for name, member in list(vars(public).items()):
             function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
             returned = r"get one from|from `connect|returns one|yields them"
             is_constructor = name == "__init__" and not re.search(returned, public.__doc__ or "")
             if inspect.isfunction(function) and (not name.startswith("_") or is_constructor):
                 yield from map(str, inspect.get_annotations(function).values())
+
+
+def text_of(annotation: object) -> str:
+    """Return an annotation as source text, without the validators of `Annotated`."""
+    if isinstance(annotation, str) or "Annotated" not in str(annotation):
+        return str(annotation)
+    holder = type("Holder", (), {"__annotations__": {"value": annotation}})
+    return str(typing.get_type_hints(holder)["value"])
 
 
 @pytest.mark.parametrize("name", PUBLIC)
@@ -76,6 +88,45 @@ def test_public_signatures_mention_only_public_names(name: str) -> None:
         expression = annotation.removeprefix("<class '").removesuffix("'>")
         mentioned = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
         assert mentioned & OURS <= {*PUBLIC, *ALLOWED}, annotation
+
+
+STARTED = {name: importlib.import_module(name) for name in ("nedbus.bridges", "nedbus.tables", "nedbus.web")}
+"""The packages that commands start; their `__all__` has what `cli` calls, and is no API."""
+
+PROGRAMS = ("bridges", "cli", "doctor", "monitoring", "pki", "tables", "web")
+"""The packages that use nedbus as a user's program does; the contract of imports in pyproject.toml names them, too."""
+
+
+def names_used(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield each name of a module of nedbus that a file uses, with the module: imported, or as an attribute of it."""
+    tree = ast.parse(path.read_text())
+    modules = dict[str, str]()  # by their name in the file
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module is not None and not node.level:
+            for alias in node.names:
+                imported = f"{node.module}.{alias.name}"
+                if imported in MODULES | STARTED:
+                    modules[alias.asname or alias.name] = imported
+                else:
+                    yield node.module, alias.name
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            yield modules[node.value.id], node.attr
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_programs_use_only_public_names(program: str) -> None:
+    """A program of nedbus uses only names in `__all__` of the public modules; import-linter forbids other modules.
+
+    The commands also start the packages of STARTED.
+    """
+    own = f"nedbus.{program}"
+    allowed = MODULES | STARTED if program == "cli" else MODULES
+    for path in ROOT.glob(f"service/nedbus/{program}/**/*.py"):
+        for module, name in names_used(path):
+            assert program == "cli" or module == own or module not in STARTED, f"{path}: {module} is a program"
+            if module in allowed and module not in {"nedbus", own}:
+                assert name in allowed[module].__all__, f"{path}: {module}.{name} is not public"
 
 
 def test_error_tree_lists_every_error() -> None:

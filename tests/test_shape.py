@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import resource
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -40,6 +42,33 @@ def test_packages_are_imported_through_their_interface() -> None:
                     )
                 if top == "nedbus" and inner and layer != "__init__.py":
                     assert inner[0] == layer or len(inner) == 1, f"{path}: import from nedbus.{inner[0]}"
+
+
+def test_public_names_come_from_lower_layers() -> None:
+    """A package takes a public name from `nedbus` or `nedbus.health` only if a lower layer defines it.
+
+    import-linter does not see this, because these modules import the others on first use.
+    """
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    level_of = {name.strip(): level for level, line in enumerate(layers) for name in line.split("|")}
+    checked = 0
+    for path in PRODUCT:
+        top, layer, *_ = path.relative_to(ROOT / path.relative_to(ROOT).parts[0]).with_suffix("").parts
+        own = level_of.get(f"{top}.{layer}")
+        for node in ast.walk(parse(path)):
+            if own is None or not isinstance(node, ast.ImportFrom) or node.module not in {"nedbus", "nedbus.health"}:
+                continue
+            for alias in node.names:
+                home = f"nedbus.{alias.name}"
+                if home not in level_of:
+                    value = getattr(importlib.import_module(node.module), alias.name)
+                    home = ".".join(getattr(value, "__module__", "").split(".")[:2])
+                if home in level_of and home != f"{top}.{layer}":
+                    checked += 1
+                    is_for_types = node.col_offset > 0  # below `if TYPE_CHECKING:`, or on first use
+                    assert is_for_types or level_of[home] > own, f"{path}: {alias.name} is defined in {home}"
+    assert checked > 50
 
 
 def test_modules_state_their_responsibility() -> None:

@@ -7,6 +7,7 @@ import inspect
 import re
 from collections.abc import Iterator
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,10 +17,34 @@ import nedbus_msgs
 
 from .markdown import cell, code, docstring, page, section, table
 
+PUBLIC_MODULES: Final = (
+    "nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus.vehicle_events", "nedbus.fusion",
+    "nedbus.settings", "nedbus.daemon", "nedbus.monitoring", "nedbus.pki", "nedbus.doctor",
+    "nedbus.rmw_zenoh",
+)  # fmt: skip
+"""The modules whose `__all__` is the public API; the others, and further names of these, may change at any time."""
+
 _SECTIONS: Final = {  # by title: the packages of the names
-    "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.samples", "nedbus.transport"),
+    "The bus, subscriptions and publishers": (
+        "nedbus.client",
+        "nedbus.samples",
+        "nedbus.transport.router",
+        "nedbus.transport.tls",
+        "nedbus.transport.vehicle_directory",
+    ),
     "Files": ("nedbus.flights", "nedbus.tables"),
-    "Events": ("nedbus.vehicle_events", "nedbus.event_history", "nedbus.event_sources", "nedbus.monitoring"),
+    "Events": (
+        "nedbus.vehicle_events",
+        "nedbus.event_history",
+        "nedbus.event_sources",
+        "nedbus.monitoring.live_events",
+    ),
+    "External positions": ("nedbus.fusion",),
+    "A service in your program": ("nedbus.settings", "nedbus.daemon", "nedbus.transport.router_log"),
+    "Metrics and health": ("nedbus.monitoring",),
+    "Certificates": ("nedbus.pki",),
+    "Checks of settings and networks": ("nedbus.doctor",),
+    "ROS 2 over Zenoh": ("nedbus.transport.rmw_zenoh", "nedbus.transport.liveliness", "nedbus.transport.session"),
     "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
     "Messages, arrays, frames and resets": ("nedbus_msgs",),
 }
@@ -35,7 +60,7 @@ _CONSTANTS: Final = {  # without a docstring in the code
 def api_page() -> str:
     """Return the page of all public names, written relative to `nedbus`."""
     named = {name: getattr(nedbus, name) for name in nedbus.__all__}
-    for module in (nedbus.frames, nedbus.health, nedbus.errors):
+    for module in map(import_module, PUBLIC_MODULES[1:]):
         short = module.__name__.removeprefix("nedbus.")
         named |= {f"{short}.{name}": getattr(module, name) for name in module.__all__ if name not in named}
     constants = {name: each for name, each in named.items() if not (inspect.isclass(each) or inspect.isroutine(each))}
@@ -49,7 +74,11 @@ def api_page() -> str:
         assert own, packages
     return page(
         "Python API",
-        "Everything is in `nedbus`, or in its modules `frames`, `health` and `errors`.",
+        "Everything is in `nedbus` and its modules "
+        + ", ".join(code(name.removeprefix("nedbus.")) for name in PUBLIC_MODULES[1:])
+        + ": what their `__all__` lists. All other names may change at any time.",
+        "`nedbus`, `errors`, `frames` and `health` are for scripts; the others are for programs that show events, run a"
+        " service, or manage a fleet, as the commands of nedbus do.",
         "Units are SI and the frame is NED unless stated otherwise.",
         "Message classes have [their own pages](../messages.md).",
         *parts,
@@ -112,16 +141,19 @@ def _constant(item: tuple[str, Any]) -> list[str]:
     name, value = item
     shown = {"TOPICS": "a mapping of names to `Topic`", "DTYPE": "`numpy.dtype`", "Session": "`zenoh.Session`"}
     shown["frames.DERIVED"] = "a mapping of names to `DerivedField`"
+    shown["vehicle_events.KINDS"] = "a mapping of names to `Kind`"
     return [code(name), shown.get(name) or code(str(value).replace("typing.", "")), cell(_meaning(name))]
 
 
 def _meaning(name: str) -> str:
     if name in _CONSTANTS:
         return _CONSTANTS[name]
-    for package in (nedbus_msgs, nedbus):
-        for path in Path(package.__path__[0]).rglob("*.py"):
+    module, _, constant = name.rpartition(".")
+    own = Path(nedbus.__path__[0]) / module  # for equal names in several modules
+    for folder in (own, Path(nedbus_msgs.__path__[0]), Path(nedbus.__path__[0])):
+        for path in folder.rglob("*.py"):
             for assigned, text in constants_of(ast.parse(path.read_text())):
-                if assigned == name.rpartition(".")[2]:
+                if assigned == constant:
                     return text
     raise LookupError(name)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from typing import Final, TypeAlias, cast
 
-from .errors import AddressError
+from .errors import AddressError, ArgumentError
 from .model.declaration import Topic
 from .model.definition import MESSAGES, TOPICS
 from .model.message import Message
@@ -236,6 +237,14 @@ def parse_status_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> tuple[str | N
     return check_vehicle(vehicle), service
 
 
+def prefix_of(key: str) -> str:
+    """Return the prefix of the key of a message or of a publisher's token; "" if it has none, as in plain ROS 2."""
+    vehicle, alive, _ = key.partition("/@alive/")
+    before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
+    is_ros2_domain = bool(before) and before[0].isdecimal()  # `<domain>/fmu/out/vehicle_local_position`
+    return "" if is_ros2_domain else "/".join(before)
+
+
 def ack_key(key_expr: str) -> str:
     """Return the key to query readers of a key or key expression for acknowledgements."""
     return f"{key_expr}/@ack"
@@ -337,3 +346,9 @@ def check_prefix(prefix: str) -> None:
     """Raise AddressError for a key prefix that is not chunks of A-Z a-z 0-9 _ - separated by slashes."""
     if not all(_CHUNK.fullmatch(chunk) for chunk in prefix.split("/")):
         raise AddressError("prefix", prefix, "chunks of A-Z a-z 0-9 _ - separated by /")
+
+
+def check_max_rate(max_rate: object) -> None:
+    """Raise ArgumentError unless `max_rate` is a finite number above 0."""
+    if isinstance(max_rate, bool) or not isinstance(max_rate, int | float) or not 0 < max_rate < math.inf:
+        raise ArgumentError("max_rate", max_rate, "messages per second, a finite number above 0")

@@ -6,7 +6,8 @@ with nedbus.connect() as bus:
     for sample in bus.subscribe():
         print(sample.vehicle, sample.message.position)  # north, east and down; None while it is invalid
 
-Further public names are in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
+Further public names are in `nedbus.frames`, `nedbus.health` and `nedbus.errors`. The reference lists modules for
+programs that show events, run a service or manage a fleet, such as `nedbus.vehicle_events` and `nedbus.daemon`.
 """
 
 from importlib import import_module as _import_module
@@ -71,8 +72,10 @@ if TYPE_CHECKING:
     )
     from .event_sources import events, why
     from .flights import (
+        Conversion,
         Flight,
         FlightSamples,
+        convert_files as convert,
         open_flight as open,  # noqa: A004 - as in nedbus.open(path)
         utc_of,
     )
@@ -100,6 +103,7 @@ __all__ = [
     "ConfigError",
     "ConnectError",
     "Continuous",
+    "Conversion",
     "Counts",
     "Flight",
     "FlightSamples",
@@ -129,6 +133,7 @@ __all__ = [
     "align",
     "connect",
     "connect_async",
+    "convert",
     "define_msg",
     "dtype_of",
     "events",
@@ -148,7 +153,7 @@ _MODULES = {
     "nedbus.client": "AsyncBus AsyncNewest AsyncPublisher AsyncSubscription Bus Newest Publisher Subscription connect"
     " connect_async",
     "nedbus.event_sources": "events why",
-    "nedbus.flights": "Flight FlightSamples open utc_of",
+    "nedbus.flights": "Conversion Flight FlightSamples convert open utc_of",
     "nedbus.tables": "addresses_of align missing_of read",
     "nedbus.timeline": "UtcOffset",
     "nedbus.transport": "Session Tls",
@@ -157,6 +162,7 @@ _MODULES = {
     "nedbus_msgs.arrays": "DTYPE MessageArray dtype_of mask_invalid to_array to_message",
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
+_NAMES_AT_HOME = {"convert": "convert_files", "open": "open_flight"}  # that differ from the public name
 _SUBMODULES = "errors", "frames", "health"
 
 
@@ -172,7 +178,7 @@ if not TYPE_CHECKING:  # otherwise type checkers would accept any name
         """Import a public name on first use."""
         if name in __all__:
             home = _import_module(_HOMES.get(name, "nedbus.errors"))
-            return globals().setdefault(name, getattr(home, "open_flight" if name == "open" else name))
+            return globals().setdefault(name, getattr(home, _NAMES_AT_HOME.get(name, name)))
         if name in _SUBMODULES:
             return _import_module(f"{__name__}.{name}")
         if name in _import_module("nedbus_msgs").MESSAGES:

@@ -1,4 +1,4 @@
-"""Clocks of this host, and durations as text: monotonic time for all decisions, Unix time only for timestamps.
+"""Clocks of this host, times and durations as text: monotonic time for all decisions, Unix time for timestamps.
 
 NTP, a GNSS receiver or a user may step the Unix clock forward or back at any time.
 """
@@ -40,3 +40,14 @@ def format_duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+
+
+def format_utc(utc: float) -> str:
+    """Format a Unix time as UTC, such as 14:05:12.3."""
+    tenths = round(utc * 10)
+    return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"
+
+
+def format_since(since: float | None, now: float) -> str:
+    """Format the start of a condition as a suffix for its text; "" if unknown."""
+    return "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"

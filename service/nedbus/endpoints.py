@@ -1,9 +1,10 @@
-"""Zenoh endpoints: default, syntax, name resolution, and the address to dial for a listening endpoint."""
+"""Endpoints of Zenoh and addresses of HTTP servers: default, syntax, name resolution, and the address to dial."""
 
 import re
 import socket
 from collections.abc import Sequence
 from contextlib import suppress
+from ipaddress import ip_address
 from typing import Final
 
 from nedbus.errors import ConfigError
@@ -50,3 +51,19 @@ def resolution_error(endpoints: Sequence[str]) -> str | None:
 def dial_endpoint(endpoint: str) -> str:
     """Return the endpoint to dial for a local router, with loopback in place of a wildcard address."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def split_http(where: str) -> tuple[str, int]:
+    """Parse HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
+    host, _, port = where.rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
+        raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
+    return bare, int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a server on this address is reachable from this host only."""
+    with suppress(ValueError):
+        return ip_address(host).is_loopback
+    return host == "localhost"

@@ -78,6 +78,15 @@ class ConfigError(NedbusError, ValueError):
         position = f", line {line}, column {column}" if line else ""
         return cls(f"{path}{position}", reason)
 
+    @classmethod
+    def in_text(cls, path: Path, reason: str, text: str, index: int) -> ConfigError:
+        """Return the error for an index into the text of a file; -1, as `str.find` returns, names only the file."""
+        if index < 0:
+            return cls.in_file(path, reason)
+        line = text.count("\n", 0, index) + 1
+        column = index - text.rfind("\n", 0, index)
+        return cls.in_file(path, reason, line=line, column=column)
+
 
 class ConnectError(NedbusError, ConnectionError):
     """Raised when no endpoint answers in time; `advice`: the remedy, if the cause is known."""

@@ -6,17 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from nedbus.vehicle_events import (
-    ALL,
-    AccountReport,
-    Event,
-    Times,
-    VehicleReport,
-    Verdict,
-    by_vehicle,
-    events_outside,
-    verdict_of,
-)
+from nedbus.health import AccountReport, Event, Times, VehicleReport, Verdict
+from nedbus.vehicle_events import ALL, by_vehicle, events_outside, verdict_of
 from nedbus_msgs import ANY, AddressError, ArgumentError, Selection, VehicleNames, vehicle_name
 
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"

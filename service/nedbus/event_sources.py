@@ -7,22 +7,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, overload
 
+from nedbus import Flight, Sample
 from nedbus.errors import ArgumentError
-from nedbus.flights import (
-    FileEvents,
-    Flight,
-    detect_sample_events,
-    read_file_events,
-    read_flight_events,
-)
-from nedbus.samples import Sample
+from nedbus.flights import FileEvents, detect_sample_events, read_file_events, read_flight_events
 from nedbus_msgs import ANY, Selection, VehicleNames
 
 if TYPE_CHECKING:
-    from nedbus.client import Bus
-    from nedbus.event_history import EventHistory
-    from nedbus.monitoring import LiveEvents
-    from nedbus.vehicle_events import Verdict
+    from nedbus import Bus
+    from nedbus.health import EventHistory, LiveEvents, Verdict
 
 _Recorded: TypeAlias = str | Path | Sequence[str | Path] | Flight | Iterable[Sample[Any]]
 
@@ -47,7 +39,7 @@ def events(
     """
     selection = Selection(vehicle=vehicle)
     if _is_bus(source):
-        from nedbus.monitoring import LiveEvents
+        from nedbus.health import LiveEvents
 
         return LiveEvents(source, selection, within)
     if within is not None:

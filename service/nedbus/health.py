@@ -22,12 +22,18 @@ if TYPE_CHECKING:
         ServiceStatus,
         SourceStatus,
         StreamHealth,
+        StreamState,
         StreamStatus,
         Vehicles,
+        describe_stream,
+        find_services,
+        health_of_last,
+        stream_state,
     )
     from .event_history import EventHistory
     from .fusion import Fusion, QuantityFusion
     from .monitoring import LiveEvents
+    from .transport import RouterState, query_routers
     from .vehicle_events import (
         SEVERITIES,
         AccountReport,
@@ -42,11 +48,13 @@ if TYPE_CHECKING:
 else:
     _NAMES = {
         "client": "Health Histogram LinkCallback LogStreamStatus Monitor NewestMessage PositionStatus Publishers"
-        " RejectionReport Rejections ServiceStatus SourceStatus StreamHealth StreamStatus Vehicles",
+        " RejectionReport Rejections ServiceStatus SourceStatus StreamHealth StreamState StreamStatus Vehicles"
+        " describe_stream find_services health_of_last stream_state",
         "vehicle_events": "SEVERITIES AccountReport Condition Event Span Story Times VehicleReport Verdict",
         "event_history": "EventHistory",
         "fusion": "Fusion QuantityFusion",
         "monitoring": "LiveEvents",
+        "transport": "RouterState query_routers",
     }
     __getattr__ = lazy_exports(
         "nedbus", {name: ("", module) for module, names in _NAMES.items() for name in names.split()}
@@ -55,6 +63,7 @@ else:
 __all__ = [
     "SEVERITIES", "AccountReport", "Condition", "Event", "EventHistory", "Fusion", "Health", "Histogram",
     "LinkCallback", "LiveEvents", "LogStreamStatus", "Monitor", "NewestMessage", "PositionStatus", "Publishers",
-    "QuantityFusion", "RejectionReport", "Rejections", "ServiceStatus", "SourceStatus", "Span", "Story",
-    "StreamHealth", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict",
+    "QuantityFusion", "RejectionReport", "Rejections", "RouterState", "ServiceStatus", "SourceStatus", "Span", "Story",
+    "StreamHealth", "StreamState", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict", "describe_stream",
+    "find_services", "health_of_last", "query_routers", "stream_state",
 ]  # fmt: skip

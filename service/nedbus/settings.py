@@ -7,25 +7,24 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
+from nedbus.endpoints import check_endpoints, dial_endpoint, split_http
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
-from nedbus.transport import Tls, check_endpoints, dial_endpoint, router_endpoints
+from nedbus.transport import Tls, router_endpoints
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_name
 
 _log = logging.getLogger(__name__)
 
+__all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source"]
+
 DEFAULT_FILE: Final = Path("nedbus.toml")
 _MIN_PREFIX: Final = len("NEDBUS_TLS")  # minimum length of a variable's name to count as a truncated setting
-
-_Position = tuple[int | None, int | None]  # line and column from 1; None if unknown
 
 
 def split_sources(value: object) -> object:
@@ -39,22 +38,6 @@ def split_sources(value: object) -> object:
 def split_values(value: object) -> object:
     """Split a string at commas."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
-
-
-def split_http(where: str) -> tuple[str, int]:
-    """Parse HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
-    host, _, port = where.rpartition(":")
-    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
-        raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
-    return bare, int(port)
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a server on this address is reachable from this host only."""
-    with suppress(ValueError):
-        return ip_address(host).is_loopback
-    return host == "localhost"
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
@@ -203,8 +186,8 @@ def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
     path, setter = settings._file, settings.set_by(name) or name
     if path is None or setter != str(path):
         return ConfigError(setter, reason)
-    line, column = _find_key(_read_text(path), name)
-    return ConfigError.in_file(path, reason, line=line, column=column)
+    text = _read_text(path)
+    return ConfigError.in_text(path, reason, text, _find_key(text, name))
 
 
 def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
@@ -212,8 +195,8 @@ def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigE
     setter = settings.set_by("source")
     if settings._file is None or setter != str(settings._file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
-    line, column = _find_source(_read_text(settings._file), settings.source, index, error.key)
-    return ConfigError.in_file(settings._file, str(error), line=line, column=column)
+    text = _read_text(settings._file)
+    return ConfigError.in_text(settings._file, str(error), text, _find_source(text, settings.source, index, error.key))
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
@@ -296,36 +279,30 @@ def _read_toml(path: Path) -> dict[str, object]:
     except tomllib.TOMLDecodeError as exc:
         position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
         reason = re.sub(r" \(at .*\)", "", str(exc))
-        # An error without a position is at the end of the document.
-        line, column = map(int, position.groups()) if position else position_at(text, len(text.rstrip("\n")))
+        if position is None:  # the error is at the end of the document
+            raise ConfigError.in_text(path, reason, text, len(text.rstrip("\n"))) from exc
+        line, column = map(int, position.groups())
         raise ConfigError.in_file(path, reason, line=line, column=column) from exc
 
 
-def _find_key(text: str, name: str) -> _Position:
-    """Return the line and column of a key or table, which `tomllib` does not report."""
+def _find_key(text: str, name: str) -> int:
+    """Return the index of a key or table, which `tomllib` does not report; -1 if it is not in the text."""
     found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
-    return position_at(text, found.start(1)) if found else (None, None)
+    return found.start(1) if found else -1
 
 
-def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Position:
-    """Return the line and column of a source (a table, or a string in a list) or of one of its options."""
+def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> int:
+    """Return the index of a source (a table, or a string in a list) or of one of its options."""
     source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
     if not isinstance(source, str) and index < len(headers):
         start = headers[index].start(1)
         end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
         option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
-        return position_at(text, start + option.start(1) if option else start)
+        return start + option.start(1) if option else start
     if isinstance(source, str):
         found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
         before = sources[:index].count(source)
         if before < len(found):
-            return position_at(text, found[before])
+            return found[before]
     return _find_key(text, "source")
-
-
-def position_at(text: str, start: int) -> _Position:
-    """Return the line and column of an index into a string; (None, None) for -1, as `str.find` returns."""
-    if start < 0:
-        return None, None
-    return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

@@ -109,3 +109,22 @@ for arguments in ("convert", path, path + ".mcap"), ("plot", path), ("events", p
 """
     process = start("-c", program, fresh=True)
     assert process.wait() == 0, process.err
+
+
+def test_public_names_need_no_optional_package(start: Start) -> None:
+    """Without the extras, each name of `nedbus` exists, for tab completion and `help`; `convert` names the extra."""
+    program = """
+import sys
+for name in ["mcap", "pymavlink", "matplotlib", "cryptography", "prometheus_client", "foxglove", "bokeh"]:
+    sys.modules[name] = None
+import nedbus
+assert [name for name in dir(nedbus) if not hasattr(nedbus, name)] == []
+try:
+    nedbus.convert("flight.ulg", "flight.mcap")
+except nedbus.ConfigError as exc:
+    assert "[mcap]" in str(exc)
+else:
+    raise AssertionError
+"""
+    process = start("-c", program, fresh=True)
+    assert process.wait() == 0, process.err

@@ -10,10 +10,10 @@ import pytest
 
 import nedbus
 from nedbus import Tls
-from nedbus.endpoints import resolution_error
+from nedbus.endpoints import is_loopback, resolution_error
 from nedbus.errors import ConfigError, ConnectError, ListenError
 from nedbus.pki import make_authority, make_certificate
-from nedbus.settings import is_loopback, load_settings
+from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
 from tests.peers.command_line import run_command
@@ -277,6 +277,17 @@ def test_malformed_endpoint_raises(endpoint: str) -> None:
         open_client((endpoint,), timeout=0)
     with pytest.raises(ConfigError, match="is not an endpoint"):
         open_router(listen=(endpoint,))
+
+
+@pytest.mark.parametrize(
+    ("index", "where"),
+    [(0, ", line 1, column 1"), (5, ", line 2, column 2"), (-1, "")],
+    ids=["first", "second", "none"],
+)
+def test_error_in_a_text_has_line_and_column(index: int, where: str) -> None:
+    """`ConfigError.in_text` converts an index to line and column, both from 1; -1 names only the file."""
+    error = ConfigError.in_text(Path("a.toml"), "wrong", "abc\ndef", index)
+    assert str(error) == f"a.toml{where}: wrong"
 
 
 @pytest.mark.parametrize(

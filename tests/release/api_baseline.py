@@ -19,11 +19,12 @@ from typing import Final
 import griffe
 
 import nedbus
+from docs.generator.api import PUBLIC_MODULES
 from nedbus_msgs import MESSAGES
 
 ROOT: Final = Path(__file__).parents[2]
 BASELINE: Final = ROOT / "packaging" / "public_api.pyi.txt"
-MODULES: Final = ("nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus_msgs")
+MODULES: Final = (*PUBLIC_MODULES, "nedbus_msgs")
 _NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")  # not created by scripts
 _DECORATORS: Final = ("property", "staticmethod", "classmethod")
 

@@ -19,8 +19,9 @@ import foxglove
 from foxglove import messages
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
 
-from nedbus.client import Bus, Monitor, Sample
+from nedbus import Bus, Sample
 from nedbus.errors import ListenError
+from nedbus.health import Monitor
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     DEFAULT_TOPIC,

@@ -3,7 +3,7 @@
 from collections import Counter
 from typing import Any, Final
 
-from nedbus.client import Sample
+from nedbus import Sample
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 

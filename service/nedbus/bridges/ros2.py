@@ -11,10 +11,21 @@ from typing import Any, Final
 
 import zenoh
 
-from nedbus import clock, transport
-from nedbus.client import Bus, Sample, Subscription
+from nedbus import Bus, Sample, Session, Subscription, clock
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
+from nedbus.rmw_zenoh import (
+    BRIDGED_ENCODING,
+    NO_HASH,
+    Attachment,
+    PublisherToken,
+    TopicKey,
+    gid_of_token,
+    node_token,
+    px4_publishers_key_expr,
+    token_keys,
+    translate_zenoh_errors,
+)
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     BY_TOPIC,
@@ -66,9 +77,9 @@ class Ros2Bridge:
     def __init__(
         self,
         bus: Bus,
-        session: transport.Session,
+        session: Session,
         *,
-        observer: transport.Session | None = None,
+        observer: Session | None = None,
         selection: Selection | None = None,
         layout: str = RELEASES[-1],
         domain: int = 0,
@@ -86,7 +97,7 @@ class Ros2Bridge:
         self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # definition, layout and type hash, by topic
         for topic, definition in BY_TOPIC.items():
             if found := definition.layout_of_release(layout):
-                type_hash = hash_of(found, ros2_type(definition)) if hashed else transport.NO_HASH
+                type_hash = hash_of(found, ros2_type(definition)) if hashed else NO_HASH
                 self._types[topic] = definition, found, type_hash
         self._zid, self._node = str(session.info.zid()), f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
@@ -102,8 +113,8 @@ class Ros2Bridge:
 
         Raises ClosedError if the bus or the session is closed, NedbusError if access control hides the bridge.
         """
-        key = transport.node_token(self._domain, self._zid, self._node)
-        with transport.translate_zenoh_errors():
+        key = node_token(self._domain, self._zid, self._node)
+        with translate_zenoh_errors():
             token = self._session.liveliness().declare_token(key)
         try:
             if self._observer is not None:
@@ -120,10 +131,10 @@ class Ros2Bridge:
                 self._close(address)
             token.undeclare()
 
-    def _require_visible(self, observer: transport.Session, token: str, stop: threading.Event) -> None:
+    def _require_visible(self, observer: Session, token: str, stop: threading.Event) -> None:
         """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
         end = time.monotonic() + TIMINGS.token_visible
-        while not stop.is_set() and not transport.token_keys(observer, token, timeout=0.5):
+        while not stop.is_set() and not token_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
                 end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
             elif time.monotonic() > end:
@@ -170,10 +181,10 @@ class Ros2Bridge:
         addresses = list(filter(self._is_bridged, self._bus.publishers()))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
-        nodes: dict[transport.TopicKey, str] = {}  # other nodes, by the topic they publish
-        for text in transport.token_keys(self._session, transport.px4_publishers_key_expr(self._domain), timeout=0.5):
+        nodes: dict[TopicKey, str] = {}  # other nodes, by the topic they publish
+        for text in token_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
             with suppress(DecodeError):
-                token = transport.PublisherToken.parse(text)
+                token = PublisherToken.parse(text)
                 if token.session != self._zid:
                     nodes.setdefault(token.key, token.node)
         others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
@@ -204,11 +215,11 @@ class Ros2Bridge:
         key = self._key(address)
         self._entities += 1
         token, drop = key.token("MP", self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
-        encoding = transport.BRIDGED_ENCODING
-        with transport.translate_zenoh_errors():
+        encoding = BRIDGED_ENCODING
+        with translate_zenoh_errors():
             publisher = self._session.declare_publisher(str(key), encoding=encoding, congestion_control=drop)
             declared = self._session.liveliness().declare_token(token)
-        self._publishers[address] = _Ros2Publisher(transport.gid_of_token(token), publisher, declared)
+        self._publishers[address] = _Ros2Publisher(gid_of_token(token), publisher, declared)
 
     def _close(self, address: Address) -> None:
         if publisher := self._publishers.pop(address, None):
@@ -220,14 +231,14 @@ class Ros2Bridge:
         definition, layout, _ = self._types[sample.topic]
         payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
         publisher.sequence += 1
-        attachment = bytes(transport.Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
-        with transport.translate_zenoh_errors():
+        attachment = bytes(Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
+        with translate_zenoh_errors():
             publisher.publisher.put(payload, attachment=attachment)
 
-    def _key(self, address: Address) -> transport.TopicKey:
+    def _key(self, address: Address) -> TopicKey:
         definition, _, type_hash = self._types[address.topic]
         name = dds_type(ros2_type(definition))
-        return transport.TopicKey(self._domain, self._arbiter.topic_of(address), name, type_hash)
+        return TopicKey(self._domain, self._arbiter.topic_of(address), name, type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
         """Return whether an address is selected and the workspace has its message type; log a missing type once."""

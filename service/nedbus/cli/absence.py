@@ -3,14 +3,14 @@
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from nedbus.client import Bus, ServiceStatus, SourceStatus, prefix_of
-from nedbus.transport import token_keys
+from nedbus import Bus
+from nedbus.health import ServiceStatus, SourceStatus
 
 from .output.streams import to_text
 
 _TIMEOUT: Final = 1.0  # s for the router to list the tokens of other prefixes
 _MAX_NAMED: Final = 20  # vehicles or addresses in a hint
-_MAX_REASONS: Final = 5  # sources in a hint
+_MAX_REASONS: Final = 5  # sources or prefixes in a hint
 _MAX_REASON: Final = 300  # characters of the error of a source
 
 
@@ -38,19 +38,12 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
             names = to_text(", ".join(outdated[:_MAX_NAMED]))
             advice = f"{advice}; update nedbus on the host of {names}, which is older"
         return Absence(f"a service answers: {advice}", is_fault=False)
-    if prefixes := _other_prefixes(bus):
+    if prefixes := bus.other_prefixes(timeout=_TIMEOUT)[:_MAX_REASONS]:
         names = " and ".join(f"{to_text(prefix)}/" for prefix in prefixes)
         advice = f"use --prefix {to_text(prefixes[0])}"
         reason = f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
         return Absence(reason, is_fault=True)
     return Absence("start a source with 'nedbus serve'", is_fault=False)
-
-
-def _other_prefixes(bus: Bus) -> list[str]:
-    """Return the first prefixes, other than this bus's, under which vehicles are published."""
-    session = bus._session  # noqa: SLF001 - a further one might exceed the limit of the router
-    keys = token_keys(session, "**/@alive/**", timeout=_TIMEOUT)
-    return sorted({prefix_of(key) for key in keys} - {"", bus.prefix})[:_MAX_REASONS]
 
 
 def _source_reasons(service: ServiceStatus, wanted: Sequence[str]) -> Iterator[str]:

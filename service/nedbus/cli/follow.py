@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from nedbus.client import Bus, Sample, Subscription
+from nedbus import Bus, Sample, Subscription
 from nedbus.errors import ClosedError, NoDataError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS

@@ -22,7 +22,7 @@ from nedbus_msgs.frames import derived_from
 from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
 
 if TYPE_CHECKING:
-    from nedbus.client import Bus
+    from nedbus import Bus
 
     OpenBus = Callable[[], Bus]
 else:
@@ -142,7 +142,7 @@ def _read_settings(
 
 
 def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> AbstractContextManager[Any]:
-    from nedbus.client import Bus
+    from nedbus import Bus
 
     settings = _read_settings(**settings_options)
     try:

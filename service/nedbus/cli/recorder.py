@@ -7,11 +7,9 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
-from nedbus import clock
-from nedbus.client import Subscription
+from nedbus import Batch, Subscription, clock
 from nedbus.errors import ClosedError, NoDataError
 from nedbus.flights import RecordingWriter, check_recording
-from nedbus.samples import Batch
 from nedbus_msgs.text import counted
 
 _FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush

@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from nedbus.clock import format_duration
 from nedbus.extras import lazy_exports
 from nedbus.samples import Counts, Mode, Sample
 from nedbus.transport import Publishers
@@ -18,7 +17,6 @@ from .discovery import (
     StreamStatus,
     Vehicles,
     find_services,
-    prefix_of,
     reply_parts,
 )
 from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
@@ -28,7 +26,6 @@ from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .publishing.writer import HEARTBEAT
-from .rate_gate import check_max_rate
 from .subscription import Subscription
 
 if TYPE_CHECKING:

@@ -146,6 +146,7 @@ class AsyncBus:
     publishers = _awaited(Bus.publishers)
     services = _awaited(Bus.services)
     accounts = _awaited(Bus.accounts)
+    other_prefixes = _awaited(Bus.other_prefixes)
     history = _awaited(Bus.history)
     why = _awaited(Bus.why)
     fusion = _awaited(Bus.fusion)

@@ -32,6 +32,7 @@ from nedbus_msgs import (
     Selection,
     VehicleLocalPosition,
     VehicleNames,
+    prefix_of,
     topic_of,
     vehicle_name,
 )
@@ -224,6 +225,14 @@ class Bus(AbstractContextManager["Bus"]):
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
         """Query the event reports of all nedbus services: events of the last `within` seconds, and vehicle states."""
         return find_reports(self._session, prefix=self.prefix, within=within, timeout=timeout)
+
+    def other_prefixes(self, *, timeout: float = 1.0) -> list[str]:
+        """Return the other prefixes under which vehicles are published on this network, sorted.
+
+        For the case that no vehicle is found: a program with another prefix sees none of them.
+        """
+        keys = token_keys(self._session, "**/@alive/**", timeout=timeout)
+        return sorted({prefix_of(key) for key in keys} - {"", self.prefix})
 
     def history(self, *, within: float = 86_400.0, timeout: float = 2.0) -> EventHistory:
         """Query the events of the last `within` seconds [s] and the vehicle states from all services, as one history.

@@ -177,7 +177,11 @@ def _status_type() -> TypeAdapter[ServiceStatus]:
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
-    """Query the status of all nedbus services; ignore oversized replies, and statements about other vehicles."""
+    """Query the status of all nedbus services, as `bus.services`, over a session from `bus.open_session`.
+
+    Large replies then do not delay the messages of the bus. Ignores oversized replies, and what a service says of
+    other vehicles than that of the key.
+    """
     found: dict[tuple[str | None, str], ServiceStatus] = {}
     for vehicle, service, content in _find(session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout):
         if not isinstance(content, dict):
@@ -191,14 +195,6 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
         sources = part.sources if known is None else (*known.sources, *part.sources)
         found[vehicle, service] = replace(part, sources=sources)
     return list(found.values())
-
-
-def prefix_of(key: str) -> str:
-    """Return the prefix of the key of a message or of a publisher's token; "" if it has none, as in plain ROS 2."""
-    vehicle, alive, _ = key.partition("/@alive/")
-    before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
-    is_ros2_domain = bool(before) and before[0].isdecimal()  # `<domain>/fmu/out/vehicle_local_position`
-    return "" if is_ros2_domain else "/".join(before)
 
 
 def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:

@@ -3,8 +3,6 @@
 import math
 from typing import Final
 
-from nedbus.errors import ArgumentError
-
 RATES: Final = (1, 2, 5, 10, 20, 50, 100)  # Hz to which publishers downsample a stream, each on its own key
 
 
@@ -31,12 +29,6 @@ class RateGate:
             # One period after the due time, not after this message: 100 Hz limited to 30 Hz stays 30 Hz on average.
             self._due = max(due + self._period, now - self._early)
         return True
-
-
-def check_max_rate(max_rate: object) -> None:
-    """Raise ArgumentError unless `max_rate` is a finite number above 0."""
-    if isinstance(max_rate, bool) or not isinstance(max_rate, int | float) or not 0 < max_rate < math.inf:
-        raise ArgumentError("max_rate", max_rate, "messages per second, a finite number above 0")
 
 
 def rate_step(max_rate: float) -> int:

@@ -10,11 +10,12 @@ from typing import Final, Literal
 
 from nedbus import clock
 from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
+from nedbus.endpoints import dial_endpoint
 from nedbus.errors import ConfigError, ConnectError
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting, locate_source
-from nedbus.sources import ReplaySource, Source, parse_source
-from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
+from nedbus.sources import SOURCE_KINDS, ReplaySource, Source, parse_source
+from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
 from nedbus.vehicle_events import AccountReport, EventLog, report_of
 
 from .status_replies import StatusReplies
@@ -27,6 +28,9 @@ _GRACE: Final = 1.0  # s for sources to stop at shutdown
 _RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _POLL: Final = 1.0  # s between polls for silent streams and for the link
 _RELOADABLE: Final = frozenset({"source", "vehicle"})  # settings that a reload can change
+SOURCE_FORMS: Final = tuple(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
+"""How the sources of a service are written, such as "ulog:FILE"; a part in brackets is optional."""
+
 _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
@@ -12,6 +12,7 @@ from nedbus.client import Histogram, PositionStatus, PublisherRegistry, SourceSt
 from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.log_event import about
 from nedbus.sources import (
+    SOURCE_KINDS,
     LinkCopies,
     LinkLoad,
     LiveItem,
@@ -22,13 +23,15 @@ from nedbus.sources import (
     Source,
     SourceMessage,
     UnavailableTopics,
+    parse_source,
 )
 from nedbus.timeline import MAX_PAUSE, Pace
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.vehicle_events import EventLog
+from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .output import SourceOutput
+from .output import TOO_MANY, SourceOutput
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +43,7 @@ _MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
 
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
+"""States of a source, in `SourceStatus.state`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,23 @@ class PlannedSource:
     vehicle: str
     source: Source = field(compare=False)
 
+    def addresses(self, *, offline: bool = False) -> Collection[Address]:
+        """Return the addresses of a replay, or the position addresses of vehicles named in a live source's options.
+
+        `offline`: no file is read, and the addresses of a log or recording are unknown.
+
+        Raises SourceError or OSError if the file cannot be read.
+        """
+        spec = parse_source(self.text)
+        if isinstance(self.source, LiveSource):
+            named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
+            return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
+        if offline and SOURCE_KINDS[spec.kind].target == "FILE":
+            return ()
+        run = self.source.open()
+        with closing(run.messages):  # type: ignore[type-var] # replays are generators
+            return run.addresses
+
 
 @dataclass(frozen=True, slots=True)
 class SourceMeasures:
@@ -58,6 +79,11 @@ class SourceMeasures:
 
     status: SourceStatus
     durations: Histogram
+
+    @property
+    def beyond_limit(self) -> int:
+        """Messages of a replay that are rejected because their address is beyond the limit of 10,000."""
+        return self.status.rejections.get(TOO_MANY, 0)
 
     @property
     def states(self) -> dict[str, str]:

@@ -3,16 +3,15 @@
 import logging
 import socket
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 
 from nedbus.daemon import PlannedSource, plan_sources
+from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, position_at
-from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
-from nedbus.transport import RouterConfig, check_endpoints, read_router_config, router_endpoints, split_endpoint
-from nedbus_msgs import DEFAULT_TOPIC, Address
+from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source
+from nedbus.transport import RouterConfig, read_router_config
+from nedbus_msgs import Address
 
 from .access_rules import find_rule_mistakes
 from .finding import Finding
@@ -34,10 +33,10 @@ def check_service(
         replaced = {name for name in ("listen", "connect") if getattr(settings, name)}
         mistakes += check_router_file(settings.router_config, offline=offline, replaced=replaced)
         try:
-            endpoints = endpoints or router_endpoints((), settings.router_config)
+            endpoints = endpoints or settings.router_endpoints
         except ConfigError as exc:
             mistakes.append(exc)
-    mistakes += check_sources(settings, endpoints or router_endpoints(), offline=offline)
+    mistakes += check_sources(settings, endpoints or (DEFAULT_ENDPOINT,), offline=offline)
     if offline:
         return mistakes
     found = [
@@ -63,13 +62,13 @@ def check_router_file(
     text = path.read_text(errors="replace")
     subjects = max(0, text.find("cert_common_names"))  # names of certificates also occur before
     located = [
-        (mistake.reason, position_at(text, text.find(f'"{mistake.certificate}"', subjects)))
+        (mistake.reason, text.find(f'"{mistake.certificate}"', subjects))
         for mistake in find_rule_mistakes(config.access)
     ]
     if not offline:
         found = _check_router_access(config, replaced)
-        located += [(reason, position_at(text, text.find(value))) for value, reason in found if reason]
-    return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
+        located += [(reason, text.find(value)) for value, reason in found if reason]
+    return [ConfigError.in_text(path, reason, text, index) for reason, index in located]
 
 
 def _check_router_access(config: RouterConfig, replaced: Collection[str]) -> list[tuple[str, str]]:
@@ -96,7 +95,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
     publishers: dict[Address, PlannedSource] = {}
     for planned in plan:
         try:
-            addresses, reason = _addresses(planned, offline=offline), ""
+            addresses, reason = planned.addresses(offline=offline), ""
         except (NedbusError, OSError) as exc:
             addresses, reason = (), str(exc)
         same = next((address for address in addresses if address in publishers), None)
@@ -107,19 +106,6 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
             yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
         for address in addresses:
             publishers.setdefault(address, planned)
-
-
-def _addresses(planned: PlannedSource, *, offline: bool) -> Collection[Address]:
-    """Return all addresses of a replay, or the position addresses of vehicles named in a live source's options."""
-    spec = parse_source(planned.text)
-    if isinstance(planned.source, LiveSource):
-        named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
-        return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
-    if offline and SOURCE_KINDS[spec.kind].target == "FILE":
-        return ()
-    run = planned.source.open()
-    with closing(run.messages):  # type: ignore[type-var] # replays are generators
-        return run.addresses
 
 
 def _try_listen(endpoint: str) -> Finding | None:

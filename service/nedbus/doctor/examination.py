@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from nedbus import client
+from nedbus import Tls, connect
 from nedbus.errors import NedbusError
 from nedbus.extras import import_optional
 from nedbus.log_event import about
@@ -17,7 +17,7 @@ from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.timings import TIMINGS
-from nedbus.transport import AccessControl, Tls, probe_writes, read_router_config
+from nedbus.transport import AccessControl, probe_writes, read_router_config
 
 from .access_rules import explain_permissions
 from .configuration import check_sources
@@ -109,7 +109,7 @@ def _check_sources(settings: Settings) -> Iterator[Finding]:
 
 def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[Finding]:
     """Connect to a router, observe its network, and yield the findings of `NETWORK_CHECKS`."""
-    with client.connect(router, timeout=TIMINGS.doctor_open, prefix=seen.prefix, tls=tls) as bus:
+    with connect(router, timeout=TIMINGS.doctor_open, prefix=seen.prefix, tls=tls) as bus:
         session = bus._session  # noqa: SLF001 - a further one might exceed the limit of the router
         if seen.vehicle is not None:
             with bus.open_session(timeout=TIMINGS.doctor_open) as writer:

@@ -7,6 +7,8 @@ from typing import Final, Literal, get_args
 from nedbus_msgs.text import counted
 
 State = Literal["ok", "unknown", "warning", "wrong"]
+"""State of the subject of a check."""
+
 _STATES: Final[tuple[State, ...]] = get_args(State)  # worst last
 FIRST_PARTNER: Final = (
     "PX4 sends only to the first address that sent to its port since its boot: if that was another program or port,"

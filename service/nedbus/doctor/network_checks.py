@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import ServiceStatus, SourceStatus, prefix_of
-from nedbus.vehicle_events import by_vehicle, format_duration, format_since
-from nedbus_msgs import Address, get_topic
+from nedbus.clock import format_duration, format_since
+from nedbus.health import ServiceStatus, SourceStatus
+from nedbus.vehicle_events import by_vehicle
+from nedbus_msgs import Address, get_topic, prefix_of
 
 from .finding import FIRST_PARTNER, Finding, State, brief, list_names
 from .observation import Observation

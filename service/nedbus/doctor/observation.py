@@ -10,9 +10,11 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus import client, clock, transport
+from nedbus import Bus, Newest, Session, clock
+from nedbus.health import AccountReport, Publishers, RouterState, ServiceStatus, SourceStatus, query_routers
+from nedbus.rmw_zenoh import PublisherToken, px4_publishers_key_expr, token_keys, translate_zenoh_errors
 from nedbus.timings import TIMINGS
-from nedbus.vehicle_events import AccountReport
+from nedbus.transport import Verdict
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
 T = TypeVar("T")
@@ -43,40 +45,40 @@ class Observation:
     prefix: str
     version: str
     vehicle: str | None
-    verdict: transport.Verdict | None = None
-    services: list[client.ServiceStatus] = field(default_factory=list)
+    verdict: Verdict | None = None
+    services: list[ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
-    alive: transport.Publishers = field(default_factory=transport.Publishers)
+    alive: Publishers = field(default_factory=Publishers)
     ages: dict[Address, float | None] = field(default_factory=dict)
     delays: dict[Address, float | None] = field(default_factory=dict)
     errors: dict[Address, str] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
-    ros2: list[transport.PublisherToken] = field(default_factory=list)
-    routers: list[transport.RouterState] = field(default_factory=list)
+    ros2: list[PublisherToken] = field(default_factory=list)
+    routers: list[RouterState] = field(default_factory=list)
     listened: float = 0.0
 
     @property
-    def sources(self) -> list[client.SourceStatus]:
+    def sources(self) -> list[SourceStatus]:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
 
-    def observe(self, bus: client.Bus, session: transport.Session) -> None:
+    def observe(self, bus: Bus, session: Session) -> None:
         """Send the queries, and receive messages for at least 3 s; `session`: that of the bus."""
         prefix, start = self.prefix, time.monotonic()
         newest = bus.newest(ANY)
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-        self.routers = transport.query_routers(session, timeout=_QUERY_TIMEOUT)
+        self.routers = query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
         self.services = bus.services(timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
         self.accounts = bus.accounts(within=0.0, timeout=_QUERY_TIMEOUT)
         self.alive = bus.publishers(timeout=_LIST_TIMEOUT)
-        tokens = transport.token_keys(session, transport.px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
-        publishers = _parse_each(transport.PublisherToken.parse, tokens)
+        tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
+        publishers = _parse_each(PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges
-        tokens = transport.token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
+        tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add(newest)
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
@@ -91,7 +93,7 @@ class Observation:
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
-    def _add(self, newest: client.Newest) -> None:
+    def _add(self, newest: Newest) -> None:
         for each in newest.update():
             address = each.sample.address
             if not each.sample.retained and (address in self.delays or len(self.delays) < _MAX_KEYS):
@@ -101,9 +103,9 @@ class Observation:
         self.delays |= {address: None for address in newest.invalid if address not in self.delays}
 
 
-def _subscribe(session: transport.Session, key_expr: str) -> Callable[[], Iterable[transport.RawSample]]:
+def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[zenoh.Sample]]:
     """Return a function that drains up to one full ring of samples; deleting it ends the subscription."""
-    with transport.translate_zenoh_errors():
+    with translate_zenoh_errors():
         subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING))
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 

@@ -7,12 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from nedbus import clock
+from nedbus import Tls, clock
+from nedbus.endpoints import split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import UNKNOWN_CA, Tls, check_pem, open_client, read_certificate, split_endpoint
+from nedbus.transport import UNKNOWN_CA, check_pem, open_client, read_certificate
 
 from .finding import Finding, brief, worst_state
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .conversion import convert, convert_flight
+    from .conversion import Conversion, convert, convert_files, convert_flight
     from .events import (
         EVENT_OPTIONS,
         MAX_FILE_EVENTS,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
-        ("mcap", "conversion"): "convert convert_flight",
+        ("", "conversion"): "Conversion convert convert_files convert_flight",
         ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events"
         " read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",

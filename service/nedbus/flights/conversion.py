@@ -1,22 +1,38 @@
 """Convert flights to an MCAP recording, validating each message."""
 
+from __future__ import annotations
+
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
 from nedbus.atomic_write import atomic_write
 from nedbus.errors import OutputError, SourceError
+from nedbus.extras import import_optional
 from nedbus.log_event import about
 from nedbus.samples import SourceMessage
-from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
+from nedbus_msgs import (
+    BY_TOPIC,
+    Address,
+    Message,
+    Provenance,
+    check_vehicle,
+    describe,
+    upgrade_with,
+    vehicle_name,
+)
 from nedbus_msgs.text import counted
 
-from .flight import Flight, boot_utc_of
-from .readers import check_recording
-from .writer import RecordingWriter
+from .flight import Flight, boot_utc_of, open_messages
+from .readers import ReadOptions, check_recording
+from .selection import absent_topics, parse_topics, topics_of
+
+if TYPE_CHECKING:
+    from .writer import RecordingWriter
 
 _log = logging.getLogger(__name__)
 
@@ -24,6 +40,50 @@ _MAX_START: Final = 2**63  # ns; leaves room for later times in 64 bits
 _CHUNK: Final = 1024  # messages per write
 _CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses a few seconds of a typical flight
 _MAX_LOGGED: Final = 5  # rejected messages logged per file
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """What `nedbus.convert` has done.
+
+    `summary`: the numbers of messages written and rejected, as text. `warnings`: damage to the files, with the parts
+    that were skipped, and requested topics that they lack. `damaged`: messages were lost by damage.
+    """
+
+    summary: str
+    warnings: tuple[str, ...]
+    damaged: bool
+
+
+def convert_files(
+    source: str | Path | Sequence[str | Path],
+    output: str | Path,
+    *,
+    topics: str | Sequence[str] = (),
+    vehicle: str | int | None = None,
+    on_progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Conversion:
+    """Convert flight logs to an MCAP recording, as `nedbus convert` does; every message is validated.
+
+    `source`: a .ulg log, an .mcap recording or a .tlog, or several, which are merged by UTC. `output`: a new file,
+    whose name ends with .mcap. `topics`: topics or names of messages, "*" for all; by default those of all built-in
+    messages. `vehicle`: the vehicle id for a log of one vehicle. `on_progress`: called with the number of bytes read so
+    far, and that of all.
+
+    Raises the errors of `nedbus.open` for the files, AddressError for an invalid topic or vehicle, ConfigError for an
+    output with another suffix, OutputError if the output exists or cannot be written, SourceError if all messages are
+    rejected. No partial file is left behind. Needs the extra `mcap`, else raises ConfigError.
+    """
+    sources = [source] if isinstance(source, str | Path) else source
+    paths = [Path(each).expanduser() for each in sources]
+    _load_writer()  # raises ConfigError without the extra, before the files are read
+    names = parse_topics(topics if isinstance(topics, str) else ",".join(topics))
+    name = None if vehicle is None else check_vehicle(vehicle_name(vehicle))
+    with open_messages(paths, ReadOptions(topics_of(names), name)) as flight:
+        summary = convert_flight(flight, Path(output).expanduser(), on_progress=on_progress)
+        absent = absent_topics(names, {address.topic for address in flight.definitions}, "this file")
+    warnings = (*flight.warnings, *(f"{paths[0]}: {text}" for text in absent))
+    return Conversion(summary, warnings, flight.damaged)
 
 
 def convert_flight(flight: Flight, path: Path, *, on_progress: Callable[[int, int], object]) -> str:
@@ -66,7 +126,7 @@ def convert(
     try:
         with (
             atomic_write(path) as part,
-            RecordingWriter(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts) as writer,
+            _load_writer()(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts) as writer,
         ):
             rejected, reason = _write(messages, writer, starts or {}, source=source, on_progress=on_progress)
             if rejected and not writer.messages:
@@ -75,6 +135,12 @@ def convert(
         raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
     written = counted(writer.messages, "message")
     return f"{written}, {rejected} rejected" if rejected else written
+
+
+def _load_writer() -> type[RecordingWriter]:
+    """Import the writer, which needs the extra `mcap`; raise ConfigError without it."""
+    writer: type[RecordingWriter] = import_optional("mcap", f"{__package__}.writer").RecordingWriter
+    return writer
 
 
 def _write(

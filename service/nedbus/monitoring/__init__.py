@@ -14,3 +14,5 @@ if TYPE_CHECKING:
     from .exporter import Exporter
 else:
     __getattr__ = lazy_exports(__name__, {"Exporter": ("metrics", "exporter")})
+
+__all__ = ["Exporter", "HttpServer", "Page", "Snapshot", "service_pages", "why_not_ready", "why_refused"]

@@ -11,11 +11,10 @@ from typing import Any, Final
 
 from prometheus_client.core import Metric
 
-from nedbus import clock
-from nedbus.client import Bus, LogStreamStatus, PositionStatus, find_services
+from nedbus import Bus, Session, clock
 from nedbus.errors import NedbusError
+from nedbus.health import LogStreamStatus, PositionStatus, RouterState, find_services, query_routers
 from nedbus.timings import TIMINGS
-from nedbus.transport import RouterState, Session, query_routers
 from nedbus.vehicle_events import report_of
 from nedbus_msgs import Selection
 

@@ -13,9 +13,9 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, NamedTuple
 
+from nedbus.endpoints import is_loopback, split_http
 from nedbus.errors import ListenError
 from nedbus.log_event import about
-from nedbus.settings import is_loopback, split_http
 from nedbus.timings import TIMINGS
 
 from .access import why_refused

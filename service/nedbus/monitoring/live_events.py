@@ -8,10 +8,10 @@ from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from typing import Any, Final, Self
 
-from nedbus import clock
-from nedbus.client import Bus, Sample, Subscription
+from nedbus import Bus, Sample, Subscription, clock
 from nedbus.errors import NoDataError
-from nedbus.vehicle_events import ALL, AccountReport, Event, Times, once_per_service
+from nedbus.health import AccountReport, Event, Times
+from nedbus.vehicle_events import ALL, once_per_service
 from nedbus_msgs import Selection
 
 from .observer import Observer

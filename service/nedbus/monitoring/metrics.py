@@ -17,9 +17,9 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
 from nedbus import clock
-from nedbus.client import Health, Histogram, SourceStatus
-from nedbus.daemon import STATES, TOO_MANY, Daemon, SourceMeasures
-from nedbus.vehicle_events import SEVERITIES, EventLog
+from nedbus.daemon import STATES, Daemon, SourceMeasures
+from nedbus.health import SEVERITIES, Health, Histogram, SourceStatus
+from nedbus.vehicle_events import EventLog
 
 from .http_server import Page
 
@@ -216,7 +216,7 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     event_log = daemon.update_events(list(sources.values()))
     yield from vehicle_metrics(event_log, streams)
     of = {label: measures.status for label, measures in sources.items()}
-    addresses = sum(each.status.rejections.get(TOO_MANY, 0) for each in sources.values())
+    addresses = sum(each.beyond_limit for each in sources.values())
     yield from make_metrics({
         "nedbus_limit_reached": [(("vehicles",), event_log.refused), (("addresses",), addresses)],
         "nedbus_source_rejected": [((label,), status.rejected) for label, status in of.items()],

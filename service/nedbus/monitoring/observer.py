@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from nedbus import clock
-from nedbus.client import Bus, Health, Monitor, RejectionReport, Sample, stream_state
+from nedbus import Bus, Sample, clock
+from nedbus.health import Health, Monitor, RejectionReport, stream_state
 from nedbus.timings import TIMINGS
 from nedbus.vehicle_events import RECENT, EventLog
 from nedbus_msgs import Address, Selection

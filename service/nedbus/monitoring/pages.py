@@ -4,10 +4,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
+from nedbus.clock import format_since
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.extras import import_optional
-from nedbus.vehicle_events import AccountReport, Expectation, by_vehicle, faults_of, format_since
+from nedbus.health import AccountReport
+from nedbus.vehicle_events import Expectation, by_vehicle, faults_of
 from nedbus_msgs.text import plural
 
 from .http_server import Page

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from nedbus.atomic_write import atomic_write
+from nedbus.endpoints import check_endpoints
 from nedbus.errors import ConfigError, PkiError
-from nedbus.transport import check_endpoints
 
 from .authority import Authority, new_key, write_new
 from .certificate import certificate_name

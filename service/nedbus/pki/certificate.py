@@ -10,8 +10,12 @@ from typing import Any, Final
 from nedbus.extras import import_optional
 from nedbus_msgs import AddressError, check_vehicle
 
-DAYS: Final = 825  # default validity of a certificate [days]
-RENEW_WITHIN: Final = 30  # days before expiry when a certificate becomes due for renewal
+DAYS: Final = 825
+"""Default validity of a certificate [days]."""
+
+RENEW_WITHIN: Final = 30
+"""Days before the expiry of a certificate at which it becomes due for renewal."""
+
 CERTIFICATE_PREFIX: Final = "vehicle-"
 """Prefix of the vehicle id in common names, so no vehicle has the common name of a reader or router."""
 

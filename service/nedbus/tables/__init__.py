@@ -21,3 +21,8 @@ else:
         ("plot", "plot"): "MAX_STREAMS draw",
     }
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
+
+__all__ = [
+    "MAX_STREAMS", "addresses_of", "align", "array_of", "array_warnings", "draw", "missing_of", "read",
+    "read_positions",
+]  # fmt: skip

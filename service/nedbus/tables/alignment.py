@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overlo
 import numpy as np
 import numpy.typing as npt
 
+from nedbus import UtcOffset, utc_of
 from nedbus.errors import AddressError, ArgumentError, ConfigError
-from nedbus.flights import utc_of
-from nedbus.timeline import UtcOffset, to_datetime64
+from nedbus.timeline import to_datetime64
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray, derive_column
 from nedbus_msgs.frames import DERIVED, derived_from

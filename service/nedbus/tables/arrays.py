@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from nedbus import Flight, UtcOffset
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.extras import import_optional
-from nedbus.flights import Flight, ReadOptions, no_utc
-from nedbus.timeline import UtcOffset
+from nedbus.flights import ReadOptions, no_utc
 from nedbus_msgs import DEFAULT_TOPIC, Address, decode_text
 from nedbus_msgs.arrays import MessageArray
 

@@ -14,8 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.atomic_write import atomic_write
+from nedbus.clock import format_utc
 from nedbus.errors import ConfigError, OutputError
-from nedbus.vehicle_events import KINDS, SEVERITIES, Event, Severity, Times, format_utc, spans_of, unit_of
+from nedbus.health import SEVERITIES, Event, Times
+from nedbus.vehicle_events import KINDS, Severity, spans_of
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
 
@@ -152,7 +154,7 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
     ticks = np.arange(np.ceil(low / step), high / step) * step
     texts = [format_utc(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
     axes.set_xticks(ticks - shift, texts)
-    return f"time [{unit_of('vehicle' if has_utc else 'boot')}]"
+    return f"time [{Times.unit('vehicle' if has_utc else 'boot')}]"
 
 
 def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None:

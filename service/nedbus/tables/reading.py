@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
 
+from nedbus import Flight
 from nedbus.errors import AddressError, SourceError
-from nedbus.flights import Flight, ReadOptions, matching, require_one_vehicle, single_match
+from nedbus.flights import ReadOptions, matching, require_one_vehicle, single_match
 from nedbus.log_event import about
 from nedbus.timeline import provides_utc
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name

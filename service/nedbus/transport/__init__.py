@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
 from nedbus.extras import lazy_exports
 
 from .key_reader import KeyReader

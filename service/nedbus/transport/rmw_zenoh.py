@@ -17,8 +17,12 @@ import xxhash
 
 from nedbus_msgs import DecodeError
 
-NO_HASH: Final = "TypeHashNotSupported"  # replaces the hash in keys of ROS 2 Humble, and of PX4 built for Humble
-BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # marks messages from nedbus, to prevent loops; ROS 2 ignores it
+NO_HASH: Final = "TypeHashNotSupported"
+"""Replaces the hash in keys of ROS 2 Humble, and of PX4 built for Humble."""
+
+BRIDGED_ENCODING: Final = "application/cdr;nedbus"
+"""Encoding that marks messages from nedbus, to prevent loops; ROS 2 ignores it."""
+
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10, as PX4 publishes
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16  # bytes

@@ -214,6 +214,7 @@ class RouterState:
 def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     """Return the state of each router that replies within `timeout` seconds, sorted by id.
 
+    `session`: from `bus.open_session`, because a large reply delays the other messages of its session.
     A router is missing if its admin space is off or denied, or if its reply exceeds the message size of this session:
     2**18 bytes for a client, about 1,400 sessions.
     """

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from nedbus.clock import format_duration, format_since, format_utc
 from nedbus_msgs.text import counted
 
 from .event import ALL, without_wild
 from .report import AccountReport, VehicleReport, by_vehicle, once_per_service
-from .times import format_duration, format_since, format_utc
 
 VALID: Final[Mapping[str, str]] = {"xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid"}
 """Quantities whose validity a health check can require, and their flags in VehicleLocalPosition."""

@@ -8,6 +8,8 @@ from typing import Final, Literal, get_args
 from .rules import AID_SOURCES, EVIDENCE, FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, MINOR_AIDS, REJECTED
 
 Severity = Literal["bad", "watch", "info"]
+"""How bad an event or a state is."""
+
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
 """Severities, worst first: bad (the vehicle cannot do its task), watch (may become bad), info (routine)."""
 

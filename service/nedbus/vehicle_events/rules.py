@@ -131,6 +131,8 @@ MODES: Final[Mapping[int, str]] = {
     15: "Stabilized", 17: "Takeoff", 18: "Land", 19: "Follow", 20: "Precision Land", 21: "Orbit", 22: "VTOL Takeoff",
     **{number: f"External {number - 22}" for number in range(23, 31)},
 }  # fmt: skip
+"""Names of flight modes, by `nav_state` of VehicleStatus."""
+
 """Flight mode names by nav_state, as in QGroundControl."""
 
 VEHICLE_TYPES: Final[Mapping[int, str]] = {0: "unspecified", 1: "rotary wing", 2: "fixed wing", 3: "rover"}
@@ -139,6 +141,8 @@ VEHICLE_TYPES: Final[Mapping[int, str]] = {0: "unspecified", 1: "rotary wing", 2
 FIXES: Final[Mapping[int, str]] = {
     0: "none", 1: "none", 2: "2D", 3: "3D", 4: "DGPS", 5: "RTK float", 6: "RTK fixed", 8: "extrapolated",
 }  # fmt: skip
+"""Names of GNSS fixes, by `fix_type` of SensorGps."""
+
 WARNINGS: Final[Mapping[int, str]] = {
     1: "low", 2: "critical", 3: "emergency", 4: "failed", 6: "unhealthy", 7: "charging",
 }  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
-from nedbus.clock import format_duration
+from nedbus.clock import format_duration, format_utc
 from nedbus.timeline import unix_seconds
 
 from .event import Event
@@ -59,6 +59,11 @@ class Times:
             return "host" if self.is_live else "vehicle"
         return "start" if event.boot is None else "boot"
 
+    @staticmethod
+    def unit(clock: str) -> str:
+        """Return the unit of a clock's times: "UTC", or seconds with their epoch, such as "s since boot"."""
+        return _CLOCKS[clock].partition(",")[0].replace("seconds", "s")
+
     def text(self, event: Event) -> str:
         """Format the time of an event without the date, as `find` parses it: 14:05:12.3, 123.400 or +12.300."""
         utc = self.utc(event)
@@ -75,10 +80,10 @@ class Times:
         still = f"until {'now' if self.is_live else 'the end'}"
         if begin is None:
             return f"from the first message {still} ({format_duration(lasted)})"
-        since = f"{self.text(begin)} {unit_of(self.clock(begin))}"
+        since = f"{self.text(begin)} {Times.unit(self.clock(begin))}"
         if end is None:
             return f"at {since}" if lasted == 0 else f"from {since}, {still} ({format_duration(lasted)})"
-        return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({format_duration(lasted)})"
+        return f"from {self.text(begin)} to {self.text(end)} {Times.unit(self.clock(end))} ({format_duration(lasted)})"
 
     def find(self, text: str, near: Event) -> float:
         """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the event log's time [s].
@@ -109,19 +114,3 @@ class Times:
         if near.boot is None and self.is_live:
             raise ValueError("no message of this vehicle has the time since boot")
         return near.time + seconds - (near.time if near.boot is None else near.boot)
-
-
-def unit_of(clock: str) -> str:
-    """Return the unit of a clock's times: "UTC", or seconds with their epoch, such as "s since boot"."""
-    return _CLOCKS[clock].partition(",")[0].replace("seconds", "s")
-
-
-def format_utc(utc: float) -> str:
-    """Format a Unix time as UTC, such as 14:05:12.3."""
-    tenths = round(utc * 10)
-    return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"
-
-
-def format_since(since: float | None, now: float) -> str:
-    """Format the start of a condition as a suffix for its text; "" if unknown."""
-    return "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"

@@ -10,6 +10,7 @@ from functools import partial
 from statistics import median
 from typing import Final
 
+from nedbus.clock import format_duration
 from nedbus.fusion import AID_TOPICS, FusionTracker
 from nedbus.timeline import MAX_REORDERED, RebootDetector, RebootSign
 from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
@@ -21,7 +22,6 @@ from .detectors import AidDetector, ChangeDetector, Fields, Finding, VisionDetec
 from .event import ALONE, SUPPRESSED, WINDOW, Author, Condition, Event, State, explain, state_of, without_wild
 from .kinds import KINDS, Severity
 from .position import PositionDetector
-from .times import format_duration
 
 MAGNETOMETER: Final = "vehicle_magnetometer"
 EVENT_TOPICS: Final = (*TOPICS, detectors.EKF_SELECTOR, AIR_DATA, MAGNETOMETER, *rules.AID_SOURCES)

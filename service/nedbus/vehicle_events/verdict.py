@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
 
+from nedbus.clock import format_duration
+
 from .event import ALL, WINDOW, Condition, Event
 from .kinds import KINDS, importance
 from .position import large_part
 from .rules import POSITIONS, SUBJECTS
 from .story import TOGETHER, Story, is_alarm, stories_of
-from .times import Times, format_duration
+from .times import Times
 
 _GLOBAL: Final = "vehicle_global_position"
 _WIDTH: Final = 97  # columns next to a short vehicle name

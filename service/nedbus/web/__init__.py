@@ -9,3 +9,5 @@ if TYPE_CHECKING:
 else:
     _NAMES = "PageOptions", "serve_live", "serve_recording"
     __getattr__ = lazy_exports(__name__, dict.fromkeys(_NAMES, ("web", "server")))
+
+__all__ = ["PageOptions", "serve_live", "serve_recording"]

@@ -5,21 +5,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from nedbus.vehicle_events import (
-    Condition,
-    Event,
-    EventLog,
-    Span,
-    Story,
-    Times,
-    Verdict,
-    format_utc,
-    spans_of,
-    stories_of,
-    story_of,
-    unit_of,
-    verdict_of,
-)
+from nedbus.clock import format_utc
+from nedbus.health import Condition, Event, Span, Story, Times, Verdict
+from nedbus.vehicle_events import EventLog, spans_of, stories_of, story_of, verdict_of
 
 PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
@@ -36,7 +24,7 @@ class EventTimeline:
     def __init__(self, event_log: EventLog, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
         self.event_log = event_log
         self.times = times or Times(is_live=True)
-        self.clock_offset, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
+        self.clock_offset, self.unit = 0.0, Times.unit("host" if self.times.is_live else "start")
         self._before = before
         self._reported = -1
         self._events: list[Event] = []
@@ -62,7 +50,7 @@ class EventTimeline:
         utc = self.times.utc_of_boot(vehicle, boot)
         if utc is not None or len(self.event_log.vehicles) < 2:  # vehicles boot at different times
             self.clock_offset = (boot if utc is None else utc) - time
-            self.unit = unit_of("boot" if utc is None else "vehicle")
+            self.unit = Times.unit("boot" if utc is None else "vehicle")
 
     def format_time(self, seconds: float) -> str:
         """Format an event time as on the time axes."""
@@ -71,7 +59,7 @@ class EventTimeline:
 
     def format_clock(self, seconds: float) -> str:
         """Format an event time with the name of its clock; for a recording, add the seconds since its start."""
-        since = "" if self.times.is_live or not self.clock_offset else f", {seconds:.1f} {unit_of('start')}"
+        since = "" if self.times.is_live or not self.clock_offset else f", {seconds:.1f} {Times.unit('start')}"
         return f"{self.format_time(seconds)} {self.unit}{since}"
 
     def story(self, vehicle: str, now: float, at: Event | float | None, active: Sequence[Condition]) -> Story | None:

@@ -11,10 +11,18 @@ from itertools import count
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from nedbus.client import Health, LogStreamStatus, Monitor, NewestMessage, RejectionReport, StreamState, stream_state
-from nedbus.fusion import Fusion
+from nedbus import Sample
+from nedbus.health import (
+    Fusion,
+    Health,
+    LogStreamStatus,
+    Monitor,
+    NewestMessage,
+    RejectionReport,
+    StreamState,
+    stream_state,
+)
 from nedbus.monitoring import Snapshot
-from nedbus.samples import Sample
 from nedbus.vehicle_events import FIXES, MODES, State, rank_vehicle
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.messages import VehicleStatus

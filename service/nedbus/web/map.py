@@ -10,7 +10,7 @@ from bokeh.models import HoverTool, TapTool
 from bokeh.models.annotations import ScaleBar
 from bokeh.plotting import figure
 
-from nedbus.vehicle_events import Event
+from nedbus.health import Event
 from nedbus_msgs import Address
 
 from .background import Background

@@ -11,12 +11,13 @@ from typing import Any, Final
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
-from nedbus.client import RejectionReport, Sample
+from nedbus import Sample
 from nedbus.errors import NedbusError
 from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, follow_flight, open_messages, times_of
+from nedbus.health import RejectionReport, Times
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.vehicle_events import EventLog, Times, state_at
+from nedbus.vehicle_events import EventLog, state_at
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .event_timeline import EventTimeline

@@ -25,14 +25,14 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.iostream import IOStream
 from tornado.web import HTTPError, RequestHandler
 
-from nedbus import clock
-from nedbus.client import Bus, Sample
+from nedbus import Bus, Sample, clock
+from nedbus.endpoints import is_loopback
 from nedbus.errors import ListenError
+from nedbus.health import Times
 from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, why_refused
-from nedbus.settings import is_loopback
 from nedbus.timings import TIMINGS
-from nedbus.vehicle_events import Times, once_per_service
+from nedbus.vehicle_events import once_per_service
 from nedbus_msgs import Selection
 
 from .background import Background

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from nedbus.client import Sample
+from nedbus import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPosition
 from nedbus_msgs.frames import CommonOrigin, to_global
 

@@ -10,7 +10,8 @@ from typing import Final
 
 import jinja2
 
-from nedbus.client import describe_stream, format_duration
+from nedbus.clock import format_duration
+from nedbus.health import describe_stream
 
 from .fleet import MAX_STREAMS
 from .stream import is_position

@@ -16,7 +16,8 @@ from bokeh.models import (
 from bokeh.models.annotations import Legend, LegendItem
 from bokeh.plotting import figure
 
-from nedbus.vehicle_events import ALL, KINDS, Event, Span
+from nedbus.health import Event, Span
+from nedbus.vehicle_events import ALL, KINDS
 
 from .column_data import replace, table
 from .stream import COLUMNS, History

@@ -16,7 +16,8 @@ from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, Glob
 from bokeh.models.widgets import Div, TextInput
 from bokeh.themes import Theme
 
-from nedbus.vehicle_events import ALL, Event, state_at
+from nedbus.health import Event
+from nedbus.vehicle_events import ALL, state_at
 from nedbus_msgs import Address
 
 from .background import Background

@@ -4,8 +4,9 @@ import threading
 from collections.abc import Mapping, Set
 from typing import Any, Final
 
-from nedbus.fusion import FUSION_TOPICS, VISION_TOPICS, Fusion, FusionTracker
-from nedbus.samples import PositionStatus, Sample
+from nedbus import Sample
+from nedbus.fusion import FUSION_TOPICS, VISION_TOPICS, FusionTracker
+from nedbus.health import Fusion, PositionStatus
 
 _TOPICS: Final = frozenset(FUSION_TOPICS)
 _VISION: Final = frozenset(VISION_TOPICS)

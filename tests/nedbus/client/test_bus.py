@@ -159,6 +159,15 @@ def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkey
     assert not queried
 
 
+def test_other_prefixes_are_those_of_other_publishers(endpoint: str, bus: nedbus.Bus) -> None:
+    """`other_prefixes` names the prefixes of publishers, but not that of the bus."""
+    bus.publisher(VLP, vehicle="1")
+    with nedbus.connect(endpoint, prefix="fleet/north") as other:
+        other.publisher(VLP, vehicle="1")
+        assert bus.other_prefixes() == ["fleet/north"]
+        assert other.other_prefixes() == ["nedbus"]
+
+
 def test_vehicles_are_listed_again_after_an_overflow(
     endpoint: str, bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.vehicle_events import Event, Story, Times, stories_of, unit_of
+from nedbus.vehicle_events import Event, Story, Times, stories_of
 
 from .flight import ARMED, Flight, lose_gps
 
@@ -217,7 +217,7 @@ def test_unavailable_clock_raises() -> None:
 def test_event_without_boot_time_is_relative_to_start() -> None:
     """An event without a time since boot is shown relative to the start of the recording, as `find` parses it."""
     event = event_at(40.0)
-    assert (Times().clock(event), Times().text(event), unit_of(Times().clock(event))) == (
+    assert (Times().clock(event), Times().text(event), Times.unit(Times().clock(event))) == (
         "start",
         "+40.000",
         "s since the start of the recording",

@@ -9,15 +9,14 @@ from typing import Annotated, Final
 
 import typer
 
-from nedbus import __version__, bridges, monitoring, web as page
+from nedbus import Bus, __version__, bridges, monitoring, web as page
 from nedbus.bridges import FOXGLOVE_PORT
 from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicsOption, VehiclesOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
-from nedbus.client import Bus
+from nedbus.endpoints import is_loopback, split_http
 from nedbus.errors import ConfigError, ConnectError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY, RELEASES, Selection
 
 _log = logging.getLogger("nedbus")

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus import Bus, Mode, Sample
 from nedbus.cli.follow import follow
 from nedbus.cli.options import (
     POSITIONS,
@@ -21,8 +22,7 @@ from nedbus.cli.options import (
 )
 from nedbus.cli.output.samples import CsvLines, Lines, to_fields, to_json
 from nedbus.cli.output.streams import write, write_stderr
-from nedbus.client import Bus, Mode, Sample, check_max_rate
-from nedbus_msgs import Address, Selection
+from nedbus_msgs import Address, Selection, check_max_rate
 
 _MAX_RATE: Final = "Downsample each stream at its publisher to this rate, in Hz"
 _EVERY: Final = "Print every message in order; a replay at speed=max waits for this terminal or pipe"

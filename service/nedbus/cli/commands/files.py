@@ -5,12 +5,14 @@ from typing import Annotated, Final
 
 import typer
 
-from nedbus import flights, tables
+import nedbus
+from nedbus import tables
 from nedbus.cli.options import InstanceOption, VehiclesOption, command
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.output.table import show_progress
 from nedbus.errors import ConfigError, SourceError
-from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection, check_vehicle
+from nedbus.vehicle_events import KINDS
+from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 _FLIGHTS: Final = ".ulg, .mcap or .tlog files; several are merged by UTC"
 _IMAGE: Final = "Image to write (default: next to the flight)"
@@ -29,18 +31,18 @@ def convert(
 
     Validates every message, and converts the topics of all built-in messages unless --topics selects others.
     """
-    write_recording = flights.convert_flight  # raises ConfigError without the extra, before the files are read
-    names = flights.parse_topics(topics or "")
-    if vehicle is not None:
-        check_vehicle(vehicle)
-    options = flights.ReadOptions(flights.topics_of(names), vehicle)
-    with flights.open_messages(sources, options) as flight, show_progress() as show:
-        report = write_recording(flight, output, on_progress=lambda done, total: show(f"{output}", done, total))
-        absent = flights.absent_topics(names, {address.topic for address in flight.definitions}, "this file")
-    for warning in (*flight.warnings, *(f"{sources[0]}: {text}" for text in absent)):
+    with show_progress() as show:
+        done = nedbus.convert(
+            sources,
+            output,
+            topics=topics or "",
+            vehicle=vehicle,
+            on_progress=lambda done, total: show(f"{output}", done, total),
+        )
+    for warning in done.warnings:
         write_stderr(warning)
-    write_stderr(f"{output}: {report}")
-    _require_undamaged(flight.damaged, sources, "converted")
+    write_stderr(f"{output}: {done.summary}")
+    _require_undamaged(done.damaged, sources, "converted")
 
 
 @command
@@ -71,10 +73,11 @@ def plot(
     if not streams:
         raise SourceError(name, "nothing to plot: the selected streams have no valid message")
     target = output or sources[0].with_suffix(".png")
-    read = flights.read_file_events(*sources)
-    known = (each for vehicle in read.event_log.vehicles.values() for each in vehicle.conditions.values())
-    events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.event_log.events_since(0)[0]]
-    draw(streams, target, title=", ".join(each.name for each in sources), events=events, times=read.times)
+    history = nedbus.events(sources)
+    held = (condition for vehicle in history.vehicles.values() for condition in vehicle.held)
+    initial = [condition.begin for condition in held if condition.initial and not KINDS[condition.kind].usual]
+    events = [*dict.fromkeys(initial), *history.events]
+    draw(streams, target, title=", ".join(each.name for each in sources), events=events, times=history.times)
     write(str(target))
     _require_undamaged(flight.damaged, sources, "plotted")
 

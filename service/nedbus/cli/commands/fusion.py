@@ -13,12 +13,13 @@ from nedbus.cli.options import DurationOption, FilesArgument, JsonOption, OpenBu
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.errors import ConfigError, NoDataError
-from nedbus.fusion import FUSION_TOPICS, Fusion, fusion_changes
+from nedbus.fusion import FUSION_TOPICS, fusion_changes
+from nedbus.health import Fusion
 from nedbus_msgs import ANY
 
 if TYPE_CHECKING:
-    from nedbus.client import Bus
-    from nedbus.samples import PositionStatus, Sample
+    from nedbus import Bus, Sample
+    from nedbus.health import PositionStatus
 
 _MAX_TEXT: Final = 1000  # characters of a report, parts of which peers wrote
 _STATUS_INTERVAL: Final = 1.0  # s between two queries of what is sent

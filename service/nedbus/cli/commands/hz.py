@@ -5,12 +5,13 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any, Final
 
-from nedbus import clock
+from nedbus import Bus, clock
 from nedbus.cli.follow import follow
 from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, allow_one, command
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import live_table
-from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, format_duration, stream_state
+from nedbus.clock import format_duration
+from nedbus.health import Health, Monitor, StreamState, describe_stream, stream_state
 from nedbus_msgs import DOUBT_FLAGS, Address, Selection
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")

@@ -8,13 +8,15 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus import Bus
 from nedbus.cli.absence import explain_absence
 from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import (
-    Bus,
+from nedbus.clock import format_duration
+from nedbus.errors import AddressError, ConfigError, ConnectError
+from nedbus.health import (
     Health,
     ServiceStatus,
     SourceStatus,
@@ -23,8 +25,6 @@ from nedbus.client import (
     health_of_last,
     stream_state,
 )
-from nedbus.clock import format_duration
-from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
 from nedbus_msgs.text import counted

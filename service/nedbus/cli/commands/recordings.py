@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
+from nedbus import Bus
 from nedbus.cli.follow import write_notice
 from nedbus.cli.options import ALL, DurationOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.output.table import show_progress
 from nedbus.cli.run import run_until_stopped
-from nedbus.client import Bus
 from nedbus.errors import NoDataError
 from nedbus.extras import import_optional
 from nedbus.timings import TIMINGS

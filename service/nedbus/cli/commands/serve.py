@@ -13,21 +13,19 @@ from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCerti
 from nedbus.cli.output.progress import log_progress
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
-from nedbus.daemon import Daemon
+from nedbus.daemon import SOURCE_FORMS, Daemon, log_refusals, run_router
 from nedbus.doctor import check_service
+from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
-from nedbus.sources import SOURCE_KINDS
-from nedbus.transport import DEFAULT_ENDPOINT, Uplinks, log_refusals, open_router, router_endpoints
 
 from .bridges import serve_pages
 from .checks import report_mistakes
 
 _log = logging.getLogger("nedbus")
-_KINDS = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
-_SOURCES = f"Source to publish: {_KINDS}, with ?OPTION=VALUE&...; repeatable"
+_SOURCES = f"Source to publish: {', '.join(SOURCE_FORMS)}, with ?OPTION=VALUE&...; repeatable"
 _HTTP = "Serve metrics, health and status on this address"
 _ZENOHD = "Router configuration in the format of zenohd"
 _LISTEN = f"Endpoint to listen on; repeatable (default: {DEFAULT_ENDPOINT})"
@@ -108,20 +106,10 @@ def router(
     --listen and --connect replace the endpoints of the file, like the flags of zenohd.
     """
     settings = load_settings(config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key)
-    endpoints, routers = settings.listen, tuple(connect or ())
-    tls, closing = settings.tls if routers else None, threading.Event()
+    routers, closing = tuple(connect or ()), threading.Event()
+    tls = settings.tls if routers else None
 
     def run(stop: threading.Event) -> None:
-        where = router_endpoints(endpoints, config_file)
-        if any(each.startswith("tls/") for each in where):
-            log_refusals()
-        session = open_router(listen=endpoints, connect=routers, config_file=config_file, tls=tls)
-        joining = f", joining {', '.join(routers)}" if routers else ""
-        _log.info("router on %s%s", ", ".join(where), joining, extra=about("router"))
-        uplinks = Uplinks(session, routers, tls=tls)
-        while not stop.wait(1.0 if routers else None):
-            uplinks.check()
-        closing.set()
-        session.close()
+        run_router(stop, listen=settings.listen, connect=routers, config_file=config_file, tls=tls, closing=closing)
 
     run_until_stopped(run, closing=closing)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final
 
 from nedbus.daemon import Daemon
+from nedbus.endpoints import DEFAULT_ENDPOINT, dial_endpoint
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 from nedbus_msgs.text import counted
 
 from .streams import is_log_structured, write_stderr

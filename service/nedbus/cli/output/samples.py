@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from nedbus.client import Sample, format_duration
+from nedbus import Sample
+from nedbus.clock import format_duration
 from nedbus.errors import ConfigError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, Message, message_doubts

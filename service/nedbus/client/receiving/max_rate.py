@@ -15,13 +15,13 @@ import zenoh
 from nedbus import clock
 from nedbus.client.io_thread import CallThread
 from nedbus.client.protocol import LIVE
-from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
+from nedbus.client.rate_gate import RateGate, rate_step
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.samples import Mode
 from nedbus.timings import TIMINGS
 from nedbus.transport import Publishers, RawSample, Session, VehicleDirectory, send_query
-from nedbus_msgs import Address, Selection, get_topic
+from nedbus_msgs import Address, Selection, check_max_rate, get_topic
 
 from .arrival import Arrival, detach
 from .decoder import Decoder

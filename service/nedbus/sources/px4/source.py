@@ -14,6 +14,7 @@ from typing import Any, Final
 import zenoh
 
 from nedbus import transport
+from nedbus.endpoints import check_endpoints
 from nedbus.errors import AddressError, ConfigError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
@@ -45,7 +46,7 @@ class Px4ZenohSource:
         self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None, *_: str
     ) -> None:
         if endpoint:
-            transport.check_endpoints([endpoint], where="px4-zenoh")
+            check_endpoints([endpoint], where="px4-zenoh")
         self._endpoints = (endpoint,) if endpoint else routers
         self._is_own = not endpoint or endpoint in routers
         self._options, self._tls = options, tls

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from nedbus.cli.output.progress import suggested_commands
-from nedbus.transport import DEFAULT_ENDPOINT
+from nedbus.endpoints import DEFAULT_ENDPOINT
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_port
 from tests.peers.processes import Start

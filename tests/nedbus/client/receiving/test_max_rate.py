@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 
 from nedbus import Counts, Mode
-from nedbus.client.rate_gate import RATES, RateGate, check_max_rate, rate_step
+from nedbus.client.rate_gate import RATES, RateGate, rate_step
 from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateInbox
 from nedbus.errors import ArgumentError
 from nedbus.transport import RawSample
-from nedbus_msgs import Address, Selection
+from nedbus_msgs import Address, Selection, check_max_rate
 
 from .raw_samples import KEY, drain, put, raw, timestamps
 
