@@ -259,7 +259,7 @@ def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]
         if not any(_is_same(text, other) for other in said):
             said.append(text)
     said = said[:_MAX_TEXTS]
-    shown = [event for event in causes if not any(_repeats(text, event) for text in said)]
+    shown = [event for event in causes if not any(_repeats(other, event) for other in (*said, *causes))]
     of_worst = _subjects(worst.what)
     shown.sort(key=lambda event: (of_worst.isdisjoint(_subjects(event.text)), importance(event.kind), -event.time))
     shown = shown[:_MAX_CAUSES]
@@ -279,9 +279,13 @@ def _is_same(text: Event, other: Event) -> bool:
     return all(re.search("inject", each.text, re.IGNORECASE) for each in (text, other))
 
 
-def _repeats(text: Event, event: Event) -> bool:
-    """Return whether a text of PX4 reports an event of nedbus, with its reason."""
-    return event.kind == "ekf_changed" and "primary EKF changed" in text.text and abs(text.time - event.time) < TOGETHER
+def _repeats(other: Event, event: Event) -> bool:
+    """Return whether another event says more about the same: PX4's text on an EKF, or a lost fix on its satellites."""
+    if abs(other.time - event.time) >= TOGETHER:
+        return False
+    if event.kind == "ekf_changed":
+        return other.kind == "text" and "primary EKF changed" in other.text
+    return event.kind == "few_satellites" and other.kind == "gps_fix_lost" and "satellites" in other.text
 
 
 def _largest_correction(worst: Story, stories: Sequence[Story]) -> Event | None:

@@ -370,7 +370,8 @@ def test_shortened_evidence_prefers_sensor_events() -> None:
         flight.wait(1.0).send()
     text = verdict(flight).text
     assert "(one of 3)" in text
-    assert "only 0 satellites, dead reckoning" in text
+    assert "satellites 12 to 0, dead reckoning" in text
+    assert "only 0 satellites" not in text, "the lost fix says it"
     assert text.index("GPS fix lost") < text.index("dead reckoning")
 
 
