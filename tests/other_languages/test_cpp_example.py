@@ -32,8 +32,8 @@ def compile_with(*arguments: str) -> subprocess.CompletedProcess[str]:
 def has_header(name: str) -> bool:
     """Return whether the compiler finds this header of the system."""
     found = subprocess.run(
-        ["g++", "-std=c++17", _BACKEND, "-E", "-x", "c++", "-"], input=f"#include <{name}>\n", capture_output=True, text=True,
-        timeout=110, check=False,
+        ["g++", "-std=c++17", _BACKEND, "-E", "-x", "c++", "-"], input=f"#include <{name}>\n",
+        capture_output=True, text=True, timeout=110, check=False,
     )  # fmt: skip
     return found.returncode == 0
 

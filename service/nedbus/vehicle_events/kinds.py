@@ -66,7 +66,8 @@ _STATUS: Final = "VehicleStatus"
 _JAMMED: Final = ("jamming", "spoofing")
 _SENSING: Final = (
     "no_messages", "no_vision", "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided",
-    "aid_rejected", "aid_unused", "vision_unused", "innovation_rejected", "estimator_fault", "ekf_changed", "transition",
+    "aid_rejected", "aid_unused", "vision_unused", "innovation_rejected", "estimator_fault", "ekf_changed",
+    "transition",
 )  # fmt: skip
 _CONTRADICTED: Final = ("height_contradicted", "position_contradicted")
 _INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning", *_CONTRADICTED)

@@ -301,7 +301,8 @@ def _largest_correction(worst: Story, stories: Sequence[Story]) -> Event | None:
 
 def _size(correction: Event) -> float:
     """Return the largest part of a reset or jump [m or m/s]; that of the heading and times do not count."""
-    return max((abs(size) for name, size in correction.numbers.items() if name not in ("heading", "begin")), default=0.0)
+    sizes = [abs(size) for name, size in correction.numbers.items() if name not in ("heading", "begin")]
+    return max(sizes, default=0.0)
 
 
 def _others(

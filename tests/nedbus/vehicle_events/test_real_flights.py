@@ -480,7 +480,9 @@ DECISIVE: Final = {
     "multi_ekf_switch": [
         "Injected: gyro stuck", "primary EKF changed 1 (gyro fault) -> 0", "reset of xy by 1.6 m, vxy by 4.7 m/s",
     ],
-    "twelve_messages": ["GPS fix lost", "Offboard requires local position", "position jumped by 98.0 m without a reset"],
+    "twelve_messages": [
+        "GPS fix lost", "dead reckoning", "Offboard requires local position", "jumped by 98.0 m without a reset",
+    ],
     "fmuv6c_1.17_selector_whipsaw": [
         "primary EKF changed 1 (filter fault) -> 0", "Accel 1 clipping, not safe to fly!",
         "primary EKF changed from 0 to 1",
