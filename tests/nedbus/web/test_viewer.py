@@ -326,7 +326,7 @@ def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
 
 
 def test_attitude_is_shown_as_angles_in_degrees(sim: SimulatedFleet) -> None:
-    """Below the tiles are roll, pitch and yaw of the vehicle's attitude, "-" if it is unknown, with an age if silent."""
+    """Below the tiles are roll, pitch and yaw of the attitude, "-" if it is unknown, with an age if it is silent."""
     attitude = Address("wing", "vehicle_attitude")
     sim.fly(3)
     assert "roll" not in Page(sim).panel("nums")
