@@ -163,14 +163,15 @@ def draw_field_figure(
     drawn, start = _streams(streams)
     marks = _marks(drawn, start / 1e6, events)
     heights = [_PANEL] * len(names)
-    mosaic = [[name] for name in names]
+    mosaic: list[HashableList[str]] = [[name] for name in names]
     if marks:
         heights.append(_FRAME + _ROW * len(marks))
         mosaic.append(["events"])
     figure = Figure(figsize=(_WIDTH, _FRAME + sum(heights)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic(mosaic, height_ratios=heights)
-    first, lowest = axes[names[0]], axes[mosaic[-1][0]]
+    first = axes[names[0]]
+    lowest = axes["events" if marks else names[-1]]
     for panel in axes.values():
         if panel is not first:
             panel.sharex(first)

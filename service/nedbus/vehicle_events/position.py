@@ -29,6 +29,8 @@ _RESETS: Final[Mapping[Quantity, tuple[tuple[str, ...], str]]] = {
     "vz": (("v_up",), "vz by {v_up:z.1f} m/s"),
     "heading": (("heading",), "heading by {degrees:z.0f} deg"),
 }
+_POSITION: Final[tuple[Quantity, ...]] = ("xy", "z")
+_VELOCITY: Final[tuple[Quantity, ...]] = ("vxy", "vz")
 _DIRECTIONS: Final = re.compile(r" \(.*\)")  # in the text of a reset of xy
 _DURATION: Final = re.compile(r" in [\d.]+ s")  # in the text of a jump
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
@@ -159,9 +161,9 @@ def short_text(correction: Event) -> str:
         return _DURATION.sub("", correction.text)
     sizes = _sizes_of(correction)
     parts = []
-    for names in (("xy", "z"), ("vxy", "vz")):
-        size, name = max((sizes.get(name, 0.0), name) for name in names)
-        if size >= SMALL_RESET:
+    for names in _POSITION, _VELOCITY:
+        name = max(names, key=lambda each: sizes.get(each, 0.0))
+        if sizes.get(name, 0.0) >= SMALL_RESET:
             parts.append(_DIRECTIONS.sub("", _describe(name, correction.numbers)))
     return f"reset of {', '.join(parts)}" if parts else correction.text
 
