@@ -21,6 +21,7 @@ KNOWN: Final = {
     _ROOT_ONLY: "CI runs as root",
     f"{_LANGUAGE}[node]": "needs Node.js, and a package from its registry",
     f"{_LANGUAGE}[cargo]": "needs Rust, and packages from its registry",
+    f"{_LANGUAGES}.test_cpp_example::test_example_compiles_with_the_headers_of_zenoh": "needs zenoh-cpp",
     f"{_LANGUAGES}.test_ros2_generator::test_hash_equals_that_of_ros_2": _PACKAGES,
     f"{_LANGUAGES}.test_ros2_generator::test_literal_hash_equals_that_of_libraries": _PACKAGES,
     f"{_LANGUAGES}.test_payloads::test_decoder_of_documentation_returns_every_value": _PACKAGES,

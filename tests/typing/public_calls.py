@@ -99,6 +99,8 @@ def publish(bus: nedbus.Bus) -> None:
     publisher = bus.publisher("external_ins_local_position", vehicle="mine", source="ins")
     publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x=2.0))
     publisher.publish({"timestamp": 1, "x": 2.0})
+    publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x="2"))  # type: ignore[arg-type] # not a number
+    publisher.publish({"timestamp": 1, "x": "2"})  # checked when it is published: a publisher is of any message
     publisher.publish_many(np.zeros(3, nedbus.DTYPE))
     publisher.publish(1.0)  # type: ignore[arg-type] # not a message
     nedbus.VehicleLocalPosition(timestamp=1, X=2.0)  # type: ignore[call-arg] # no such field

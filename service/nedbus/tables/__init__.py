@@ -10,15 +10,15 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .alignment import align
     from .arrays import addresses_of, array_of, array_warnings, missing_of, open_arrays
-    from .plot import MAX_STREAMS, draw
-    from .reading import read, read_positions
+    from .plot import MAX_STREAMS, draw, draw_fields
+    from .reading import read, read_plotted
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "alignment"): "align",
         ("", "arrays"): "addresses_of array_of array_warnings missing_of open_arrays",
-        ("", "reading"): "read read_positions",
-        ("plot", "plot"): "MAX_STREAMS draw",
+        ("", "reading"): "read read_plotted",
+        ("plot", "plot"): "MAX_STREAMS draw draw_fields",
     }
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
 

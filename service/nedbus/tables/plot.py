@@ -1,10 +1,10 @@
-"""Plot of a log or recording: track, height, speed, flags over time, resets, and events."""
+"""Plot of a log or recording: track, height, speed, flags over time, resets, and events; or named fields over time."""
 
 from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -19,7 +19,8 @@ from nedbus.errors import ConfigError, OutputError
 from nedbus.health import SEVERITIES, Event, Times
 from nedbus.vehicle_events import KINDS, Severity, spans_of
 from nedbus_msgs import DEFAULT_TOPIC, Address
-from nedbus_msgs.arrays import MessageArray
+from nedbus_msgs.arrays import MessageArray, derive_column, mask_invalid
+from nedbus_msgs.frames import DERIVED, derived_from
 
 from .arrays import missing_of
 
@@ -30,6 +31,7 @@ _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _DPI: Final = 120
 _WIDTH: Final = 12.0  # inches
 _HEIGHT: Final = 6.0  # inches for track, altitude and speed
+_PANEL: Final = 2.0  # inches for a field
 _ROW: Final = 0.2  # inches per row of flags or events below these
 _FRAME: Final = 0.6  # inches for the title and axis of the rows
 _COLORS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
@@ -88,23 +90,36 @@ def draw(streams: _Arrays, path: Path, *, title: str, events: Iterable[Event] = 
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
+    _save(path, lambda: draw_figure(streams, title=title, events=events, times=times))
+
+
+def draw_fields(
+    streams: _Arrays, names: Sequence[str], path: Path, *, title: str, events: Iterable[Event] = (),
+    times: Times = _BOOT,
+) -> None:  # fmt: skip
+    """Plot fields of up to MAX_STREAMS streams over time, one below the other; also names of `nedbus.frames.DERIVED`.
+
+    Invalid values are gaps. Time axis, events and errors as in `draw`; ConfigError also for a field that no stream has,
+    or that is not a number.
+    """
+    _save(path, lambda: draw_field_figure(streams, names, title=title, events=events, times=times))
+
+
+def _save(path: Path, draw_it: Callable[[], Figure]) -> None:
+    """Save a figure in the format of the file's suffix; nothing is drawn for another suffix."""
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(str(path), f"not an image format; the name must end with {' or '.join(_SUFFIXES)}")
     try:
         # A glyph that the font lacks is only a warning.
         with atomic_write(path, replace=True) as part, warnings.catch_warnings(action="ignore"):
-            draw_figure(streams, title=title, events=events, times=times).savefig(part)
+            draw_it().savefig(part)
     except OSError as exc:
         raise OutputError(path, exc) from exc
 
 
 def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT) -> Figure:
     """Return the figure that `draw` saves."""
-    start = min(int(messages["timestamp"][0]) for _, messages in streams)
-    drawn = [
-        _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
-        for (address, messages), color in zip(streams, _COLORS, strict=False)
-    ]
+    drawn, start = _streams(streams)
     rows, marks = _rows(drawn), _marks(drawn, start / 1e6, events)
     heights = [_FRAME + _ROW * len(each) for each in (rows, marks) if each]
     figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
@@ -141,6 +156,78 @@ def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), t
     if marks:
         _draw_events(figure, axes["events"], marks)
     return figure
+
+
+def draw_field_figure(
+    streams: _Arrays, names: Sequence[str], *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
+) -> Figure:
+    """Return the figure that `draw_fields` saves."""
+    drawn, start = _streams(streams)
+    marks = _marks(drawn, start / 1e6, events)
+    heights = [_PANEL] * len(names)
+    mosaic: list[HashableList[str]] = [[name] for name in names]
+    if marks:
+        heights.append(_FRAME + _ROW * len(marks))
+        mosaic.append(["events"])
+    figure = Figure(figsize=(_WIDTH, _FRAME + sum(heights)), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplot_mosaic(mosaic, height_ratios=heights)
+    first = axes[names[0]]
+    lowest = axes["events" if marks else names[-1]]
+    for panel in axes.values():
+        if panel is not first:
+            panel.sharex(first)
+    for name in names:
+        _draw_field(axes[name], drawn, name)
+    if len(drawn) > 1:
+        first.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
+    lowest.set_xlabel(_label_times(first, drawn, start / 1e6, times))
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may contain any bytes
+    if marks:
+        _draw_events(figure, axes["events"], marks)
+    return figure
+
+
+def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
+    """Plot a field of the streams that have it."""
+    drawn = 0
+    for stream in streams:
+        values = _values_of(stream.messages, name)
+        if values is not None:
+            axes.plot(stream.seconds, values, color=stream.color, linewidth=0.9, label=str(stream.address))
+            drawn += 1
+    if not drawn:
+        known = sorted({each for stream in streams for each in _plottable(stream.messages)})
+        raise ConfigError("--field", f"no selected stream has a number {name!r}; they have {', '.join(known)}")
+    meaning = DERIVED[name].meaning if name in DERIVED else name
+    axes.set_title(meaning, fontsize="medium", loc="right", parse_math=False)
+    axes.grid(alpha=0.3)
+
+
+def _plottable(messages: MessageArray) -> list[str]:
+    """Return the names of the fields with one number or flag each, and of the quantities derived from fields."""
+    names = messages.dtype.names or ()
+    own = [name for name in names if messages.dtype[name].shape == () and messages.dtype[name].kind in "biuf"]
+    return own + derived_from(names)
+
+
+def _values_of(messages: MessageArray, name: str) -> Any:
+    """Return the values of a field, NaN where invalid; None if the messages do not have it."""
+    if name not in _plottable(messages):
+        return None
+    if name in (messages.dtype.names or ()):
+        return mask_invalid(messages)[name]
+    return derive_column(messages, name)
+
+
+def _streams(streams: _Arrays) -> tuple[list[_Stream], int]:
+    """Return the plotted streams, and the time of their first message [us]."""
+    start = min(int(messages["timestamp"][0]) for _, messages in streams)
+    drawn = [
+        _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
+        for (address, messages), color in zip(streams, _COLORS, strict=False)
+    ]
+    return drawn, start
 
 
 def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Times) -> str:

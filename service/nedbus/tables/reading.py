@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Collection, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
@@ -13,7 +13,7 @@ from nedbus.errors import AddressError, SourceError
 from nedbus.flights import ReadOptions, matching, require_one_vehicle, single_match
 from nedbus.log_event import about
 from nedbus.timeline import provides_utc
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import (
@@ -137,12 +137,12 @@ def read_streams(
     return ReadStreams(streams, flight, chosen, unix_times=not is_one_file)
 
 
-def read_positions(paths: Sequence[Path], selection: Selection) -> tuple[Flight, list[Address]]:
-    """Read the positions of one or more files for a plot; return the addresses that a selection chooses.
+def read_plotted(paths: Sequence[Path], selection: Selection, topics: Collection[str]) -> tuple[Flight, list[Address]]:
+    """Read these topics of one or more files for a plot; return the addresses that a selection chooses.
 
     Raises the errors of `read`.
     """
-    topics = DEFAULT.topics.keys()
+    topics = frozenset(topics)
     options = ReadOptions(topics if len(paths) == 1 else topics | _UTC_TOPICS)
     selects = Selection(selection.topics, instance=selection.instance).matches  # a vehicle may have another name here
     flight = open_arrays(paths, options, selects)

@@ -188,8 +188,9 @@ class AidDetector(ChangeDetector):
 
 
 class VisionDetector(ChangeDetector):
-    """Detector for positions sent into the vehicle that its EKF does not fuse at all, by PX4's timestamps alone.
+    """Detector for positions sent into the vehicle: none arrives any more, or the EKF fuses none of them.
 
+    It depends on PX4's timestamps alone.
     `is_fused`: returns whether the EKF fuses any vision, None if unknown, and PX4's time of this state [us].
     `explain`: returns the cause as the end of a sentence, or "".
     """
@@ -198,18 +199,26 @@ class VisionDetector(ChangeDetector):
         super().__init__((), (), detect_nothing)
         self._is_fused, self._explain = is_fused, explain
         self.is_unused = False
+        self.is_missing = False
         self._arriving = 0  # first message after a pause [us]
         self._refused = 0  # first flags that say that no vision is fused [us]
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         super().reset()
-        self.is_unused = False
+        self.is_unused = self.is_missing = False
         self._arriving = self._refused = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding]:
-        """Return the findings in a message."""
+        """Yield the findings in a message."""
         super().add(message, missing)
+        if self.is_missing:
+            self.is_missing = False
+            yield Finding("no_vision", "end", "vision messages resumed")
+        yield from self._check_use()
+
+    def _check_use(self) -> Iterator[Finding]:
+        """Return the begin or end of vision that arrives without being fused."""
         if not self._arriving or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
             self._arriving = self.stamp
         is_fused, stamp = self._is_fused()
@@ -224,8 +233,11 @@ class VisionDetector(ChangeDetector):
         return self._begin((self.stamp - max(self._arriving, self._refused)) / 1e6)
 
     def stop(self) -> Iterator[Finding]:
-        """Return the end of the condition when messages no longer arrive."""
-        return self._end("vision no longer arrives")
+        """Yield the findings when messages no longer arrive."""
+        yield from self._end("vision no longer arrives")
+        if not self.is_missing:
+            self.is_missing = True
+            yield Finding("no_vision", "begin", "no vision message")
 
     def _begin(self, age: float) -> Iterator[Finding]:
         if not self.is_unused and age >= rules.VISION_HOLD:

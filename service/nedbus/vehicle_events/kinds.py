@@ -67,8 +67,9 @@ _GPS: Final = "SensorGps"
 _STATUS: Final = "VehicleStatus"
 _JAMMED: Final = ("jamming", "spoofing")
 _SENSING: Final = (
-    "no_messages", "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided", "aid_rejected",
-    "aid_unused", "vision_unused", "innovation_rejected", "estimator_fault", "ekf_changed", "transition",
+    "no_messages", "no_vision", "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided",
+    "aid_rejected", "aid_unused", "vision_unused", "innovation_rejected", "estimator_fault", "ekf_changed",
+    "transition",
 )  # fmt: skip
 _CONTRADICTED: Final = ("height_contradicted", "position_contradicted")
 _INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning", *_CONTRADICTED)
@@ -117,6 +118,7 @@ _ROWS: Final = (
         "no_messages", "watch", causes=("text", "link_down"), on_ground="info", flags={name: name for name in EVIDENCE},
         begin="no {} message", end="{} messages resumed",
     ),
+    Kind("no_vision", "watch", causes=("text", "link_down", "aid_rejected"), on_ground="info"),
     Kind("text", "watch", "LogMessage", ("no_messages", "ekf_changed"), row="PX4", phase=True, stateless=True),
     Kind(
         "reset", "watch", _ESTIMATE, ("text", *_SENSING, *_INVALID, "origin_set", "origin_moved"), on_ground="info",
@@ -147,8 +149,8 @@ _ROWS: Final = (
     ),
     Kind(
         "not_fused", "watch", _FLAGS,
-        ("no_messages", "gps_fix_lost", "few_satellites", *_JAMMED, "aid_rejected", "innovation_rejected",
-         "estimator_fault"),
+        ("no_messages", "no_vision", "gps_fix_lost", "few_satellites", *_JAMMED, "aid_rejected",
+         "innovation_rejected", "estimator_fault"),
         on_ground="info",
         flags=FUSED, bad=False, minor=frozenset(HEIGHTS), begin="EKF stopped fusing {}", end="EKF started fusing {}",
     ),

@@ -1,6 +1,7 @@
 """Event detector for the position estimate: flags, resets, origin changes and unexplained jumps."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
@@ -28,6 +29,10 @@ _RESETS: Final[Mapping[Quantity, tuple[tuple[str, ...], str]]] = {
     "vz": (("v_up",), "vz by {v_up:z.1f} m/s"),
     "heading": (("heading",), "heading by {degrees:z.0f} deg"),
 }
+_POSITION: Final[tuple[Quantity, ...]] = ("xy", "z")
+_VELOCITY: Final[tuple[Quantity, ...]] = ("vxy", "vz")
+_DIRECTIONS: Final = re.compile(r" \(.*\)")  # in the text of a reset of xy
+_DURATION: Final = re.compile(r" in [\d.]+ s")  # in the text of a jump
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
 _CONTEXT: Final = dict.fromkeys(JUMP_FIELDS, math.nan)  # read when a compared field changes, with their defaults
 
@@ -134,15 +139,33 @@ def _describe(name: Quantity, numbers: Mapping[str, float]) -> str:
     return text.format(**sizes, size=math.hypot(*sizes.values()), degrees=math.degrees(sizes[names[0]]))
 
 
-def large_part(reset: Event) -> str:
-    """Return the text of a reset, without the quantities that a large one moved little."""
-    sizes = {
+def _sizes_of(reset: Event) -> dict[Quantity, float]:
+    """Return the known sizes of a reset [m, m/s], without that of the heading."""
+    return {
         name: math.hypot(*(reset.numbers[each] for each in _RESETS[name][0]))
         for name in _RESETS
         if name != "heading" and name in reset.names and reset.numbers.keys() >= {*_RESETS[name][0]}
     }
+
+
+def large_part(reset: Event) -> str:
+    """Return the text of a reset, without the quantities that a large one moved little."""
+    sizes = _sizes_of(reset)
     large = [name for name, size in sizes.items() if size >= LARGE_CORRECTION]
     return f"reset of {', '.join(_describe(name, reset.numbers) for name in large)}" if large else reset.text
+
+
+def short_text(correction: Event) -> str:
+    """Return a short text of a reset or jump: of a reset, the largest part of position and of velocity."""
+    if correction.kind != "reset":
+        return _DURATION.sub("", correction.text)
+    sizes = _sizes_of(correction)
+    parts = []
+    for names in _POSITION, _VELOCITY:
+        name = max(names, key=lambda each: sizes.get(each, 0.0))
+        if sizes.get(name, 0.0) >= SMALL_RESET:
+            parts.append(_DIRECTIONS.sub("", _describe(name, correction.numbers)))
+    return f"reset of {', '.join(parts)}" if parts else correction.text
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:

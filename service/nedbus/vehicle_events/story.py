@@ -291,6 +291,7 @@ def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> lis
         if other.end is not None and other.until is not None and other.until < span.since - TOGETHER
     }
     near = [event for event in events if span.since - WINDOW <= event.time <= span.since + LATE]
+    near = _without_texts_before_arming(near, span.since)
     causes = [
         cause
         for cause in explain(replace(span.begin, time=span.since), near, held, late=LATE)
@@ -310,6 +311,12 @@ def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> lis
         and (event.severity != "info" or not _is_routine(event))
     ]
     return [event for event in others if event.severity != "info"] or others
+
+
+def _without_texts_before_arming(events: Sequence[Event], time: float) -> list[Event]:
+    """Leave out the texts of failed checks before the arming that precedes `time`: they no longer hold then."""
+    armed = max((event.time for event in events if event.kind == "armed" and event.time <= time), default=-math.inf)
+    return [event for event in events if event.kind != "text" or event.time >= armed or is_alarm(event)]
 
 
 def _is_routine(event: Event) -> bool:
@@ -336,7 +343,10 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _is_part(story: Story, worse: Story) -> bool:
-    """Return True if a story is evidence for a worse one, or a consequence of a bad one; not if it outlasts that."""
+    """Return True if a story is evidence for a worse one, or its consequence; not if it outlasts that.
+
+    What corrected the estimate is a consequence only of a bad one.
+    """
     begin = story.spans[0].begin
     is_bad_estimate = story.is_bad and story.spans[0].is_of_estimate
     outlasts = worse.until is not None and (
@@ -346,9 +356,11 @@ def _is_part(story: Story, worse: Story) -> bool:
         return False
     if begin in worse.before and story.kind in KINDS[worse.kind].causes:
         return True
-    if not worse.is_bad or begin not in (*worse.meanwhile, *worse.after):
+    if begin not in (*worse.meanwhile, *worse.after):
         return False
     is_consequence = worse.kind in KINDS[story.kind].causes
+    if not worse.is_bad:
+        return is_consequence and not KINDS[story.kind].correction
     is_alarm_of_sensor = story.kind == "text" and _SENSOR_FAILURE.search(begin.text) is not None
     return is_consequence or (not is_alarm_of_sensor and (story.kind == "text" or not story.is_bad))
 

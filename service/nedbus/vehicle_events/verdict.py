@@ -12,8 +12,8 @@ from nedbus.clock import format_duration
 
 from .event import ALL, WINDOW, Condition, Event
 from .kinds import KINDS, importance
-from .position import large_part
-from .rules import POSITIONS, SUBJECTS
+from .position import large_part, short_text
+from .rules import LARGE_CORRECTION, POSITIONS, SUBJECTS
 from .story import TOGETHER, Story, is_alarm, stories_of
 from .times import Times
 
@@ -58,8 +58,8 @@ class _Parts:
     """The parts of a verdict's text; `render` joins as many as fit into three lines, each of them whole.
 
     `state`: the worst fault and its period. `evidence`: most important first. `missing`: topics that may hold more.
-    `none`: says that there is no evidence. `others`: the other faults, most important first; `is_another_bad`: the
-    first of them is bad.
+    `none`: says that there is no evidence. `others`: what else happened, most important first; `is_other_urgent`:
+    the first of them is bad, or a large correction.
     """
 
     state: str
@@ -67,7 +67,7 @@ class _Parts:
     none: str = ""
     missing: str = ""
     others: tuple[str, ...] = ()
-    is_another_bad: bool = False
+    is_other_urgent: bool = False
 
     def render(self, times: Times) -> str:
         chosen: list[Event] = []
@@ -108,7 +108,7 @@ class _Parts:
 
         is_quoted_only = all(event.kind == "text" for event in self.evidence)
         add_evidence(self.evidence[:1] if is_quoted_only else self.evidence[:2])
-        if self.is_another_bad:
+        if self.is_other_urgent:
             add_others(self.others[:1])
         if is_quoted_only:
             add_missing()
@@ -166,9 +166,14 @@ def verdict_of(
     none = f"No evidence in the {WINDOW:.0f} s before." if worst.begin and worst.is_bad and not cause else ""
     missing = f"Not in the data: {', '.join(worst.lacking)}." if worst.lacking and (worst.is_bad or not cause) else ""
     state = f"{head}{_what(worst)}{_count(worst, stories)} {worst.when(times, end)}."
-    others = tuple(_others(worst, ranked, cause, stories, times))
-    is_another_bad = sum(story.is_bad for story in stories) > 1
-    text = _Parts(state, tuple(ordered), none, missing, others, is_another_bad).render(times)
+    others = _others(worst, ranked, cause, stories, times)
+    is_other_urgent = sum(story.is_bad for story in stories) > 1
+    correction = _largest_correction(worst, stories)
+    if correction is not None:
+        after_bad_one = 1 if is_other_urgent else 0
+        others.insert(after_bad_one, f"{times.text(correction)} {short_text(correction)}")
+        is_other_urgent = True
+    text = _Parts(state, tuple(ordered), none, missing, tuple(others), is_other_urgent).render(times)
     return Verdict(text, usable, vehicle, times, end, worst.begin, worst.end, cause, tuple(stories))
 
 
@@ -256,7 +261,7 @@ def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]
         if not any(_is_same(text, other) for other in said):
             said.append(text)
     said = said[:_MAX_TEXTS]
-    shown = [event for event in causes if not any(_repeats(text, event) for text in said)]
+    shown = [event for event in causes if not any(_repeats(other, event) for other in (*said, *causes))]
     of_worst = _subjects(worst.what)
     shown.sort(key=lambda event: (of_worst.isdisjoint(_subjects(event.text)), importance(event.kind), -event.time))
     shown = shown[:_MAX_CAUSES]
@@ -276,9 +281,30 @@ def _is_same(text: Event, other: Event) -> bool:
     return all(re.search("inject", each.text, re.IGNORECASE) for each in (text, other))
 
 
-def _repeats(text: Event, event: Event) -> bool:
-    """Return whether a text of PX4 reports an event of nedbus, with its reason."""
-    return event.kind == "ekf_changed" and "primary EKF changed" in text.text and abs(text.time - event.time) < TOGETHER
+def _repeats(other: Event, event: Event) -> bool:
+    """Return whether another event says more about the same: PX4's text on an EKF, or a lost fix on its satellites."""
+    if abs(other.time - event.time) >= TOGETHER:
+        return False
+    if event.kind == "ekf_changed":
+        return other.kind == "text" and "primary EKF changed" in other.text
+    return event.kind == "few_satellites" and other.kind == "gps_fix_lost" and "satellites" in other.text
+
+
+def _largest_correction(worst: Story, stories: Sequence[Story]) -> Event | None:
+    """Return the largest reset or jump of at least LARGE_CORRECTION during a fault or at its end, no story itself."""
+    begins = [story.begin for story in stories]
+    corrections = [
+        event
+        for event in (*worst.meanwhile, *worst.after)
+        if event.kind in ("reset", "jump") and event not in begins and _size(event) >= LARGE_CORRECTION
+    ]
+    return max(corrections, key=_size, default=None)
+
+
+def _size(correction: Event) -> float:
+    """Return the largest part of a reset or jump [m or m/s]; that of the heading and times do not count."""
+    sizes = [abs(size) for name, size in correction.numbers.items() if name not in ("heading", "begin")]
+    return max(sizes, default=0.0)
 
 
 def _others(
@@ -294,7 +320,8 @@ def _others(
         if story is worst or story.kind == worst.kind != "text" or story.begin is None or story.begin in cause:
             continue
         if story.kind != worst.kind or is_alarm(story.begin):
-            parts.append(f"{times.text(story.begin)} {_what(story)}{_count(story, stories)}")
+            what = short_text(story.begin) if KINDS[story.kind].correction else _what(story)
+            parts.append(f"{times.text(story.begin)} {what}{_count(story, stories)}")
     return parts
 
 

@@ -80,6 +80,11 @@ class VehicleView:
     fusion: Fusion | None = None
 
     @property
+    def attitude(self) -> StreamView | None:
+        """The stream of its attitude, None if it sends none."""
+        return next((stream for stream in self.streams if stream.address.topic == "vehicle_attitude"), None)
+
+    @property
     def grade(self) -> str:
         """The severity of the state, with "ok" for "info"."""
         return "ok" if self.state.severity == "info" else self.state.severity

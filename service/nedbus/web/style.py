@@ -12,6 +12,7 @@ import jinja2
 
 from nedbus.clock import format_duration
 from nedbus.health import describe_stream
+from nedbus_msgs.frames import derive
 
 from .fleet import MAX_STREAMS
 from .stream import is_position
@@ -50,7 +51,7 @@ def panels() -> jinja2.Template:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=format_duration, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)
-    environment.globals.update(MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, describe=describe_stream, hypot=math.hypot)
+    environment.globals.update(MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, describe=describe_stream, derive=derive)
     return environment.from_string(re.sub(r"(?<=[>}])\n\s*(?=[<{])", "", read_asset("panels.html")))
 
 

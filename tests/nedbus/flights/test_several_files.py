@@ -14,7 +14,7 @@ import pytest
 import nedbus
 from nedbus.errors import SourceError
 from nedbus.flights import read_file_events
-from nedbus.tables import array_of, read_positions
+from nedbus.tables import array_of, read_plotted
 from nedbus.web.playback import Recording
 from nedbus_msgs import Selection
 from tests.flights.messages import VALID, VLP, message
@@ -92,7 +92,7 @@ def test_files_of_one_name_have_distinct_vehicles(tmp_path: Path) -> None:
 
 def test_plot_of_one_vehicle_among_several_files(swarm: list[str], tmp_path: Path) -> None:
     """A vehicle that several files have is plotted by the name that the warnings and `read` give it."""
-    flight, addresses = read_positions([Path(path) for path in swarm], Selection(VLP, vehicle="b"))
+    flight, addresses = read_plotted([Path(path) for path in swarm], Selection(VLP, vehicle="b"), [VLP])
     assert [str(address) for address in addresses] == [f"b/{VLP}"]
     (messages, _) = array_of(flight, addresses[0], unix_times=True)
     assert messages["timestamp"][0] == EPOCH + 60_000_000

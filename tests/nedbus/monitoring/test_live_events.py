@@ -10,9 +10,10 @@ from nedbus import Address
 from nedbus.client import QueryServer, reply_parts
 from nedbus.monitoring import LinkLosses
 from nedbus.transport import Session
-from nedbus.vehicle_events import EventLog, report_of
+from nedbus.vehicle_events import Event, EventLog, report_of
 from nedbus_msgs import status_key
 from tests.flights.messages import VLP, message
+from tests.waits import wait_for
 
 
 def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_session: Session) -> None:
@@ -31,11 +32,18 @@ def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_
 
     with closing(server):
         lose(100)
+        wait_for(bus.accounts, what="the router to know the service")
         losses = LinkLosses(bus)
         lose(150)
-        losses._next_query = 0.0
-        shown = losses.poll()
-        again = losses.poll()
+
+        shown = list[Event]()
+
+        def poll() -> int:
+            losses._next_query = 0.0
+            shown.extend(losses.poll())
+            return len(shown)
+
+        wait_for(poll, what="the losses")
+        poll()
     text = f"800 messages lost in 7.0 s ({VLP}), on the link to the service gcs"
     assert [(event.vehicle, event.text, event.time) for event in shown] == [("7", text, 1.7e9 + 150)]
-    assert again == []

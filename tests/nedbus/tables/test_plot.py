@@ -235,6 +235,39 @@ def test_events_of_each_vehicle_have_their_own_rows() -> None:
     assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 3.0), (0.0, 5.0)])
 
 
+def test_fields_are_drawn_by_name() -> None:
+    """Fields and derived quantities have one panel each, on one time axis with the events; invalid values are gaps."""
+    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)
+    address, array = flight_of()
+    array["z_valid"][:10] = False
+    events = [event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",))]
+    figure = plot.draw_field_figure([(address, array)], ["z", "height", "speed"], title="a", events=events)
+    parts = {str(axes.get_label()): axes for axes in figure.axes}
+    assert list(parts) == ["z", "height", "speed", "events"]
+    z, height, speed = (parts[name].lines[0].get_ydata() for name in ("z", "height", "speed"))
+    assert np.isnan(z[:10]).all()
+    assert np.array_equal(z[10:], array["z"][10:])
+    assert np.array_equal(height, -z, equal_nan=True)
+    assert np.allclose(speed, 1.0)
+    assert "above the origin of the local frame [m]" in parts["height"].get_title("right")
+    with pytest.raises(nedbus.ConfigError, match=r"no selected stream has a number 'delta_xy'; they have .*speed"):
+        plot.draw_field_figure([(address, array)], ["delta_xy"], title="a")
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not REAL, reason="no real logs")
+def test_plot_command_draws_angles(tmp_path: Path) -> None:
+    """`nedbus plot --field` draws the angles of attitudes; without it, their topic has no track."""
+    pytest.importorskip("matplotlib")
+    log, picture = LOGS.parent / "px4" / "ev_right.ulg", tmp_path / "a.png"
+    command = "plot", str(log), "-t", "vehicle_attitude", "-o", str(picture)
+    plotted = run_command(*command, "--field", "roll_deg,yaw")
+    assert plotted.exit_code == 0, plotted.err
+    assert picture.stat().st_size > 10_000
+    assert "name fields with --field" in run_command(*command).err
+    assert "unknown field 'rol_deg'" in run_command(*command, "--field", "rol_deg").err
+
+
 @pytest.mark.slow
 def test_plot_command_marks_events(tmp_path: Path) -> None:
     """`nedbus plot` marks the events of a simulated loss of GPS."""

@@ -1023,6 +1023,28 @@ def test_rejected_and_unused_measurements_are_conditions() -> None:
     assert [event.text for event in reported] == ["EKF no longer receives vision position after 1.9 s"]
 
 
+@pytest.mark.parametrize(("state", "severity"), [(ARMED, "watch"), (DISARMED, "info")])
+def test_vision_that_stops_is_a_condition_until_it_resumes(state: int, severity: str) -> None:
+    """Vision of which no message arrives for a second is a condition that began at its last message."""
+    flight = Flight()
+    flight.status(state)
+
+    def fly(seconds: float, *, with_vision: bool) -> list[tuple[str, str, float]]:
+        reported: list[Event] = []
+        for _ in range(round(seconds * 10)):
+            flight.wait(0.1).send()
+            if with_vision:
+                reported += flight.send("vehicle_visual_odometry")
+            reported += flight.update()
+        return [(event.text, event.severity, round(flight.now - event.time, 1)) for event in reported]
+
+    assert fly(3, with_vision=False) == fly(3, with_vision=True) == fly(0.9, with_vision=False) == []
+    assert fly(0.5, with_vision=False) == [("no vision message", severity, 1.4)]
+    [resumed] = fly(0.1, with_vision=True)
+    assert resumed[:2] == ("vision messages resumed after 1.5 s", "info")
+    assert fly(2, with_vision=True) == []
+
+
 def test_measurement_of_another_ekf_is_ignored() -> None:
     """Only the primary EKF's measurements count."""
     flight = Flight()

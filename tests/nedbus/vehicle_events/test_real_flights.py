@@ -60,7 +60,7 @@ TRACKED: Final = {
 }  # fmt: skip
 NOT_IN_TABLE: Final = (
     "dropout", "text", "ekf_changed", "other_ekf", "height_contradicted", "position_contradicted", "no_messages",
-    "aid_rejected", "aid_unused", "vision_unused", "vehicle_type", "transition", "origin_contradicted",
+    "aid_rejected", "aid_unused", "vision_unused", "no_vision", "vehicle_type", "transition", "origin_contradicted",
 )  # fmt: skip
 RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # PX4 1.15 name: current name
 
@@ -468,15 +468,21 @@ FIRST_SENTENCES: Final = {
     "gps_off_in_flight": "not usable: xy and vxy not valid from 08:30:07.2 UTC, until the end (11.0 s).",
     "mag_failure": "position valid throughout, but no magnetometer message (one of 2) from 22:12:57.6 to 22:13:11.3",
     "multi_ekf_switch": 'position valid throughout, but PX4: "Attitude failure detected" at 22:12:07.7 UTC.',
+    "twelve_messages": "not usable: xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s).",
     "fmuv6c_1.17_selector_whipsaw": "not usable: reset of height by -129.8 m, vz by -33.5 m/s (one of 23) at 16:25",
 }  # fmt: skip
 DECISIVE: Final = {
     "baro_failure": ["Injected: baro off", "Baro sensor #0 failure: Timeout"],
     "ev_refused": ["stopped fusing vision position", "vision arrives, but the EKF does not fuse it"],
-    "ev_right": ["stopped fusing vision position", "reset of xy by 2.2 m"],
+    "ev_right": ["no vision message; 22:11:51.6 EKF stopped fusing vision position", "reset of xy by 2.2 m"],
     "gps_off_in_flight": ["no GPS message", "gps off", "dead reckoning"],
     "mag_failure": ["mag off", "Magnetometer sensor #0 failure: Timeout"],
-    "multi_ekf_switch": ["Injected: gyro stuck", "primary EKF changed 1 (gyro fault) -> 0"],
+    "multi_ekf_switch": [
+        "Injected: gyro stuck", "primary EKF changed 1 (gyro fault) -> 0", "reset of xy by 1.6 m, vxy by 4.7 m/s",
+    ],
+    "twelve_messages": [
+        "GPS fix lost", "dead reckoning", "Offboard requires local position", "jumped by 98.0 m without a reset",
+    ],
     "fmuv6c_1.17_selector_whipsaw": [
         "primary EKF changed 1 (filter fault) -> 0", "Accel 1 clipping, not safe to fly!",
         "primary EKF changed from 0 to 1",
@@ -492,6 +498,20 @@ def test_verdict_begins_with_what_a_pilot_must_know(name: str) -> None:
     evidence = found.text.partition("Evidence")[2]
     assert all(words in evidence for words in DECISIVE[name])
     assert "..." not in found.text
+
+
+@pytest.mark.parametrize(("name", "number"), [("baro_failure", 1), ("mag_failure", 2)])
+def test_failing_sensor_is_one_fault(name: str, number: int) -> None:
+    """PX4's text about a failed sensor belongs to the fault of its missing messages, and is in its details."""
+    stories = verdict(path_of(name)).stories
+    assert [story.kind for story in stories] == ["no_messages"] * number
+    assert all(any(is_alarm(event) for event in story.meanwhile) for story in stories)
+
+
+def test_failed_checks_from_before_arming_explain_no_change_in_flight() -> None:
+    """A change of the EKF 6 s after arming is not explained by what PX4 reported on the ground before."""
+    switch = next(story for story in verdict(path_of("multi_ekf_switch")).stories if story.kind == "ekf_changed")
+    assert [event.kind for event in switch.before] == ["origin_set"]
 
 
 def test_vision_that_is_not_fused_is_an_event() -> None:

@@ -370,7 +370,8 @@ def test_shortened_evidence_prefers_sensor_events() -> None:
         flight.wait(1.0).send()
     text = verdict(flight).text
     assert "(one of 3)" in text
-    assert "only 0 satellites, dead reckoning" in text
+    assert "satellites 12 to 0, dead reckoning" in text
+    assert "only 0 satellites" not in text, "the lost fix says it"
     assert text.index("GPS fix lost") < text.index("dead reckoning")
 
 
@@ -559,6 +560,50 @@ def test_large_reset_is_a_recovery_for_a_second_after_an_invalid_estimate(tenths
     flight.wait(0.1).send(x=20.0, xy_reset_counter=1)
     [reset] = [event for event in flight.event_log.events if event.kind == "reset"]
     assert reset.severity == severity
+
+
+@pytest.mark.parametrize(("distance", "is_named"), [(20.0, True), (9.0, False)])
+def test_large_correction_at_the_end_of_a_fault_is_named(distance: float, *, is_named: bool) -> None:
+    """A reset of 10 m or more that recovers an invalid estimate is no fault, but in the verdict, by its size."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.fly(2)
+    for _ in range(10):
+        flight.wait(0.1).send(xy_valid=False)
+    for _ in range(10):
+        flight.wait(0.1).send(x=distance, xy_reset_counter=1)
+    found = verdict(flight)
+    assert [story.kind for story in found.stories] == ["xy_invalid"]
+    assert (f" reset of xy by {distance:.1f} m." in found.text) == is_named
+
+
+def test_reset_during_a_lesser_fault_stays_a_fault() -> None:
+    """What corrected the estimate is not part of a fault that left it sound, unlike other consequences of that."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.send("estimator_status_flags", instance=0, cs_ev_pos=True)
+    flight.fly(2)
+    flight.wait(0.1).send(dead_reckoning=True)
+    flight.wait(0.1).send(dead_reckoning=True, x=2.0, xy_reset_counter=1)
+    flight.send("failsafe_flags", local_position_invalid=False)
+    for _ in range(10):
+        flight.wait(0.1).send(x=2.0, xy_reset_counter=1)
+    assert [story.kind for story in verdict(flight).stories] == ["dead_reckoning", "reset"]
+
+
+def test_text_from_before_arming_is_no_evidence() -> None:
+    """A failed check of the ground explains nothing in flight, unlike a text about a failed sensor."""
+    flight = Flight()
+    flight.status(DISARMED)
+    flight.fly(1)
+    px4_text(flight, "No heading reference")
+    px4_text(flight, "Baro sensor #0 failure: Timeout")
+    flight.wait(1.0).status(ARMED)
+    flight.fly(2)
+    for _ in range(10):
+        flight.wait(0.1).send(dead_reckoning=True)
+    [story] = [story for story in verdict(flight).stories if story.kind == "dead_reckoning"]
+    assert [event.text for event in story.before] == ["Baro sensor #0 failure: Timeout"]
 
 
 def test_fault_in_flight_leads_before_one_on_the_ground() -> None:

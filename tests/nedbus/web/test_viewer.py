@@ -325,6 +325,21 @@ def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
         assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.panel("nums")
 
 
+def test_attitude_is_shown_as_angles_in_degrees(sim: SimulatedFleet) -> None:
+    """Below the tiles are roll, pitch and yaw of the attitude, "-" if it is unknown, with an age if it is silent."""
+    attitude = Address("wing", "vehicle_attitude")
+    sim.fly(3)
+    assert "roll" not in Page(sim).panel("nums")
+    turned = nedbus.frames.euler_to_quaternion(*(math.radians(degrees) for degrees in (10.0, -20.0, 90.0)))
+    for q, text in ((turned, "roll 10.0°, pitch -20.0°, yaw 90.0°"), ((math.nan,) * 4, "roll -, pitch -, yaw -")):
+        for _ in range(20):
+            sim.fly(0.1)
+            sim.add(attitude, q=q)
+        assert f'<div class="quiet">{text}</div>' in Page(sim).panel("nums")
+    sim.fly(10)
+    assert "yaw -, 10.0 s ago</div>" in Page(sim).panel("nums")
+
+
 def test_rates_of_a_slow_stream_are_shown_below_the_numbers(sim: SimulatedFleet) -> None:
     """If positions arrive at less than half the usual rate, both rates are shown below the numbers."""
     sim.fly(20, rate=20)

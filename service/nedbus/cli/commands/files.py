@@ -7,7 +7,7 @@ import typer
 
 import nedbus
 from nedbus import tables
-from nedbus.cli.options import InstanceOption, VehiclesOption, command
+from nedbus.cli.options import InstanceOption, VehiclesOption, command, parse_fields
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.output.table import show_progress
 from nedbus.errors import ConfigError, SourceError
@@ -16,6 +16,7 @@ from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 _FLIGHTS: Final = ".ulg, .mcap or .tlog files; several are merged by UTC"
 _IMAGE: Final = "Image to write (default: next to the flight)"
+_PLOTTED: Final = "Fields to plot over time, or height, speed, roll_deg, ..."
 FlightsArgument = Annotated[list[Path], typer.Argument(metavar="FLIGHT", help=_FLIGHTS, show_default=False)]
 
 
@@ -53,14 +54,17 @@ def plot(
     topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
     vehicle: VehiclesOption = None,
     instance: InstanceOption = None,
+    field: Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help=_PLOTTED)] = None,
 ) -> None:
-    """Plot flights: track, altitude, speed, flags, resets and events."""
+    """Plot flights: track, height, speed, flags, resets and events; or fields over time."""
     draw, limit = tables.draw, tables.MAX_STREAMS
     selection, name = Selection(topic, vehicle or ANY, instance), ", ".join(map(str, sources))
-    if topic not in (ANY, *DEFAULT.topics):
-        table = f'nedbus.read("{sources[0]}", "{topic}", dataframe="pandas")'
-        raise ConfigError("--topic", f"{topic} has no track; plot {' or '.join(DEFAULT.topics)}, or read it: {table}")
-    flight, selected = tables.read_positions(sources, selection)
+    fields = parse_fields(field, selection)
+    is_position = topic in (ANY, *DEFAULT.topics)
+    if not fields and not is_position:
+        positions = " or ".join(DEFAULT.topics)
+        raise ConfigError("--topic", f"{topic} has no track; name fields with --field, or plot {positions}")
+    flight, selected = tables.read_plotted(sources, selection, DEFAULT.topics if is_position else [topic])
     if len(selected) > limit:
         write_stderr(f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i")
     streams = []
@@ -77,7 +81,11 @@ def plot(
     held = (condition for vehicle in history.vehicles.values() for condition in vehicle.held)
     initial = [condition.begin for condition in held if condition.initial and not KINDS[condition.kind].usual]
     events = [*dict.fromkeys(initial), *history.events]
-    draw(streams, target, title=", ".join(each.name for each in sources), events=events, times=history.times)
+    title = ", ".join(source.name for source in sources)
+    if fields:
+        tables.draw_fields(streams, fields, target, title=title, events=events, times=history.times)
+    else:
+        draw(streams, target, title=title, events=events, times=history.times)
     write(str(target))
     _require_undamaged(flight.damaged, sources, "plotted")
 
