@@ -264,10 +264,14 @@ class _Track(Generic[M]):
             return len(items) > 1 or (is_end and is_same and first.stamp - self.newest <= _MAX_LAST)
         if len(items) == 1:
             return False
+        set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
         if first.log is None or self.log is None:  # a log: a few streams may have waited in a queue
-            set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
             return len(set_back) >= min(_AGREEING, len(self.last))
-        if is_unix or self.is_unix:
+        if is_unix != self.is_unix:
+            return True
+        if not set_back:  # streams that appear now, which were late
+            return False
+        if is_unix:
             return True
         elapsed = first.log - self.log
         return elapsed < 0 or is_boot_possible(first.stamp, elapsed / 1e6)
