@@ -270,8 +270,10 @@ class _Track(Generic[M]):
         if is_ahead:
             is_same = is_unix == self.is_unix
             return len(items) > 1 or (is_end and is_same and first.stamp - self.newest <= _MAX_LAST)
-        if len(items) == 1:
-            return False
+        return len(items) > 1 and self._may_have_gone_back(items, first, is_unix=is_unix)
+
+    def _may_have_gone_back(self, items: Sequence[_Item[M]], first: _Item[M], *, is_unix: bool) -> bool:
+        """Return whether the vehicle may have rebooted, or its Unix time may have been set back."""
         set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
         if first.log is None or self.log is None:  # a log: a few streams may have waited in a queue
             return len(set_back) >= min(_AGREEING, len(self.last))

@@ -461,7 +461,7 @@ def test_origin_beyond_the_antimeridian_is_wrapped(direction: int) -> None:
     """An origin that PX4 up to 1.15 sets beyond 180 degrees is wrapped, and has not moved if it is sent wrapped."""
     flight = Flight()
     flight.send(xy_global=False, z_global=False)
-    origin = {"xy_global": True, "z_global": True, "ref_lat": -17.0, "ref_alt": 488.0}
+    origin: dict[str, Any] = {"xy_global": True, "z_global": True, "ref_lat": -17.0, "ref_alt": 488.0}
     reported = flight.wait(0.1).send(**origin, ref_lon=direction * 180.5)
     [event] = [event for event in reported if event.kind == "origin_set"]
     assert event.text == f"origin set at -17.000000, {direction * -179.5:.6f}"
