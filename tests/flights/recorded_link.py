@@ -73,12 +73,16 @@ def play(path: Path, options: MavlinkOptions) -> Iterator[tuple[float, SourceMes
 
 
 class Service:
-    """A service without a network that receives a recording; `start`, `now`: times in it [s]."""
+    """A service without a network that receives a recording.
+
+    `start`, `now`: times in it [s]. `rejected`: reports of rejected messages.
+    """
 
     def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
         self.now = self.start = 0.0
         self.event_log = EventLog()
-        registry = SimpleNamespace(publisher=self._open, reject=lambda *_: None)
+        self.rejected: list[object] = []
+        registry = SimpleNamespace(publisher=self._open, reject=lambda _, report: self.rejected.append(report))
         self.output = SourceOutput("udp", "mavlink:udp", cast("PublisherRegistry", registry), self._now, self.event_log)
         monkeypatch.setattr(clock, "steady", self._now)
         self._items = play(path, MavlinkOptions.model_validate({"log": "armed", "state": "0"} | options))

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from nedbus.samples import PositionStatus, Sample
 from nedbus_msgs import FieldReader
@@ -54,10 +54,6 @@ _MAX_MESSAGES: Final = 400  # in the window
 _UNSUPPORTED: Final = "ODOMETRY: unsupported"  # PX4's text
 
 _read_aid: Final = FieldReader(("timestamp", "fused", "innovation_rejected", "test_ratio", "estimator_instance"))
-_read_echo: Final = FieldReader((
-    "timestamp", "timestamp_sample", "pose_frame", "velocity_frame", "velocity", "q", "position_variance",
-    "reset_counter", "quality",
-))  # fmt: skip
 _FLAG_NAMES: Final = {name: f"cs_ev_{short}" for name, short in QUANTITIES.items()}
 _read_flags: Final = FieldReader(("timestamp", *_FLAG_NAMES.values()))
 _read_estimate: Final = FieldReader(("timestamp", "eph", "xy_valid"))
@@ -65,6 +61,23 @@ _read_bias: Final = FieldReader(("timestamp", "bias"))
 _read_primary: Final = FieldReader(("timestamp", "primary_instance"))
 _read_text: Final = FieldReader(("timestamp", "text"))
 _read_time: Final = FieldReader(("timestamp",))
+
+
+class _Received(NamedTuple):
+    """The fields of a position that PX4 received, as it publishes them in vehicle_visual_odometry."""
+
+    timestamp: Any
+    timestamp_sample: Any
+    pose_frame: Any
+    velocity_frame: Any
+    velocity: Any
+    q: Any
+    position_variance: Any
+    reset_counter: Any
+    quality: Any
+
+
+_read_received: Final = FieldReader(_Received._fields)
 
 
 @dataclass(slots=True)
@@ -94,7 +107,7 @@ class FusionTracker:
         self._aids = {name: _Aid() for name in QUANTITIES}
         self._echo_times: deque[int] = deque(maxlen=_MAX_MESSAGES)
         self._changes: deque[int] = deque(maxlen=_CONFIRMED)  # times at which reset_counter changed
-        self._echo: tuple[Any, ...] = ()
+        self._received: _Received | None = None  # the last message of _ECHO
         self._mocap = self._unsupported = 0  # time of the last one
         self._newest_sample = 0  # the largest timestamp_sample since boot
         self._ahead = 0.0  # how far it was ahead when it arrived [s]
@@ -145,7 +158,8 @@ class FusionTracker:
         Two messages in a row show a reboot, or a pause of the data: a single one may be damaged, or late.
         """
         is_odd = topic in _PERIODIC and not self.now - _REBOOT <= time <= self.now + _PAUSE
-        was_odd, self._is_odd = self._is_odd, is_odd and bool(self.now)
+        was_odd = self._is_odd
+        self._is_odd = is_odd and bool(self.now)
         if not self._is_odd:
             self.now = max(self.now, time) if topic in _PERIODIC else self.now
             return True
@@ -169,12 +183,13 @@ class FusionTracker:
         aid.ratio = _largest(ratio)
 
     def _add_echo(self, message: object) -> None:
-        before, self._echo = self._echo, _read_echo(message)
-        time, sample = self._echo[:2]
+        before = self._received
+        self._received = received = _Received._make(_read_received(message))
+        time, sample = received.timestamp, received.timestamp_sample
         if self._echo_times and time - self._echo_times[-1] > _SILENCE:
             self._echo_times.clear()
         self._echo_times.append(time)
-        if before and before[7] != self._echo[7]:
+        if before is not None and before.reset_counter != received.reset_counter:
             self._changes.append(time)
         if isinstance(sample, int) and sample > self._newest_sample:
             self._newest_sample, self._ahead = sample, (sample - time) / 1e6
@@ -234,7 +249,9 @@ class FusionTracker:
             cause = cause_of(name, states, aid.ratio, echo)
             since = aid.since / 1e6 if aid.since and aid.state != "unknown" else None
             quantities.append(QuantityFusion(name, aid.state, since, aid.ratio, cause))
-        variance = _number(self._echo[6][0]) if echo.is_echoed and self._echo[6] else math.nan
+        variance = math.nan
+        if echo.is_echoed and self._received is not None and self._received.position_variance:
+            variance = _number(self._received.position_variance[0])
         return Fusion(
             vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias,
             tuple(self._remarks(states, variance, is_sent=bool(echo.is_sent))), tuple(self._missing(echo)),
@@ -255,18 +272,21 @@ class FusionTracker:
     def _describe_echo(self, sent: PositionStatus | None) -> Echo:
         is_mocap, is_unsupported = self._is_recent(self._mocap), self._is_recent(self._unsupported, _TEXT_TIME)
         is_sent = None if sent is None else sent.rate > 0
-        if not self._echo or not self._is_recent(self._echo_times[-1]):
+        received = self._received
+        if received is None or not self._is_recent(self._echo_times[-1]):
             return Echo(is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent)
-        time, sample, pose_frame, velocity_frame, velocity, q, _, _, quality = self._echo
+        age = 0.0
+        if received.timestamp_sample:
+            age = (received.timestamp - received.timestamp_sample) / 1e6
         times = [each for each in self._echo_times if each >= self.now - _WINDOW - _SILENCE]
         rate = (len(times) - 1) / max(1e-6, (times[-1] - times[0]) / 1e6) if len(times) > 1 else math.nan
         is_ahead = self._newest_sample > self.now + _AHEAD
         is_counting = len(self._changes) == _CONFIRMED and self._changes[0] > self.now - _WINDOW
         return Echo(
             is_echoed=True, is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent, rate=rate,
-            pose_frame=pose_frame, velocity_frame=velocity_frame, has_velocity=_is_known(velocity),
-            norm_error=_norm_error(q), age=(time - sample) / 1e6 if sample else 0.0,
-            ahead=self._ahead if is_ahead else 0.0, counts_messages=is_counting, quality=quality,
+            pose_frame=received.pose_frame, velocity_frame=received.velocity_frame,
+            has_velocity=_is_known(received.velocity), norm_error=_norm_error(received.q), age=age,
+            ahead=self._ahead if is_ahead else 0.0, counts_messages=is_counting, quality=received.quality,
         )  # fmt: skip
 
     def _remarks(self, states: Mapping[str, State], variance: float, *, is_sent: bool) -> list[str]:

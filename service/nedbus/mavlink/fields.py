@@ -16,6 +16,8 @@ _FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: sta
 _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # 12: body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
+_TRANSITIONS: Final = {dialect.MAV_VTOL_STATE_TRANSITION_TO_FW, dialect.MAV_VTOL_STATE_TRANSITION_TO_MC}
+_VTOL_STATES: Final = {*_TRANSITIONS, dialect.MAV_VTOL_STATE_FW, dialect.MAV_VTOL_STATE_MC}
 
 
 def _number(value: int, unit: float, *unknown: int) -> float | None:
@@ -46,7 +48,9 @@ def _attitude(message: Any) -> dict[str, object]:
 
 
 def _home(message: Any) -> dict[str, object]:
-    """Convert HOME_POSITION, which PX4 sends only with a valid global position."""
+    """Convert HOME_POSITION, which PX4 sends only with a valid global position; other programs send zeros before."""
+    if not (message.latitude or message.longitude):
+        return {}
     q = _quaternion(*message.q)
     angles = (None, None, None) if q is None else quaternion_to_euler(q)
     local = (each if math.isfinite(each) else None for each in (message.x, message.y, message.z))
@@ -85,6 +89,23 @@ def _status(message: Any) -> dict[str, object]:
         "system_type": message.type,
         "system_id": message.get_srcSystem(), "component_id": message.get_srcComponent(),
     }  # fmt: skip
+
+
+def vtol_status(state: int) -> dict[str, object]:
+    """Return what the `vtol_state` of EXTENDED_SYS_STATE adds to the status of a VTOL; {} if it is undefined.
+
+    During a transition PX4's Commander reports a rotary wing (`Commander::vtolStatusUpdate`).
+    """
+    if state not in _VTOL_STATES:
+        return {}
+    model = MESSAGES["VehicleStatus"].model
+    is_fixed_wing = state == dialect.MAV_VTOL_STATE_FW
+    return {
+        "is_vtol": True,
+        "vehicle_type": model.VEHICLE_TYPE_FIXED_WING if is_fixed_wing else model.VEHICLE_TYPE_ROTARY_WING,
+        "in_transition_mode": state in _TRANSITIONS,
+        "in_transition_to_fw": state == dialect.MAV_VTOL_STATE_TRANSITION_TO_FW,
+    }
 
 
 def _battery(message: Any) -> dict[str, object]:

@@ -17,7 +17,7 @@ from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, Address, decode_text, is
 from nedbus_msgs.frames import wrap
 
 from .boot_time import new_clock, read_time, time_since_boot
-from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY
+from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY, vtol_status
 from .senders import text_source
 from .sequence import REPEATED
 
@@ -53,7 +53,7 @@ STREAMS: Final = {
     1: (55, 1.0, "vehicle_status"),
     147: (66, 1.0, "battery_status"),
     242: (72, 1.0, "home_position"),
-    245: (14, 1.0, "vehicle_land_detected"),
+    245: (14, 1.0, "vehicle_land_detected vehicle_status"),
 }
 """Messages to request, in order: size in MAVLink 2 [bytes], rate [Hz] (0: option `rate`), topics that need them."""
 
@@ -320,6 +320,8 @@ class Vehicle:
             case "SYS_STATUS":
                 names = [f"onboard_control_sensors_{part}" for part in ("present", "enabled", "health")]
                 self._store("sensors", now + _STATUS_TIMEOUT, **{name: getattr(message, name) for name in names})
+            case "EXTENDED_SYS_STATE":
+                self._store("vtol", now + _STATUS_TIMEOUT, **vtol_status(message.vtol_state))
             case "SYSTEM_TIME" if timestamp is not None and is_unix_time(message.time_unix_usec):
                 self._store("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
 
@@ -343,6 +345,7 @@ class Vehicle:
                 fields |= self._recall("global status", now)
             case "vehicle_status":
                 fields |= self._recall("sensors", now)
+                fields |= self._recall("vtol", now)
             case "sensor_gps" if utc := self._recall("utc", now):
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 

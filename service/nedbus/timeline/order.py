@@ -178,16 +178,24 @@ class _Track(Generic[M]):
             return self.base + self.newest  # the order of the file
         return self.base + max(0, log - self.log)
 
-    def _outliers(self, items: Iterable[_Item[M]], newest: int) -> _Placed[M]:
-        """Place messages that do not continue the clock: late and old ones by their time, all others as in the file.
+    def _outliers(self, items: Sequence[_Item[M]], newest: int) -> _Placed[M]:
+        """Place messages that do not continue the clock.
+
+        Late and old ones, and those of a stream that runs ahead of the others, have the place of their time; all others
+        that of the file.
 
         A log keeps the order of each stream, in which the vehicle wrote it.
 
         `newest`: the newest timestamp before them.
         """
         found: _Placed[M] = []
+        ahead = _streams_ahead(items, newest)
         for item in items:
             before = self.last.get(item.stream)
+            if item.stream in ahead and item.stamp > newest:
+                self.last[item.stream] = item.stamp
+                found.append((self.base + item.stamp, item))
+                continue
             is_same_clock = is_unix_time(item.stamp) == self.is_unix
             is_next = before is None or before < item.stamp
             is_old = is_next and is_same_clock and item.stamp < newest  # a stream may begin with old messages
@@ -262,12 +270,18 @@ class _Track(Generic[M]):
         if is_ahead:
             is_same = is_unix == self.is_unix
             return len(items) > 1 or (is_end and is_same and first.stamp - self.newest <= _MAX_LAST)
-        if len(items) == 1:
-            return False
+        return len(items) > 1 and self._may_have_gone_back(items, first, is_unix=is_unix)
+
+    def _may_have_gone_back(self, items: Sequence[_Item[M]], first: _Item[M], *, is_unix: bool) -> bool:
+        """Return whether the vehicle may have rebooted, or its Unix time may have been set back."""
+        set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
         if first.log is None or self.log is None:  # a log: a few streams may have waited in a queue
-            set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
             return len(set_back) >= min(_AGREEING, len(self.last))
-        if is_unix or self.is_unix:
+        if is_unix != self.is_unix:
+            return True
+        if not set_back:  # streams that appear now, which were late
+            return False
+        if is_unix:
             return True
         elapsed = first.log - self.log
         return elapsed < 0 or is_boot_possible(first.stamp, elapsed / 1e6)
@@ -439,6 +453,19 @@ class Order(Generic[M]):
                 if len(numbers) < _MAX_STEPS:
                     numbers.append(item.number)
                     offsets.append(offset)
+
+
+def _streams_ahead(items: Iterable[_Item[M]], newest: int) -> set[Any]:
+    """Return the streams of a recording that run ahead of the others: a single message may have a damaged time."""
+    last: dict[Any, int] = {}
+    ahead: set[Any] = set()
+    for item in items:
+        if item.log is None or not newest < item.stamp <= newest + _MAX_LATE:
+            continue
+        if item.stream in last and item.stamp > last[item.stream]:
+            ahead.add(item.stream)
+        last[item.stream] = item.stamp
+    return ahead
 
 
 def _stamp_of(message: Message, stamp: Any) -> int:

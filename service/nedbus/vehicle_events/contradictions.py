@@ -177,8 +177,17 @@ class Comparison:
             self._position.update(name, stamp, error.distance, error.distance_limit),
         ]
         if name == "GNSS" and estimate.z_global == 1 and not self._height.since:
-            changes.append(self._origin.update(name, stamp, error.altitude, error.height_limit))
+            changes.append(self._origin.update(name, stamp, error.altitude, self._limit_of_origin(error)))
         return [change for change in changes if change is not None]
+
+    def _limit_of_origin(self, error: _Error) -> float:
+        """Return the limit of the origin's error [m].
+
+        A climb and a worse accuracy increase the limit of a height. An origin that is wrong stays wrong meanwhile.
+        """
+        if self._origin.is_reported:
+            return min(error.height_limit, self._origin.smallest_limit)
+        return error.height_limit
 
     def _messages_around(self, stamp: int) -> tuple[_Message, _Message] | None:
         """Return the messages of the estimate before and after this time; None if they are far apart or missing."""
@@ -276,12 +285,14 @@ class _Contradiction:
     """State of one quantity, contradicted while all errors exceed their limits in the same direction.
 
     `errors`: last time [us], error and limit [m] by reference. `since`: time when all exceeded their limits [us], or 0.
+    `smallest_limit`: of those that were exceeded since then [m].
     """
 
     quantity: str
     errors: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     since: int = 0
     worst: float = 0.0
+    smallest_limit: float = math.inf
     is_reported: bool = False
 
     def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
@@ -300,9 +311,11 @@ class _Contradiction:
         if directions not in ({1.0}, {-1.0}):
             was_reported, self.is_reported = self.is_reported, False
             self.since, self.worst = 0, 0.0
+            self.smallest_limit = math.inf
             kind = f"{self.quantity}_contradicted"
             return Finding(kind, "end", f"{self.quantity} no longer contradicted") if was_reported else None
         self.since, self.worst = self.since or stamp, max(self.worst, error, key=abs)
+        self.smallest_limit = min(self.smallest_limit, limit)
         lasted = (stamp - self.since) / 1e6
         if self.is_reported or lasted < rules.CONTRADICTED[self.quantity]:
             return None

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from nedbus_msgs import JUMP_FIELDS, RESET_COUNTERS, Quantity, jump_of
-from nedbus_msgs.frames import MapProjection
+from nedbus_msgs.frames import GlobalPosition, MapProjection
 
 from .detectors import ChangeDetector, Fields, Finding, detect_flags, read_fields
 from .event import ALONE, Event
@@ -172,8 +172,10 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield an origin that was set or moved; one that was not provided before, and `ref_timestamp`, are ignored."""
     had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
     if has and not had and before["xy_global"] is not None:
-        text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
-        yield Finding("origin_set", "once", text, numbers={"latitude": after["ref_lat"], "longitude": after["ref_lon"]})
+        origin = GlobalPosition.wrapped(after["ref_lat"], after["ref_lon"], math.nan)
+        text = f"origin set at {origin.latitude:.6f}, {origin.longitude:.6f}"
+        numbers = {"latitude": origin.latitude, "longitude": origin.longitude}
+        yield Finding("origin_set", "once", text, numbers=numbers)
     elif has and had:
         moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(after["ref_lat"], after["ref_lon"])
         distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -13,6 +14,10 @@ from tests.flights.recorded_link import Service
 from tests.flights.ulogs import LOGS
 
 PX4: Final = LOGS.parent / "px4"
+OTHER_FORMAT: Final = {"gps_loss_mavlink", "twelve_messages_mavlink"}  # tests of the MAVLink source read these
+RECORDINGS: Final = [
+    path for path in sorted(PX4.rglob("*.bin.gz")) if path.name.removesuffix(".bin.gz") not in OTHER_FORMAT
+]
 
 pytestmark = [
     pytest.mark.logs,
@@ -29,6 +34,16 @@ def test_changes_between_streamed_and_converted_messages_are_no_resets(
     service = Service(PX4 / f"{name}.bin.gz", monkeypatch).run()
     assert service.events("reset", "origin_set", "origin_moved") == []
     assert {sum(health.resets.values()) for health in service.healths.values()} == {0}
+
+
+@pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.name.removesuffix(".bin.gz"))
+def test_no_message_is_rejected_and_no_estimate_contradicted(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+    """No message of a real PX4 is rejected, streamed or converted, and no estimate is said to be wrong."""
+    service = Service(path, monkeypatch).run()
+    assert service.rejected == []
+    assert service.output.rejected == 0
+    assert service.output.published > 1000
+    assert [event.text for event in service.event_log.events if event.kind.endswith("_contradicted")] == []
 
 
 def test_drop_of_the_rate_is_not_a_series_of_gaps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -136,3 +136,49 @@ def test_pace_alone_shortens_pauses() -> None:
     pace = Pace(speed=2.0)
     assert [pace.publish_at(at) for at in (0.0, 1.0, 1.0 + MAX_PAUSE, 1000.0, 1001.0)] == [0.0, 0.5, 30.5, 30.5, 31.0]
     assert pace.skipped == 1
+
+
+UNIX = 1_710_000_000_000_000  # us
+
+
+def recorded_at_full_speed(*messages: tuple[str, int]) -> list[Message]:
+    """Return messages of streams with these timestamps, which a recorder received 0.1 ms apart."""
+    host = 1_760_000_000_000_000
+    return [Message(stamp, host + 100 * number, logged=stream) for number, (stream, stamp) in enumerate(messages)]
+
+
+def assert_times_are_those_of_the_vehicle(messages: list[Message]) -> None:
+    order = Order[Message]()
+    found = list(order.arrange(messages))
+    first = min(message.timestamp for message in messages)
+    assert [message.timestamp for message in found] == sorted(message.timestamp for message in messages)
+    assert [message.at for message in found] == pytest.approx([(each.timestamp - first) / 1e6 for each in found])
+    assert order.remarks == []
+
+
+@pytest.mark.parametrize("epoch", [0, UNIX])
+def test_stream_that_appears_late_is_no_reboot(epoch: int) -> None:
+    """In the recording of a replay at full speed, a topic that appears seconds late shows no reboot, and is sorted."""
+    stamps = [epoch + stamp for stamp in range(1_000_000, 9_000_000, STEP)]
+    streams = [(stream, stamp) for stamp in stamps for stream in "ab"]
+    late = [("c", stamp) for stamp in stamps]
+    assert_times_are_those_of_the_vehicle(recorded_at_full_speed(*streams, *late))
+
+
+@pytest.mark.parametrize("epoch", [0, UNIX])
+def test_stream_that_runs_ahead_is_sorted(epoch: int) -> None:
+    """In the recording of a replay at full speed, a topic may run seconds ahead of the others."""
+    stamps = [epoch + stamp for stamp in range(1_000_000, 9_000_000, STEP)]
+    messages = [(stream, stamp) for stamp in stamps for stream in "ab"]
+    ahead = [("c", stamps[100]), ("c", stamps[150]), ("c", stamps[200])]
+    assert_times_are_those_of_the_vehicle(recorded_at_full_speed(*messages[:20], *ahead, *messages[20:]))
+
+
+def test_single_message_with_a_wild_time_has_its_place_in_the_file() -> None:
+    """One message that is far ahead of the others may be damaged: it does not extend the flight."""
+    stamps = range(1_000_000, 9_000_000, STEP)
+    messages = [(stream, stamp) for stamp in stamps for stream in "ab"]
+    order = Order[Message]()
+    found = list(order.arrange(recorded_at_full_speed(*messages[:20], ("c", 40_000_000), *messages[20:])))
+    assert [message.logged for message in found].index("c") == 20
+    assert order.duration == pytest.approx(7.98)

@@ -6,6 +6,8 @@ import threading
 from collections.abc import Iterator
 
 import pytest
+import zenoh
+import zenoh.ext
 
 from nedbus.errors import ClosedError
 from nedbus.transport import KeyReader, Session, open_router
@@ -32,6 +34,23 @@ def test_newest_sample_is_received_and_older_ones_are_counted(router: Session) -
     router.put(KEY, b"next")
     assert reader.receive().payload.to_bytes() == b"next"
     assert reader.superseded == 4
+
+
+def test_samples_that_the_ring_has_overwritten_are_counted(router: Session) -> None:
+    """If more samples arrive than the ring holds before the reader is ready, all but the newest are superseded."""
+    reader, sent = KeyReader(router, KEY), 20_000
+    misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+    publisher = zenoh.ext.declare_advanced_publisher(router, KEY, sample_miss_detection=misses)
+    publisher.put(b"first")
+    assert reader.receive().payload.to_bytes() == b"first"
+    for _ in range(sent - 1):
+        publisher.put(b"position")
+    publisher.put(b"newest")
+    assert reader.receive().payload.to_bytes() == b"newest"
+    assert reader.superseded == sent - 1
+    router.put(KEY, b"without a number")
+    assert reader.receive().payload.to_bytes() == b"without a number"
+    assert reader.superseded == sent - 1
 
 
 @pytest.mark.parametrize("by_session", [False, True])

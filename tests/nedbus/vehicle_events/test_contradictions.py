@@ -161,6 +161,19 @@ def test_constant_difference_is_an_error_of_the_origin(baro: float | None) -> No
     assert [event.kind for event in reported if event.change == "begin"] == ["height_contradicted"]
 
 
+@pytest.mark.parametrize("up", [-25.0, -488.0, 60.0])
+def test_wrong_origin_is_one_statement_during_climbs(up: float) -> None:
+    """A climb and a worse accuracy increase the limit of a height; the origin stays contradicted meanwhile."""
+    flight = Flight()
+    flight.status(ARMED)
+    reported = fly(flight, 10.0, up=up, baro=0.0)
+    reported += fly(flight, 10.0, up=up + 300.0, baro=0.0, gps={"altitude_msl_m": 820.0})
+    reported += fly(flight, 10.0, up=up, baro=0.0, gps={"epv": 7.0})
+    assert [(event.kind, event.change) for event in reported] == [("origin_contradicted", "begin")]
+    ended = fly(flight, 10.0, ref_alt=500.0 - up, up=up)
+    assert [event.change for event in ended if event.kind == "origin_contradicted"] == ["end"]
+
+
 def test_barometer_alone_is_compared_as_a_standard_atmosphere_allows() -> None:
     """A barometer is not compared above 11 km, and below it differs by up to 15 % of the climb."""
     for height, error, is_contradicted in ((23_000.0, 3000.0, False), (3000.0, 300.0, False), (3000.0, 2000.0, True)):

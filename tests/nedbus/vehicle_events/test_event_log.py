@@ -456,6 +456,19 @@ def test_second_receiver_and_battery_are_ignored(flight: Flight) -> None:
     assert flight.severity == "watch"
 
 
+@pytest.mark.parametrize("direction", [1, -1])
+def test_origin_beyond_the_antimeridian_is_wrapped(direction: int) -> None:
+    """An origin that PX4 up to 1.15 sets beyond 180 degrees is wrapped, and has not moved if it is sent wrapped."""
+    flight = Flight()
+    flight.send(xy_global=False, z_global=False)
+    origin: dict[str, Any] = {"xy_global": True, "z_global": True, "ref_lat": -17.0, "ref_alt": 488.0}
+    reported = flight.wait(0.1).send(**origin, ref_lon=direction * 180.5)
+    [event] = [event for event in reported if event.kind == "origin_set"]
+    assert event.text == f"origin set at -17.000000, {direction * -179.5:.6f}"
+    assert event.numbers == {"latitude": -17.0, "longitude": direction * -179.5}
+    assert flight.wait(0.1).send(**origin, ref_lon=direction * -179.5) == []
+
+
 def test_new_timestamp_alone_does_not_move_origin() -> None:
     """The origin is set once; later changes of less than 1 cm, or of ref_timestamp alone, are not events."""
     flight = Flight()

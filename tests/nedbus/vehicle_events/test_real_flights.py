@@ -21,9 +21,11 @@ from pyulog import ULog
 import nedbus
 from nedbus import clock
 from nedbus.flights import FileEvents
+from nedbus.health import EventHistory
 from nedbus.monitoring import Observer
 from nedbus.transport import Session
 from nedbus.vehicle_events import (
+    EVENT_TOPICS,
     Event,
     EventLog,
     Story,
@@ -50,9 +52,11 @@ from tests.waits import DEADLINE, wait_for_matching
 
 TABLE: Final = json.loads(events_table.TABLE.read_text())
 TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
+ALL: Final = sorted(LOGS.parent.rglob("*.ulg"))
 NAMES: Final = [name for name in TABLE if name != "from"]
 FREQUENT: Final = "ev_refused"  # a script counted messages in reset_counter: hundreds of resets, mostly suppressed
 STEADY: Final = [name for name in NAMES if name != FREQUENT]
+TOPICS_APART: Final = 10.0  # s of the vehicle's time by which topics arrive apart, of a replay at full speed
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
 FLAPPING: Final = 4, 10.0, 5.0  # changes per window, window [s], pause until the last one is reported [s]
 TRACKED: Final = {
@@ -315,21 +319,21 @@ def test_primary_ekf_changes_are_events() -> None:
     assert sum("ekf_changed" in [cause.kind for cause in each.evidence] for each in resets) >= 15
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_only_one_log_has_a_contradicted_estimate(name: str) -> None:
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
+def test_only_one_log_has_a_contradicted_estimate(path: Path) -> None:
     """Only one log has a contradicted estimate: height 27 m below GNSS and barometer, and position 6 to 9 m off.
 
     In the other logs no valid estimate exceeds the limit for long enough: it is off by 92 m for half a second in
     twelve_messages, by 3 m in gps_loss, and from the barometer alone by 16 m in fast flight and 6 m at takeoff.
     """
-    events = [each for each in events_in(name) if each.kind.endswith("_contradicted")]
+    events = [event for event in ulogs.cached_events(path).event_log.events if event.kind.endswith("_contradicted")]
     right = [
         ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z_valid is true"),
         ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy_valid is true"),
         ("height_contradicted", "end", 118.9, "height no longer contradicted after 2.0 s"),
     ]
     found = [(each.kind, each.change, round(each.boot or 0.0, 1), each.text) for each in events]
-    assert sorted(found, key=lambda each: each[2]) == (right if name == "nxp_v0_ekf_failure" else [])
+    assert sorted(found, key=lambda each: each[2]) == (right if path.stem == "nxp_v0_ekf_failure" else [])
 
 
 def test_contradicted_height_has_evidence_and_reset() -> None:
@@ -442,7 +446,7 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
     assert bool(states) == (name != "cuav_1.16_gps_interference")
 
 
-@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_verdict_has_at_most_three_lines(path: Path) -> None:
     """A verdict has at most three lines; on a healthy flight it is just "no faults"."""
     text = verdict(path).text
@@ -451,7 +455,7 @@ def test_verdict_has_at_most_three_lines(path: Path) -> None:
     assert not is_healthy or re.fullmatch(r"no faults in \d+ s", text)
 
 
-@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_every_fault_event_is_in_a_story(path: Path) -> None:
     """Of the events of severity bad and watch, only texts of PX4 are in no story; `--all` lists those separately."""
     read = ulogs.cached_events(path)
@@ -531,7 +535,7 @@ def test_vision_that_is_not_fused_is_an_event() -> None:
     assert "aid_rejected" in [each.kind for each in resets[-1].evidence]
 
 
-def same_events(event_log: EventLog) -> list[tuple[str, ...]]:
+def same_events(event_log: EventLog | EventHistory) -> list[tuple[str, ...]]:
     """Return events without what a conversion cannot keep: dropouts, invalid messages, and rounded durations."""
     events = [each for each in event_log.events if each.kind not in ("dropout", "rejected")]
     return sorted(
@@ -554,12 +558,55 @@ def convert_whole(path: Path, folder: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_conversion_has_the_same_events_and_verdict(path: Path, tmp_path: Path) -> None:
     """A log and its conversion, which hold the messages in different orders, have the same events and verdict."""
     converted = convert_whole(path, tmp_path)
     assert same_events(ulogs.cached_events(converted).event_log) == same_events(ulogs.cached_events(path).event_log)
     assert verdict(converted).text == verdict(path).text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
+def test_samples_of_a_replay_and_its_recording_have_the_same_events_and_verdict(
+    path: Path, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
+) -> None:
+    """A log, its samples from the bus at full speed, and a recording of them have the same events and faults.
+
+    At full speed topics arrive seconds apart, and one message that is ahead of the others has its place in the file.
+    """
+    recorded, source = tmp_path / "a.mcap", f"ulog:{path}?topics={','.join(EVENT_TOPICS)}&speed=max"
+    sent = list(open_replay(source).messages)
+    first = sent[0].address
+    [endpoint] = bus.routers
+    recorder = run_nedbus("record", "-c", endpoint, "-o", str(recorded), coverage=False)
+    wait_for_matching(zenoh_session, first.key())
+    with bus.subscribe("*", mode="every", limit=len(sent)) as subscription:
+        service = run_nedbus("serve", "-c", endpoint, "--until-done", "-s", f"{source}&wait=1")
+        samples = [subscription.receive(DEADLINE) for _ in sent]
+        assert subscription.counts.lost == subscription.counts.dropped == 0
+        assert service.wait() == 0, service.err
+    recorder.signal(signal.SIGINT)
+    assert recorder.wait() == 0, recorder.err
+    logged = ulogs.cached_events(path)
+    for copy in (nedbus.events(samples), nedbus.events(recorded)):
+        events, times = by_time(same_events(copy))
+        logged_events, logged_times = by_time(same_events(logged.event_log))
+        assert events == logged_events
+        assert times == pytest.approx(logged_times, abs=TOPICS_APART)
+    for copied in (nedbus.why(samples), nedbus.why(recorded)):
+        assert texts_of(copied) == texts_of(nedbus.why(path))
+
+
+def by_time(events: Sequence[tuple[str, ...]]) -> tuple[list[tuple[str, ...]], list[float]]:
+    """Return events without their times, and their times [s since boot]; equal events are sorted by time."""
+    ordered = sorted(events, key=lambda event: (event[:4], float(event[4])))
+    return [event[:4] for event in ordered], [float(event[4]) for event in ordered]
+
+
+def texts_of(verdicts: Mapping[str, Verdict]) -> list[str]:
+    """Return the faults of each vehicle, without times, which a recording has in UTC."""
+    return [story.what for verdict in verdicts.values() for story in verdict.stories]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from typing import Any, Final
 import pytest
 from pydantic import ValidationError
 
+import nedbus
 from nedbus_msgs import MESSAGES
 from nedbus_msgs.arrays import arrays_of
 from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
@@ -19,6 +20,9 @@ SHARED: Final = LOGS.parents[1]
 FLIGHTS: Final = sorted(
     [*LOGS.glob("*.ulg"), *SHARED.glob("data/px4/*.ulg"), *SHARED.glob("data/px4/ulog_stream/*.ulg")]
 )
+SHORT_FLIGHTS: Final = ["boot_time_utc_us.ulg", "uxrce_unix_time.mcap", "fmu_in_topics.mcap"]
+DATA: Final = Path(__file__).parents[2] / "data"
+PAGE: Final = Path(__file__).parents[3] / "docs" / "px4-values.md"
 MANY: Final = 1000  # messages, which are checked by columns
 ZEROS, NAN4 = (0.0,) * 4, (math.nan,) * 4
 
@@ -30,6 +34,7 @@ PUBLISHED: Final[list[tuple[str, dict[str, Any]]]] = [
     ("SensorGps", {"latitude_deg": -17.0, "longitude_deg": -180.00001}),  # add_vector_to_global_position, for blending
     ("SensorGps", {"eph": -1.0, "epv": -1.0}),  # DroneCAN without covariances
     ("SensorGps", {"timestamp_sample": 10_100_000}),  # PpsTimeSync::correct_gps_timestamp
+    ("VehicleOdometry", {"timestamp_sample": 10_100_000}),  # vision: a synchronised time of another computer
     ("BatteryStatus", {"remaining": 1.27}),  # a DroneCAN battery: 127 %
     ("BatteryStatus", {"remaining": 1.0001}),  # a current sensor that reads below 0 on a full battery
     ("BatteryStatus", {"remaining": -0.01}),  # a MAVLink battery with an unknown charge
@@ -81,6 +86,20 @@ def test_values_beyond_px4s_range_are_rejected(name: str, fields: dict[str, Any]
     assert why.startswith(reason)
 
 
+def test_page_lists_every_rule() -> None:
+    """The table of ranges names each flag and each field that a rule checks, and each message without rules."""
+    section = PAGE.read_text().partition("\n## Ranges\n")[2].partition("\n## ")[0]
+    introduction, _, table = section.partition("\n|")
+    rules = "\n".join(row.split("|")[1] for row in table.splitlines() if row.count("|") > 3)
+    for definition in MESSAGES.values():
+        if not definition.rules:
+            assert f"`{definition.name}`" in introduction
+        for rule in definition.rules:
+            names = rule.flags or [check.field for check in rule.checks]
+            missing = [name for name in names if f"`{name}`" not in rules]
+            assert missing == [], f"{definition.name}: add a row with the code of PX4 that publishes the field"
+
+
 def test_longitudes_are_wrapped_where_they_are_used() -> None:
     """The field keeps PX4's value, and the property is comparable with that of a receiver, east and west."""
     for longitude, wrapped in ((180.5, -179.5), (-180.5, 179.5), (180.0, 180.0), (-180.0, -180.0)):
@@ -101,6 +120,14 @@ def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path) -> None:
     result = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (result.exit_code, "rejected" in result.out + result.err) == (0, False)
     assert "no events" in run_command("events", str(path)).err
+
+
+@pytest.mark.parametrize("name", SHORT_FLIGHTS)
+def test_no_message_of_a_short_flight_is_rejected(tmp_path: Path, name: str) -> None:
+    """All messages of short recordings are valid, and no estimate is said to be wrong."""
+    result = run_command("convert", str(DATA / name), str(tmp_path / "a.mcap"), "--topics", "*")
+    assert (result.exit_code, "rejected" in result.out + result.err) == (0, False), result
+    assert [event.text for event in nedbus.events(DATA / name) if event.kind.endswith("_contradicted")] == []
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from nedbus.mavlink import ExternalPosition
 from nedbus.samples import PositionStatus, Rejection
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import TIMINGS
-from nedbus.transport import KeyReader, RawSample, Session, Tls, open_client
+from nedbus.transport import KeyReader, RawSample, Session, Tls, entity_name, open_client
 from nedbus_msgs import BY_TOPIC, Address, codec_of, provenance_of
 from nedbus_msgs.messages import TimesyncStatus
 
@@ -209,18 +209,18 @@ class SenderName:
 
     def __init__(self, topic: str) -> None:
         self._definition = BY_TOPIC[topic]
-        self._publisher: object = None  # as Zenoh identifies it
+        self._publisher: str | None = None  # its `entity_name`
         self._name = ""
 
     def of(self, raw: RawSample) -> str:
         """Return the publisher of a sample."""
-        publisher = None if raw.source_info is None else raw.source_info.source_id
+        publisher = None if raw.source_info is None else entity_name(raw.source_info.source_id)
         if publisher != self._publisher or not self._name:
             self._publisher = publisher
             source = provenance_of(self._definition, str(raw.encoding)[:_MAX_ENCODING]).source
             self._name = source or "a publisher"
             if publisher is not None:
-                self._name += f" (session {str(publisher.zid)[:_SHORT_ID]})"
+                self._name += f" (session {publisher[:_SHORT_ID]})"
         return self._name
 
 

@@ -187,6 +187,85 @@ def test_damaged_messages_of_other_components_are_no_damage(tmp_path: Path) -> N
     assert (result.exit_code, "not MAVLink" in result.err) == (0, False)
 
 
+def write_messages(path: Path, messages: Iterable[tuple[int, Any]]) -> None:
+    """Write messages of vehicle 7, each with its time since boot [ms], to a file that begins at EPOCH."""
+    sender = mavlink.MAVLink(None, 7, 1)
+    with path.open("wb") as file:
+        for ms, message in messages:
+            file.write(struct.pack(">Q", EPOCH + 1000 * ms) + message.pack(sender))
+            sender.seq = (sender.seq + 1) % 256
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("is_wrapped", [False, True])
+def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path, direction: int, *, is_wrapped: bool) -> None:
+    """Eastward and westward, as PX4 up to 1.15 sends longitudes and as later releases do: no rejection, no event."""
+    path, copied = tmp_path / "flight.tlog", tmp_path / "flight.mcap"
+    latitude, origin = -170_000_000, direction * 1_799_990_000
+    degree = math.cos(math.radians(17.0)) * 111_319.49  # m
+
+    def fly() -> Iterable[tuple[int, Any]]:
+        for number in range(200):
+            ms, east = 1000 + 100 * number, direction * number
+            estimated = origin + round(1e7 * east / degree)
+            measured = round(1e7 * math.remainder(estimated / 1e7, 360.0))
+            if is_wrapped:
+                estimated = measured
+            yield ms, mavlink.MAVLink_estimator_status_message(1000 * ms, FLAGS, *[0] * 6, 0.5, 0.5)
+            yield ms, mavlink.MAVLink_local_position_ned_message(ms, 0, east, -50, 0, 10 * direction, 0)
+            yield ms, mavlink.MAVLink_global_position_int_message(ms, latitude, estimated, 550_000, 50_000, 0, 0, 0, 0)
+            accuracy = 0, 1000, 1500, 100
+            fix = 3, latitude, measured, 550_000, 100, 100, 500, 9000, 12
+            yield ms, mavlink.MAVLink_gps_raw_int_message(1000 * ms, *fix, *accuracy)
+            if number % 10 == 0:
+                yield ms, mavlink.MAVLink_heartbeat_message(2, 12, 128, 0, 4, 3)
+                yield ms, mavlink.MAVLink_gps_global_origin_message(latitude, origin, 500_000, 1)
+                home = latitude, estimated, 500_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
+                yield ms, mavlink.MAVLink_home_position_message(*home)
+
+    write_messages(path, fly())
+    assert run_command("convert", "--topics", "*", str(path), str(copied)).exit_code == 0
+    for file in (path, copied):
+        with nedbus.open(file) as flight:
+            positions = [sample.message.global_position for sample in flight(nedbus.VehicleGlobalPosition)]
+            homes = [sample.message.global_position for sample in flight(nedbus.HomePosition)]
+            assert flight.warnings == ()
+        assert (len(positions), len(homes)) == (200, 20)
+        last = positions[-1]
+        assert last is not None
+        assert last.longitude == pytest.approx(direction * -179.999131, abs=2e-6)
+        assert None not in homes
+        assert list(nedbus.events(file)) == []
+        assert nedbus.why(file)["7"].text == "no faults in 20 s"
+
+
+def test_transition_of_a_vtol_over_mavlink_is_an_event(tmp_path: Path) -> None:
+    """Transitions in EXTENDED_SYS_STATE are events as in a log, each within the interval of HEARTBEAT."""
+    path = tmp_path / "flight.tlog"
+    states = [mavlink.MAV_VTOL_STATE_MC] * 100 + [mavlink.MAV_VTOL_STATE_TRANSITION_TO_FW] * 50
+    states += [mavlink.MAV_VTOL_STATE_FW] * 100 + [mavlink.MAV_VTOL_STATE_TRANSITION_TO_MC] * 50
+    states += [mavlink.MAV_VTOL_STATE_MC] * 50
+
+    def fly() -> Iterable[tuple[int, Any]]:
+        for number, state in enumerate(states):
+            ms = 1000 + 100 * number
+            yield ms, mavlink.MAVLink_local_position_ned_message(ms, 0, 0, -50, 0, 0, 0)
+            if number % 10 == 0:
+                yield ms, mavlink.MAVLink_extended_sys_state_message(state, 2)
+                yield ms, mavlink.MAVLink_heartbeat_message(22, 12, 128, 0, 4, 3)
+
+    write_messages(path, fly())
+    found = [(event.text, event.boot) for event in nedbus.events(path)]
+    assert found == [
+        ("VTOL transition to fixed wing", 11.0),
+        ("VTOL transition ended after 5.0 s", 16.0),
+        ("vehicle type changed from rotary wing to fixed wing", 16.0),
+        ("VTOL transition to rotary wing", 26.0),
+        ("vehicle type changed from fixed wing to rotary wing", 26.0),
+        ("VTOL transition ended after 5.0 s", 31.0),
+    ]
+
+
 @pytest.mark.parametrize("content", [b"hello", bytes(5000), b"".join(frames(255, 0))])
 def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "flight.tlog"

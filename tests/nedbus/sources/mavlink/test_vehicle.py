@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+import nedbus
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.parser import new_parser
 from nedbus.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
@@ -339,6 +340,7 @@ UNKNOWN = {  # messages with the values that mean unknown in MAVLink's common.xm
         dialect.MAVLink_home_position_message(1, 1, 1, 1, 2, 3, [0] * 4, 0, 0, 0),
         {"lat", "lon", "alt", "x", "y", "z", "valid_hpos", "valid_alt"},
     ),
+    "home at 0, 0": (dialect.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [0] * 4, 0, 0, 0), set[str]()),
     "attitude": (dialect.MAVLink_attitude_quaternion_message(1000, 0, 0, 0, 0, 0, 0, 0), set[str]()),
     "odometry without attitude": (
         dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [0] * 4, *[0] * 6, [0] * 21, [0] * 21, 0, 8, 100),
@@ -424,6 +426,30 @@ def test_zeros_of_other_messages_are_unknown(vehicle: Vehicle) -> None:
     odometry = dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21)
     vehicle.handle(odometry, 100.0)
     assert estimate(vehicle, 1000, 100.0).keys().isdisjoint({"ref_lat", "xy_global", "eph", "epv", "evh", "evv"})
+
+
+@pytest.mark.parametrize(
+    ("state", "vehicle_type", "is_in_transition", "is_to_fixed_wing"),
+    [
+        (dialect.MAV_VTOL_STATE_MC, nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING, False, False),
+        (dialect.MAV_VTOL_STATE_TRANSITION_TO_FW, nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING, True, True),
+        (dialect.MAV_VTOL_STATE_FW, nedbus.VehicleStatus.VEHICLE_TYPE_FIXED_WING, False, False),
+        (dialect.MAV_VTOL_STATE_TRANSITION_TO_MC, nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING, True, False),
+    ],
+)
+def test_status_of_a_vtol_has_its_transition(
+    state: int, vehicle_type: int, is_in_transition: bool, is_to_fixed_wing: bool
+) -> None:
+    """EXTENDED_SYS_STATE adds type and transition to the status, for as long as it arrives; an undefined state none."""
+    vehicle, heartbeat = new_vehicle("*"), dialect.MAVLink_heartbeat_message(22, 12, 128, 0, 4, 3)
+    vehicle.handle(position(1000), 100.0)
+    vehicle.handle(dialect.MAVLink_extended_sys_state_message(state, 0), 100.0)
+    fields = handle(vehicle, heartbeat, 101.0).fields
+    assert (fields["is_vtol"], fields["vehicle_type"]) == (True, vehicle_type)
+    assert (fields["in_transition_mode"], fields["in_transition_to_fw"]) == (is_in_transition, is_to_fixed_wing)
+    assert "is_vtol" not in handle(vehicle, heartbeat, 110.0).fields
+    vehicle.handle(dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_UNDEFINED, 1), 111.0)
+    assert "is_vtol" not in handle(vehicle, heartbeat, 111.0).fields
 
 
 def test_origin_beyond_the_antimeridian_is_kept(vehicle: Vehicle) -> None:

@@ -9,18 +9,23 @@ from collections.abc import Callable, Iterator
 from typing import Any, Self
 
 import pytest
+import zenoh
+import zenoh.ext
 
 import nedbus
 from nedbus import VehicleOdometry
 from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
-from nedbus.sources.mavlink.position_sender import BusAccess, PositionSender, Target, choose_target
+from nedbus.sources.mavlink import position_sender
+from nedbus.sources.mavlink.position_sender import BusAccess, PositionSender, SenderName, Target, choose_target
 from nedbus.sources.options import MavlinkOptions
+from nedbus.transport import KeyReader, open_client, open_router
+from nedbus_msgs import Address, provenance_of
 from tests.peers.live_source import source_status
-from tests.peers.ports import free_port
+from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
 from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording
-from tests.waits import wait_for
+from tests.waits import DEADLINE, wait_for
 
 from .px4_vision import SYNC_ANSWERS, Px4OnLink
 from .test_external_position import odometry
@@ -190,6 +195,24 @@ def test_wrong_positions_are_counted_and_not_sent(setup: Setup, bus: nedbus.Bus)
         assert reason.startswith("pose_frame is 0: set it to POSE_FRAME_NED")
 
 
+def test_undecodable_position_is_counted_and_not_sent(setup: Setup, bus: nedbus.Bus) -> None:
+    """A payload that is no position is left out as invalid, with the reason, and the positions around it are sent."""
+    key = Address("mocap", TOPIC).key()
+    with open_client([setup.endpoint], timeout=DEADLINE) as session, Px4OnLink(setup.port) as px4, Script(bus):
+        wait_for(lambda: px4.count() >= 10, what="positions")
+
+        def is_counted() -> bool:
+            session.put(key, b"no position")
+            return left_out(bus).get("invalid", 0) > 0
+
+        wait_for(is_counted, what="the invalid position")
+        [reason] = [text for text in source_status(bus).positions[0].reasons if "decoded" in text]
+        assert reason.startswith("the message cannot be decoded: ")
+        assert reason.endswith("; use the same version of nedbus")
+        before = px4.count()
+        wait_for(lambda: px4.count() > before, what="further positions")
+
+
 def test_second_script_is_refused(setup: Setup, bus: nedbus.Bus) -> None:
     """While a script sends, another session with the same address is refused with the name of the first."""
     with (
@@ -253,3 +276,26 @@ def test_address_must_be_one_of_a_position(address: str) -> None:
     """`position=` names a vehicle and a topic with a position."""
     with pytest.raises(ConfigError, match="position="):
         parse_source(f"mavlink:udpin:127.0.0.1:14540?position={address}")
+
+
+def test_publisher_is_described_only_when_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The samples of one publisher name it with one look at their encoding; those of another session name that."""
+    looks: list[str] = []
+
+    def count(definition: Any, encoding: str) -> Any:
+        looks.append(encoding)
+        return provenance_of(definition, encoding)
+
+    monkeypatch.setattr(position_sender, "provenance_of", count)
+    names, sender = list[str](), SenderName(TOPIC)
+    with open_router(listen=(free_endpoint(),)) as session:
+        key = Address("mocap", TOPIC).key()
+        reader = KeyReader(session, key)
+        misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+        publishers = [zenoh.ext.declare_advanced_publisher(session, key, sample_miss_detection=misses) for _ in "ab"]
+        for publisher in (publishers[0], publishers[0], publishers[0], publishers[1]):
+            publisher.put(b"")
+            names.append(sender.of(reader.receive()))
+        reader.close()
+        assert {*names} == {f"a publisher (session {str(session.zid())[:8]})"}
+    assert len(looks) == 2
