@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +17,7 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus.client import StreamHealth
 from nedbus.pki import write_access_rules
 from nedbus.transport import Session, open_client, query, token_keys
 from nedbus.web.server import LiveFleet
@@ -62,12 +64,17 @@ class Fleet:
         return ["-c", self.endpoint, *tls_options(self._pki, name)]
 
     @contextmanager
-    def forging(self, *services: str) -> Iterator[None]:
+    def forging(self, *services: str, refused: Sequence[str] = ()) -> Iterator[None]:
         """Answer as vehicle 1 on its own key, on those of vehicle 2, and on keys without a vehicle, about vehicle 2."""
-        session, stream = self.session("vehicle-1"), {"address": f"2/{VLP}", "health": {"age": 0.0, "messages": 9}}
+        session = self.session("vehicle-1")
+        health = replace(StreamHealth(VLP).snapshot(), age=0.0, messages=9, usual_interval=1e9)
+        source = {
+            "source": "sim:", "state": "running", "addresses": [f"2/{VLP}"],
+            "streams": [{"address": f"2/{VLP}", "health": asdict(health)}], "log_streams": [{"vehicle": "2"}],
+        }  # fmt: skip
+        # That the router refuses vehicle 2 must not let it report anything else about vehicle 2.
         status = {
-            "host": socket.gethostname(), "version": nedbus.__version__, "refused": [],
-            "sources": [{"source": "sim:", "state": "running", "addresses": [f"2/{VLP}"], "streams": [stream]}],
+            "host": socket.gethostname(), "version": nedbus.__version__, "refused": refused, "sources": [source],
         }  # fmt: skip
         with ExitStack() as answering:
             for service in ("x", *services):
@@ -120,6 +127,24 @@ def test_health_of_a_vehicle_depends_on_its_own_certificate(fleet: Fleet) -> Non
         result = fleet.run("health", "--expect", "2", "--max-age", "600")
         assert result.exit_code == 1, result.out
         assert "vehicle 2 is missing" in result.err
+
+
+@pytest.mark.process
+def test_claimed_refusal_lets_no_vehicle_report_about_another(fleet: Fleet) -> None:
+    """A service of vehicle 1 that reports vehicle 2 as refused measures no stream of vehicle 2: it is stale in `list`.
+
+    `health --vehicle 2` asks vehicle 2, and goes by the age of its answer.
+    """
+    with fleet.bus("vehicle-2").publisher(VLP, vehicle="2") as publisher:
+        publisher.publish(INVALID)
+        with fleet.forging(refused=["2"]):
+            reader = fleet.bus("reader")
+            wait_for(lambda: [each for each in reader.services() if each.refused == ("2",)], what="the forged status")
+            assert [each.own_streams for each in reader.services()] == [[], []]
+            # 3 s without a message make the stream stale; the forged interval of years would not.
+            wait_for(lambda: "stale" in fleet.run("list").out, what="a stale stream of vehicle 2")
+            assert fleet.run("health", "-v", "2", "--max-age", "0.5").exit_code == 1
+            assert "ULog stream of vehicle 2" not in fleet.run("info").out
 
 
 @pytest.mark.process
@@ -196,14 +221,20 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
     [f"nedbus/2/{VLP}", f"nedbus/2/{VLP}/@rate/5", f"nedbus/2/{VLP}/@adv/pub/1a/1/_", f"nedbus/@rejected/2/{VLP}",
      "nedbus/2/@doctor/1a"],
 )  # fmt: skip
-def test_vehicle_cannot_put_on_keys_of_another(fleet: Fleet, key: str) -> None:
-    """A put of vehicle 1 on a key of vehicle 2 reaches no reader; a later one of vehicle 2 does."""
-    one, two = fleet.session("vehicle-1"), fleet.session("vehicle-2")
+def test_other_certificates_cannot_put_on_keys_of_a_vehicle(fleet: Fleet, key: str) -> None:
+    """A put of vehicle 1, a reader, an operator or a stranger on a key of vehicle 2 reaches no reader.
+
+    Neither does one of vehicle 1 on a key expression that includes the key; a later one of vehicle 2 does.
+    """
+    two = fleet.session("vehicle-2")
+    others = [fleet.session(name) for name in ("vehicle-1", "reader", "operator", "stranger")]
     subscriber = fleet.session("reader").declare_subscriber(key, zenoh.handlers.RingChannel(10))
     received: list[bytes] = []
 
     def is_received() -> bool:
-        one.put(key, b"1")
+        for other in others:
+            other.put(key, b"1")
+            other.put(key.replace("2", "*", 1), b"1")
         two.put(key, b"2")
         received.extend(sample.payload.to_bytes() for sample in iter(subscriber.handler.try_recv, None))
         return len(received) > 2
@@ -214,7 +245,10 @@ def test_vehicle_cannot_put_on_keys_of_another(fleet: Fleet, key: str) -> None:
 
 @pytest.mark.process
 def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
-    """Vehicle 1 can neither answer queries on keys of vehicle 2 nor declare its liveliness tokens."""
+    """Vehicle 1 can neither answer queries on keys of vehicle 2 nor declare its liveliness tokens.
+
+    Its answer on its own key cannot carry a key of vehicle 2, or one that includes it, either.
+    """
     one, reader = fleet.session("vehicle-1"), fleet.session("reader")
     keys = ("nedbus/@schema/2/VehicleAttitude", "nedbus/@service/2/x/status", f"nedbus/2/{VLP}")
     own = "nedbus/@service/1/x/status"
@@ -224,6 +258,10 @@ def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
             answering.enter_context(answer_queries(one, key, _reply(key, {})))
         wait_for(lambda: query(reader, own, timeout=DEADLINE), what="the reply on its own key")
         assert [query(reader, key, timeout=1.0) for key in keys] == [[], [], []]
+    carried = {"nedbus/@service/2/x/status": b"{}", "nedbus/@service/*/x/status": b"{}", own: b"{}"}
+    with answer_queries(one, own, reply_with(carried)):
+        replies = query(reader, "nedbus/@service/**/status", timeout=DEADLINE)
+        assert [str(reply.key_expr) for reply in replies] == [own]
     assert token_keys(reader, "nedbus/2/@alive/**", timeout=1.0) == []
     del token
 

@@ -28,6 +28,7 @@ _EXAMINED: Final = "Examine only this vehicle; also test the write permission"
 _LINK: Final = "Also listen on a MAVLink link, such as udpin:0.0.0.0:14540"
 _RULES: Final = "Router's configuration: name the rules for this client's certificate"
 _CONFIGS: Final = "Settings (.toml) or router files (.json5); default: the settings of serve"
+_MAX_OUTDATED: Final = 20  # older services named
 _REFUSED: Final = (
     ", although its service reports it as published: check that the access rules of the router allow the service to"
     " publish this vehicle, and this client to read it (docs/security.md)"
@@ -100,12 +101,11 @@ class _Check:
         self._sources = [source for status in self._statuses for source in status.sources]
         self.ages: dict[str, float] = {}  # as measured by the services
         for status in self._statuses:
-            for source in status.sources:
-                for stream in source.streams:
-                    name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
-                    is_published = stream.address in source.addresses
-                    if age is not None and name == status.vehicle and is_published:  # its word on others does not count
-                        self.ages[name] = min(age, self.ages.get(name, age))
+            published = {address for source in status.sources for address in source.addresses}
+            for stream in status.own_streams:
+                age = stream.health.age
+                if age is not None and stream.address in published:
+                    self.ages[status.vehicle] = min(age, self.ages.get(status.vehicle, age))
         self._reports = bus.accounts(within=expected.within or 0.0)
         self._known = {name for report in self._reports for name in report.vehicles}
         self._publishers = bus.publishers()
@@ -188,11 +188,14 @@ class _Check:
 
     def outdated(self) -> Iterator[str]:
         """Yield a line for each older service: its reports are not used."""
-        for status in self._statuses:
-            if status.is_outdated:
-                where = f"service {to_text(status.service, 64)} on {to_text(status.host or 'an unknown host', 64)}"
-                version = f"nedbus {to_text(status.version or 'of an unknown version', 20)}"
-                yield f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
+        outdated = [status for status in self._statuses if status.is_outdated]
+        for status in outdated[:_MAX_OUTDATED]:
+            where = f"service {to_text(status.service, 64)} on {to_text(status.host or 'an unknown host', 64)}"
+            version = f"nedbus {to_text(status.version or 'of an unknown version', 20)}"
+            yield f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
+        more = len(outdated) - _MAX_OUTDATED
+        if more > 0:
+            yield f"{counted(more, 'more older service')}: any vehicle may claim to be one"
 
     def _faults_of_history(self) -> Iterator[str]:
         if not self._expected.expect:  # else the vehicles are asked, and an unrelated service is no fault of theirs
