@@ -33,7 +33,8 @@ _log = logging.getLogger(__name__)
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
-_MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
+# Queued reports, each of at most 16 kB, the size limit of sessions; beyond that the oldest are dropped.
+_MAX_REPORTS: Final = 250
 
 
 class Vehicles(dict[str, list[Address]]):
@@ -309,7 +310,7 @@ class Rejections:
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
     def take(self) -> list[RejectionReport]:
-        """Return the reports received since the last call, at most 1000, without waiting."""
+        """Return the reports received since the last call, at most 250, without waiting."""
         with translate_zenoh_errors():
             samples = list(islice(iter(self._handler.try_recv, None), _MAX_REPORTS))
         reports: list[RejectionReport] = []

@@ -5,6 +5,7 @@ The peers are a real zenohd with the shipped access rules, real certificates of 
 
 from __future__ import annotations
 
+import itertools
 import json
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,9 +24,11 @@ from nedbus.transport import Session, open_client, query, token_keys
 from nedbus.web.server import LiveFleet
 from nedbus_msgs import Selection, ack_key
 from tests.flights.messages import VLP
-from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, tls_settings, write_config
 from tests.peers.command_line import CommandResult, run_command
-from tests.peers.processes import Start
+from tests.peers.http_client import HttpClient
+from tests.peers.ports import free_port
+from tests.peers.processes import Process, Start
 from tests.peers.queryables import answer_queries, reply_with
 from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, wait_for
@@ -39,6 +42,15 @@ INVALID: Final = {
 FORGED_EVENT: Final = {
     "vehicle": "2", "kind": "failsafe", "change": "begin", "severity": "bad", "text": "forged failsafe", "time": 1e9,
 }  # fmt: skip
+UNREAD: Final = """
+import sys, nedbus
+with nedbus.connect() as bus:
+    kept = bus.rejections(), bus.subscribe("*", mode="every")
+    print("ready", flush=True)
+    for sample in bus.subscribe("vehicle_attitude"):
+        print(sample.message.timestamp, flush=True)
+"""
+"""A script that never reads the rejections and the messages to which it subscribes; it prints when it is reached."""
 HEALTHY: Final = {"severity": "info", "text": "ok", "has_position": True, "topics": [VLP], "first": 1e9}
 
 
@@ -311,3 +323,62 @@ def test_service_of_several_vehicles_has_a_certificate_that_says_so(
         wait_for(lambda: service_of(reader, "1") and service_of(reader, "2"), what="the reports about both vehicles")
         assert service_of(reader, "1") == service_of(reader, "2")
         assert fleet.run("health", "--expect", "1,2").exit_code == 0
+
+
+def peak_memory(process: Process) -> int:
+    """Return the largest resident memory of a process so far [kB]."""
+    status = Path(f"/proc/{process.popen.pid}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0])
+
+
+@pytest.mark.slow
+def test_flood_of_reports_and_heartbeats_takes_little_memory(
+    fleet: Fleet, pki: Path, start: Start, run_nedbus: Start
+) -> None:
+    """Puts of vehicle 1 on its @rejected and @adv keys let no reader need 1.5 times its memory at rest.
+
+    The readers are a script that reads nothing, the exporter and the page. The puts are as large as the router's rules
+    and the readers' own limits allow, and larger.
+    """
+    http = [HttpClient(free_port()) for _ in range(2)]
+    tls = {f"NEDBUS_{name.upper()}": str(path) for name, path in tls_settings(pki, "reader").items()}
+    script = start("-c", UNREAD, NEDBUS_CONNECT=fleet.endpoint, coverage=False, **tls)
+    readers = [script, *(
+        run_nedbus(command, "--wait", *fleet.options("reader"), "--http", client.where, coverage=False)
+        for command, client in zip(("export", "web"), http, strict=True)
+    )]  # fmt: skip
+    vehicle = fleet.bus("vehicle-1")
+    attitude = vehicle.publisher("vehicle_attitude", vehicle="1")
+    timestamps = itertools.count(1)
+
+    def received() -> list[float]:
+        """Return how many messages each reader has received."""
+        counts = [sum(client.values("nedbus_messages_received_total", topic="vehicle_attitude")) for client in http]
+        return [len(script.out.split()), *counts]
+
+    def reach_all() -> None:
+        """Publish messages until each reader has received one, and so all that was put before."""
+        before = received()
+
+        def are_reached() -> bool:
+            attitude.publish({"timestamp": next(timestamps), "q": (1.0, 0.0, 0.0, 0.0)})
+            return all(now > earlier for now, earlier in zip(received(), before, strict=True))
+
+        wait_for(are_reached, what="all readers")
+
+    wait_for(lambda: "ready" in script.out, what="the script")
+    for _ in range(3):
+        reach_all()
+    rest = [peak_memory(process) for process in readers]
+    session, block = vehicle._session, zenoh.CongestionControl.BLOCK
+    report, heartbeat = f"nedbus/@rejected/1/{VLP}", f"nedbus/1/{VLP}/@adv/pub/1a/1/_"
+    reason = json.dumps({"reason": "x" * 16_000}).encode()
+    for _ in range(4):
+        for _ in range(1500):
+            session.put(report, reason, congestion_control=block)
+            for size in (64, 4, 65, 16_384):
+                session.put(heartbeat, bytes(size), congestion_control=block)
+        session.put(report, bytes(2**20 - 1000), congestion_control=block)
+        reach_all()
+    peaks = [peak_memory(process) for process in readers]
+    assert [peak < 1.5 * least for peak, least in zip(peaks, rest, strict=True)] == [True, True, True], (rest, peaks)
