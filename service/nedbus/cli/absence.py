@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 from nedbus.client import Bus, ServiceStatus, SourceStatus, prefix_of
 from nedbus.transport import token_keys
 
-from .output.streams import to_text
+from .output.streams import counted, to_text
 
 _TIMEOUT: Final = 1.0  # s for the router to list the tokens of other prefixes
 _MAX_NAMED: Final = 20  # vehicles or addresses in a hint
@@ -44,6 +44,20 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
         reason = f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
         return Absence(reason, is_fault=True)
     return Absence("start a source with 'nedbus serve'", is_fault=False)
+
+
+def describe_outdated(services: Sequence[ServiceStatus]) -> list[str]:
+    """Return a line for each of the first older services, whose reports are not used, and one for the others."""
+    outdated = [service for service in services if service.is_outdated]
+    lines: list[str] = []
+    for service in outdated[:_MAX_NAMED]:
+        where = f"service {to_text(service.service, 64)} on {to_text(service.host or 'an unknown host', 64)}"
+        version = f"nedbus {to_text(service.version or 'of an unknown version', 20)}"
+        lines.append(f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it")
+    more = len(outdated) - _MAX_NAMED
+    if more > 0:
+        lines.append(f"{counted(more, 'more older service')}, which any vehicle can invent")
+    return lines
 
 
 def _other_prefixes(bus: Bus) -> list[str]:

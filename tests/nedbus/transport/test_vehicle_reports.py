@@ -212,7 +212,10 @@ def test_refusal_cannot_be_hidden_by_another_vehicle(fleet: Fleet, run_nedbus: S
 
 @pytest.mark.process
 def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
-    """A service whose status key names no vehicle is named by health, info, list and the doctor."""
+    """A service whose status key names no vehicle is named by health, info, list, why and the doctor.
+
+    `why` also names the vehicles that only such a service could report.
+    """
     session, key = fleet.session("vehicle-1"), "nedbus/@service/old-1/status"
     status = {"host": "flyer", "version": "0.1.0", "sources": [{"source": "sim:", "addresses": [f"2/{VLP}"]}]}
     with answer_queries(session, key, _reply(key, status)):
@@ -223,8 +226,32 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
         assert "service old-1 on flyer runs nedbus 0.1.0" in health.err
         assert "service old-1 on flyer, nedbus 0.1.0" in fleet.run("info").out
         assert "old-1, which is older" in fleet.run("list").err
+        with fleet.bus("vehicle-1").publisher(VLP, vehicle="1") as publisher:
+            publisher.publish(INVALID)
+            assert "service old-1 on flyer runs nedbus 0.1.0" in fleet.run("why", "-v", "1").err
         doctor = run_command("doctor", *fleet.options("reader")).out
         assert "nedbus 0.1.0 on flyer: its status does not name its vehicle" in " ".join(doctor.split())
+
+
+@pytest.mark.process
+def test_vehicle_without_reports_is_named_beside_others(fleet: Fleet, run_nedbus: Start) -> None:
+    """`why` names a vehicle that only an older service reports, after the verdicts on all others; many in one line."""
+    run_nedbus("serve", *fleet.options("vehicle-2"), "--vehicle", "2", "-s", "sim:")
+    reader = fleet.bus("reader")
+    wait_for(lambda: service_of(reader, "2"), what="the service of vehicle 2")
+    statuses = {f"nedbus/@service/old-{number}/status": b'{"host": "h", "version": "0.1.0"}' for number in range(30)}
+    session = fleet.session("vehicle-1")
+    with (
+        fleet.bus("vehicle-1").publisher(VLP, vehicle="1") as publisher,
+        answer_queries(session, "nedbus/@service/*/status", reply_with(statuses)),
+    ):
+        publisher.publish(INVALID)
+        result = fleet.run("why")
+        assert result.exit_code == 0
+        assert result.out.startswith("2: ")
+        assert "no verdict on 1: published, but no nedbus service keeps the event history" in result.err
+        assert "10 more older services" in result.err
+        assert len(fleet.run("health", "--expect", "2").err.splitlines()) == 21
 
 
 @pytest.mark.process

@@ -11,6 +11,7 @@ from typing import Annotated, Final
 import typer
 
 from nedbus import __version__
+from nedbus.cli.absence import describe_outdated
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
@@ -28,7 +29,6 @@ _EXAMINED: Final = "Examine only this vehicle; also test the write permission"
 _LINK: Final = "Also listen on a MAVLink link, such as udpin:0.0.0.0:14540"
 _RULES: Final = "Router's configuration: name the rules for this client's certificate"
 _CONFIGS: Final = "Settings (.toml) or router files (.json5); default: the settings of serve"
-_MAX_OUTDATED: Final = 20  # older services named
 _REFUSED: Final = (
     ", although its service reports it as published: check that the access rules of the router allow the service to"
     " publish this vehicle, and this client to read it (docs/security.md)"
@@ -64,7 +64,7 @@ def health(
         raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
     check = _Check(bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within))
     faults = [*check.service_faults(), *check.vehicle_faults()]
-    for remark in check.outdated():
+    for remark in check.outdated:
         if remark not in faults:
             write_stderr(to_text(f"nedbus: {remark}", MAX_TEXT))
     if json_output:
@@ -88,7 +88,10 @@ def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
 
 
 class _Check:
-    """Replies of services and publishers, and their faults; `ages`: age of each vehicle's newest message [s]."""
+    """Replies of services and publishers, and their faults.
+
+    `ages`: age of each vehicle's newest message [s]. `outdated`: a line for each older service.
+    """
 
     def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
         self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
@@ -96,6 +99,7 @@ class _Check:
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self._statuses = [each for each in bus.services() if not self._is_local or each.host == _HOST]
         self.services = dict.fromkeys(each.service for each in self._statuses)
+        self.outdated = describe_outdated(self._statuses)
         self.sources = {(each.service, source.source) for each in self._statuses for source in each.sources}
         # A source occurs once for each of its vehicles.
         self._sources = [source for status in self._statuses for source in status.sources]
@@ -186,20 +190,9 @@ class _Check:
                 asked = replace(self._expected, expect=(name,), vehicles=None)
                 yield from faults_of([AccountReport("", _HOST, 0.0, own)], asked)
 
-    def outdated(self) -> Iterator[str]:
-        """Yield a line for each older service: its reports are not used."""
-        outdated = [status for status in self._statuses if status.is_outdated]
-        for status in outdated[:_MAX_OUTDATED]:
-            where = f"service {to_text(status.service, 64)} on {to_text(status.host or 'an unknown host', 64)}"
-            version = f"nedbus {to_text(status.version or 'of an unknown version', 20)}"
-            yield f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
-        more = len(outdated) - _MAX_OUTDATED
-        if more > 0:
-            yield f"{counted(more, 'more older service')}: any vehicle may claim to be one"
-
     def _faults_of_history(self) -> Iterator[str]:
         if not self._expected.expect:  # else the vehicles are asked, and an unrelated service is no fault of theirs
-            yield from self.outdated()
+            yield from self.outdated
         if self._expected.valid or self._expected.within is not None:
             with_history = {report.service for report in self._reports}
             outdated = {status.service for status in self._statuses if status.is_outdated}

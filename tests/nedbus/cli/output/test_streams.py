@@ -6,7 +6,6 @@ import pytest
 
 from nedbus.cli.output.streams import csv_line
 
-
 WIDE = ("\uff1d1", "\uff0b1", "\uff0d1", "\uff20A1")
 
 
