@@ -409,3 +409,21 @@ def test_flood_of_reports_and_heartbeats_takes_little_memory(
         reach_all()
     peaks = [peak_memory(process) for process in readers]
     assert [peak < 1.5 * least for peak, least in zip(peaks, rest, strict=True)] == [True, True, True], (rest, peaks)
+
+
+@pytest.mark.process
+def test_zenohd_logs_certificate_and_key_of_a_denial(pki: Path, tmp_path: Path, start: Start) -> None:
+    """At the level that docs/security.md names, a real zenohd logs who was denied what; the doctor adds the rule."""
+    endpoint = secure_endpoint()
+    file = write_config(pki, tmp_path / "router-secure.json5", endpoint)
+    level = "zenoh::net::routing::interceptor::access_control=trace"
+    zenohd = start_zenohd(start, "-c", str(file), RUST_LOG=f"info,{level}")
+    with open_client([endpoint], tls=client_tls(pki, "vehicle-1"), timeout=DEADLINE) as session:
+        session.put(f"nedbus/2/{VLP}", b"")
+
+        def denials() -> list[str]:
+            lines = (zenohd.out + zenohd.err).splitlines()
+            return [line for line in lines if "unauthorized" in line and f"nedbus/2/{VLP}" in line]
+
+        wait_for(denials, what="the denial in the log")
+    assert "vehicle-1" in denials()[0]
