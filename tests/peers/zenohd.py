@@ -44,4 +44,5 @@ def start_zenohd(start: Start, *arguments: str, **environment: str) -> Process:
     """Start zenohd with these arguments; the fixture `start` kills it at the end of the test."""
     path = zenohd_path()
     plugins = f"--plugin-search-dir={path.parents[1] / 'lib'}"
-    return start("-c", EXEC_SCRIPT, os.fspath(path), plugins, *arguments, NO_COLOR="1", RUST_LOG="info", **environment)
+    settings = {"NO_COLOR": "1", "RUST_LOG": "info"} | environment
+    return start("-c", EXEC_SCRIPT, os.fspath(path), plugins, *arguments, **settings)

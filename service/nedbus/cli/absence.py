@@ -5,6 +5,7 @@ from typing import Final, NamedTuple
 
 from nedbus import Bus
 from nedbus.health import ServiceStatus, SourceStatus
+from nedbus_msgs.text import counted
 
 from .output.streams import to_text
 
@@ -44,6 +45,20 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
         reason = f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
         return Absence(reason, is_fault=True)
     return Absence("start a source with 'nedbus serve'", is_fault=False)
+
+
+def describe_outdated(services: Sequence[ServiceStatus]) -> list[str]:
+    """Return a line for each of the first older services, whose reports are not used, and one for the others."""
+    outdated = [service for service in services if service.is_outdated]
+    lines: list[str] = []
+    for service in outdated[:_MAX_NAMED]:
+        where = f"service {to_text(service.service, 64)} on {to_text(service.host or 'an unknown host', 64)}"
+        version = f"nedbus {to_text(service.version or 'of an unknown version', 20)}"
+        lines.append(f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it")
+    more = len(outdated) - _MAX_NAMED
+    if more > 0:
+        lines.append(f"{counted(more, 'more older service')}, which any vehicle can invent")
+    return lines
 
 
 def _source_reasons(service: ServiceStatus, wanted: Sequence[str]) -> Iterator[str]:

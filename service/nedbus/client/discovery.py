@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
@@ -31,7 +33,8 @@ _log = logging.getLogger(__name__)
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
-_MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
+# Queued reports, each of at most 16 kB, the size limit of sessions; beyond that the oldest are dropped.
+_MAX_REPORTS: Final = 250
 
 
 class Vehicles(dict[str, list[Address]]):
@@ -99,22 +102,25 @@ class SourceStatus(UntrustedReply):
     def vehicles(self) -> set[str]:
         """The vehicles that this status names."""
         addresses = (*self.addresses, *self.stale, *self.silent, *(each.address for each in self.streams))
-        return {each.partition("/")[0] for each in addresses} | {each.vehicle for each in self.log_streams}
+        return {_vehicle_of(each) for each in addresses} | {each.vehicle for each in self.log_streams}
 
-    def about(self, vehicles: Collection[str]) -> SourceStatus:
-        """Return this status without what it says about other vehicles than these."""
+    def about(self, vehicle: str, *, refused: Collection[str]) -> SourceStatus:
+        """Return what this status says about one vehicle, and which streams it has of the `refused` ones."""
 
         def is_about(address: str) -> bool:
-            return address.partition("/")[0] in vehicles
+            return _vehicle_of(address) == vehicle
+
+        def is_named(address: str) -> bool:
+            return is_about(address) or _vehicle_of(address) in refused
 
         return replace(
             self,
-            addresses=tuple(filter(is_about, self.addresses)),
+            addresses=tuple(filter(is_named, self.addresses)),
             stale=tuple(filter(is_about, self.stale)),
             silent=tuple(filter(is_about, self.silent)),
-            streams=tuple(each for each in self.streams if is_about(each.address)),
-            log_streams=tuple(each for each in self.log_streams if each.vehicle in vehicles),
-            positions=tuple(each for each in self.positions if each.vehicle in vehicles),
+            streams=tuple(each for each in self.streams if is_named(each.address)),
+            log_streams=tuple(each for each in self.log_streams if each.vehicle == vehicle),
+            positions=tuple(each for each in self.positions if each.vehicle == vehicle),
         )
 
     @property
@@ -155,19 +161,34 @@ class ServiceStatus(UntrustedReply):
     def about(self, vehicle: str) -> ServiceStatus:
         """Return what this status says about one vehicle, and about sources without a vehicle.
 
-        Addresses of vehicles that the router refuses are kept, because no other key can name them.
+        Addresses and streams of vehicles that the router refuses are kept, because no other key can name them:
+        `own_streams` leaves them out.
         """
-        kept = {vehicle, *self.refused}
-        sources = (each.about(kept) for each in self.sources if not each.vehicles or vehicle in each.vehicles)
-        refused = (each.about(kept) for each in self.sources if each.vehicles and vehicle not in each.vehicles)
-        shown = (*sources, *(each for each in refused if each.vehicles))
-        return replace(self, vehicle=vehicle, sources=shown)
+        sources: list[SourceStatus] = []
+        others: list[SourceStatus] = []
+        for source in self.sources:
+            part = source.about(vehicle, refused=self.refused)
+            if not source.vehicles or vehicle in source.vehicles:
+                sources.append(part)
+            elif part.vehicles:
+                others.append(part)
+        return replace(self, vehicle=vehicle, sources=(*sources, *others))
+
+    @property
+    def own_streams(self) -> list[StreamStatus]:
+        """The streams of its vehicle: what it says about those of others decides nothing."""
+        streams = [stream for source in self.sources for stream in source.streams]
+        return [stream for stream in streams if _vehicle_of(stream.address) == self.vehicle]
 
     def split(self, _: int) -> list[ServiceStatus]:
         """Split into one status per source, or omit the stream health of the only one; return [] if neither applies."""
         if len(self.sources) > 1:
             return [replace(self, sources=(each,)) for each in self.sources]
         return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
+
+
+def _vehicle_of(address: str) -> str:
+    return address.partition("/")[0]
 
 
 @cache
@@ -181,6 +202,9 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
 
     Large replies then do not delay the messages of the bus. Ignores oversized replies, and what a service says of
     other vehicles than that of the key.
+
+    The first status of each vehicle comes first, older services last: whoever shows only some leaves out those of the
+    vehicles that claim most services.
     """
     found: dict[tuple[str | None, str], ServiceStatus] = {}
     for vehicle, service, content in _find(session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout):
@@ -194,7 +218,13 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
         known = found.get((vehicle, service))
         sources = part.sources if known is None else (*known.sources, *part.sources)
         found[vehicle, service] = replace(part, sources=sources)
-    return list(found.values())
+    known_of = Counter[str]()
+    ranked: list[tuple[bool, int, ServiceStatus]] = []
+    for status in found.values():
+        ranked.append((status.is_outdated, known_of[status.vehicle], status))
+        known_of[status.vehicle] += 1
+    ranked.sort(key=lambda each: each[:2])
+    return [status for _, _, status in ranked]
 
 
 def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
@@ -220,7 +250,11 @@ def _find(session: Session, selector: str, *, prefix: str, timeout: float) -> It
     """
 
     def vehicle_of(key: str) -> str:
-        return key.removeprefix(f"{prefix}/@service/").partition("/")[0]
+        with suppress(AddressError):
+            vehicle, _ = parse_status_key(key, prefix=prefix)
+            if vehicle is not None:
+                return vehicle
+        return ""  # any vehicle may write such keys, so they share the part of one
 
     for key, content in parse_replies(query(session, selector, timeout=timeout, group_of=vehicle_of)):
         try:
@@ -271,7 +305,7 @@ class Rejections:
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
     def take(self) -> list[RejectionReport]:
-        """Return the reports received since the last call, at most 1000, without waiting."""
+        """Return the reports received since the last call, at most 250, without waiting."""
         with translate_zenoh_errors():
             samples = list(islice(iter(self._handler.try_recv, None), _MAX_REPORTS))
         reports: list[RejectionReport] = []

@@ -70,7 +70,8 @@ def query(
     """Return the replies to all selectors received within `timeout` seconds, possibly several per key.
 
     At most 10,000 replies and 64 MB in total are accepted; the number of replies beyond that is logged.
-    `group_of`: return the group of a key. Beyond the limits, the group that uses most of them loses replies first.
+    `group_of`: return the group of a key. Beyond the limits, the group that uses most of them loses replies first. The
+    replies of the groups that use least come first, so the same holds for a limit of the caller.
     """
     accepted = _Accepted()
     replies = wait_for_replies([send_query(session, selector, timeout=timeout) for selector in selectors])
@@ -81,7 +82,7 @@ def query(
         _log.warning(
             text, ", ".join(selectors), accepted.dropped, accepted.count + accepted.dropped, extra=about("incomplete")
         )
-    return [sample for samples in accepted.groups.values() for sample in samples]
+    return accepted.samples()
 
 
 class _Accepted:
@@ -104,6 +105,11 @@ class _Accepted:
             self.dropped += 1
             if self._largest != group:  # else the next reply of a flood needs no search
                 self._largest = max(self._used, key=self._used.__getitem__)
+
+    def samples(self) -> list[RawSample]:
+        """Return the accepted replies, those of the smallest group first."""
+        ordered = sorted(self.groups, key=self._used.__getitem__)
+        return [sample for group in ordered for sample in self.groups[group]]
 
     def _count(self, group: str, sample: RawSample, sign: int) -> None:
         size = len(sample.payload) + len(str(sample.key_expr))

@@ -18,7 +18,9 @@ from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
 Heartbeats = dict[tuple[str, str], int]  # newest sequence number by key and publisher
 
-_MAX_HEARTBEATS: Final = 16_384  # heartbeats in the channel
+# Heartbeats in the channel. Each may keep a receive buffer in memory, of which 4 kB or more are in use.
+# A lost heartbeat is followed by another.
+_MAX_HEARTBEATS: Final = 4096
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
 _MAX_KEY: Final = 1024  # characters of a heartbeat key; longer keys are ignored, because keys are cached
 _PAYLOAD_BYTES: Final = 4

@@ -134,13 +134,14 @@ def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountRepo
     """Return the events of reports in chronological order, each with its report.
 
     A service reports events of its link and its load for each of its vehicles; they occur once, with the vehicle ALL.
+    Only equal ones are merged: the report about one vehicle replaces no event in that about another.
     """
     found: dict[object, tuple[AccountReport, Event]] = {}
     for report in reports:
         for event in report.events:
             if event.kind in OF_SERVICE:
-                key: object = (report.service, report.host, event.kind, event.change, event.time)
-                found.setdefault(key, (report, replace(event, vehicle=ALL)))
+                content = (event.kind, event.change, event.severity, event.text, event.time, event.lasted)
+                found.setdefault((report.service, report.host, content), (report, replace(event, vehicle=ALL)))
             else:
                 found[id(event)] = report, event
     return sorted(found.values(), key=lambda each: each[1].time)

@@ -16,9 +16,16 @@ from .numbered import publish, receive_timestamps
 class LossyQueue(Inbox):
     """A queue that loses the messages whose sequence numbers are in `missing`."""
 
-    def __init__(self, key_expr: str) -> None:
-        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), key_exprs=[key_expr])
+    def __init__(self, key_expr: str, *, limit: int | None = None) -> None:
+        decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
+        super().__init__("every", decoder, key_exprs=[key_expr], limit=limit)
         self.missing: Collection[int] = ()
+        self.polls = 0  # how often the I/O thread has asked whether it may request
+
+    @property
+    def may_recover(self) -> bool:
+        self.polls += 1
+        return super().may_recover
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         rest = [raw for raw in batch if raw.source_info is None or raw.source_info.source_sn not in self.missing]

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
+from dataclasses import asdict
 from functools import partial
 from typing import cast
 
@@ -22,6 +23,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
+from nedbus.client import StreamHealth
 from nedbus.timings import Timings
 from nedbus.transport import Session, fleet_tokens, liveliness, open_router
 from nedbus.transport.queries import Replies
@@ -346,6 +348,56 @@ def test_bytes_of_replies_are_bounded(
         assert len(bus.services(timeout=DEADLINE)) == 10
     text = "dropped 40 of 50 replies beyond the limits of a query, so the result is incomplete"
     assert f"nedbus/@service/**/status: {text}" in caplog.messages
+
+
+@pytest.mark.parametrize("key", ["nedbus/@service/x{}/status", "nedbus/@service/1/x{}/status"])
+def test_flood_of_statuses_hides_no_other_vehicle(
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, *, key: str
+) -> None:
+    """Statuses on keys of one vehicle, or on those without a vehicle, use up the limits without hiding vehicle 2."""
+    monkeypatch.setattr("nedbus.transport.queries.MAX_REPLIES", 40)
+    own = json.dumps({"host": "h", "refused": ["3"], "sources": [{"warnings": ["x" * 500]}]}).encode()
+    flood = {key.format(number): b"{}" for number in range(100)}
+    answers = {**flood, "nedbus/@service/2/own/status": own}
+    with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with(answers)):
+        services = bus.services(timeout=DEADLINE)
+    assert len(services) == 40
+    [status] = [each for each in services if each.vehicle == "2"]
+    assert status.refused == ("3",)
+    assert status in services[:2]  # what shows only some shows it
+
+
+def test_memory_for_replies_is_taken_from_the_largest_vehicle(
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Statuses of vehicle 1 that fill the memory for parsed replies, and arrive first, leave that of vehicle 2."""
+    monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**14)
+    flood = {f"nedbus/@service/1/x{number}/status": b'{"host": "h"}' for number in range(200)}
+    answers = {**flood, "nedbus/@service/2/own/status": b'{"host": "honest"}'}
+    with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with(answers)):
+        services = bus.services(timeout=DEADLINE)
+    assert 1 < len(services) < 200
+    assert "honest" in [each.host for each in services]
+
+
+def test_refusal_of_a_vehicle_reports_nothing_else_about_it(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """A status of vehicle 1 that says it is refused as vehicle 2 has its streams, but no links of vehicle 2."""
+    health = asdict(StreamHealth(VLP).snapshot())
+    sources = [
+        {"source": "a", "addresses": [f"1/{VLP}", f"2/{VLP}"], "stale": ["2/x"], "silent": ["2/x"],
+         "streams": [{"address": f"{each}/{VLP}", "health": health} for each in (1, 2, 3)],
+         "log_streams": [{"vehicle": "2"}], "positions": [{"vehicle": "2"}]},
+        {"source": "b", "addresses": [f"2/{VLP}"]}, {"source": "c", "addresses": [f"3/{VLP}"]},
+    ]  # fmt: skip
+    status = json.dumps({"refused": ["2"], "sources": sources}).encode()
+    key = "nedbus/@service/1/x/status"
+    with answer_queries(zenoh_session, key, reply_with({key: status})):
+        [found] = bus.services(timeout=DEADLINE)
+    first, second = found.sources
+    assert (first.addresses, second.addresses) == ((f"1/{VLP}", f"2/{VLP}"), (f"2/{VLP}",))
+    assert [each.address for each in first.streams] == [f"1/{VLP}", f"2/{VLP}"]
+    assert [each.address for each in found.own_streams] == [f"1/{VLP}"]
+    assert (first.stale, first.silent, first.log_streams, first.positions) == ((), (), (), ())
 
 
 def test_vehicle_with_many_streams_hides_no_other(

@@ -64,6 +64,36 @@ def test_excluded_vehicle_is_listed_again(
         wait_for(lambda: (vehicles := bus.vehicles(timeout=0.1)).complete and len(vehicles) == 2, what="both vehicles")
 
 
+def test_number_of_excluded_vehicles_is_bounded(
+    endpoint: str, zenoh_session: Session, limits: Timings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A further vehicle above the limit stays listed if its exclusion would take too many key expressions."""
+    monkeypatch.setattr(fleet_tokens, "_MAX_KEY_EXPRS", 2 * 64)
+    tokens = declare(zenoh_session, "a", LIMIT + 1) + declare(zenoh_session, "7", 1)
+    with nedbus.connect(endpoint) as bus:
+        wait_for(lambda: list(bus.vehicles()) == ["7"], what="the exclusion of the first vehicle")
+        tokens += declare(zenoh_session, "further", LIMIT + 1)
+        wait_for(lambda: len(bus.vehicles().get("further", ())) == 1, what="the further vehicle")
+        wait_for(lambda: sum(bus.publishers().values()) == LIMIT + 2, what="all its tokens")
+        assert list(bus.vehicles()) == ["7", "further"]
+    assert len(tokens) == 2 * LIMIT + 3
+
+
+def test_names_that_are_too_long_count_as_one_vehicle(
+    endpoint: str, zenoh_session: Session, limits: Timings, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A peer that invents names of over 64 characters, one token each, reaches the limit of a vehicle with them."""
+    start = "x" * 65
+    tokens = declare(zenoh_session, "7", 1)
+    for number in range(LIMIT + 1):
+        tokens += declare(zenoh_session, f"{start}{number}", 1)
+    with nedbus.connect(endpoint) as bus:
+        wait_for(lambda: list(bus.vehicles()) == ["7"], what="the other vehicle")
+        assert f"the streams of '{start}' are not listed" in caplog.text
+        assert not bus.vehicles(timeout=0.0).complete
+    assert len(tokens) == LIMIT + 2
+
+
 def test_list_without_a_vehicle_with_too_many_tokens_is_incomplete(
     endpoint: str, zenoh_session: Session, limits: Timings
 ) -> None:

@@ -5,10 +5,12 @@ The peers are a real zenohd with the shipped access rules, real certificates of 
 
 from __future__ import annotations
 
+import itertools
 import json
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
@@ -16,14 +18,17 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus.client import StreamHealth
 from nedbus.pki import write_access_rules
 from nedbus.transport import Session, open_client, query, token_keys
 from nedbus.web.server import LiveFleet
 from nedbus_msgs import Selection, ack_key
 from tests.flights.messages import VLP
-from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, tls_settings, write_config
 from tests.peers.command_line import CommandResult, run_command
-from tests.peers.processes import Start
+from tests.peers.http_client import HttpClient
+from tests.peers.ports import free_port
+from tests.peers.processes import Process, Start
 from tests.peers.queryables import answer_queries, reply_with
 from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, wait_for
@@ -37,6 +42,15 @@ INVALID: Final = {
 FORGED_EVENT: Final = {
     "vehicle": "2", "kind": "failsafe", "change": "begin", "severity": "bad", "text": "forged failsafe", "time": 1e9,
 }  # fmt: skip
+UNREAD: Final = """
+import sys, nedbus
+with nedbus.connect() as bus:
+    kept = bus.rejections(), bus.subscribe("*", mode="every")
+    print("ready", flush=True)
+    for sample in bus.subscribe("vehicle_attitude"):
+        print(sample.message.timestamp, flush=True)
+"""
+"""A script that never reads the rejections and the messages to which it subscribes; it prints when it is reached."""
 HEALTHY: Final = {"severity": "info", "text": "ok", "has_position": True, "topics": [VLP], "first": 1e9}
 
 
@@ -62,12 +76,17 @@ class Fleet:
         return ["-c", self.endpoint, *tls_options(self._pki, name)]
 
     @contextmanager
-    def forging(self, *services: str) -> Iterator[None]:
+    def forging(self, *services: str, refused: Sequence[str] = ()) -> Iterator[None]:
         """Answer as vehicle 1 on its own key, on those of vehicle 2, and on keys without a vehicle, about vehicle 2."""
-        session, stream = self.session("vehicle-1"), {"address": f"2/{VLP}", "health": {"age": 0.0, "messages": 9}}
+        session = self.session("vehicle-1")
+        health = replace(StreamHealth(VLP).snapshot(), age=0.0, messages=9, usual_interval=1e9)
+        source = {
+            "source": "sim:", "state": "running", "addresses": [f"2/{VLP}"],
+            "streams": [{"address": f"2/{VLP}", "health": asdict(health)}], "log_streams": [{"vehicle": "2"}],
+        }  # fmt: skip
+        # That the router refuses vehicle 2 must not let it report anything else about vehicle 2.
         status = {
-            "host": socket.gethostname(), "version": nedbus.__version__, "refused": [],
-            "sources": [{"source": "sim:", "state": "running", "addresses": [f"2/{VLP}"], "streams": [stream]}],
+            "host": socket.gethostname(), "version": nedbus.__version__, "refused": refused, "sources": [source],
         }  # fmt: skip
         with ExitStack() as answering:
             for service in ("x", *services):
@@ -123,6 +142,24 @@ def test_health_of_a_vehicle_depends_on_its_own_certificate(fleet: Fleet) -> Non
 
 
 @pytest.mark.process
+def test_claimed_refusal_lets_no_vehicle_report_about_another(fleet: Fleet) -> None:
+    """A service of vehicle 1 that reports vehicle 2 as refused measures no stream of vehicle 2: it is stale in `list`.
+
+    `health --vehicle 2` asks vehicle 2, and goes by the age of its answer.
+    """
+    with fleet.bus("vehicle-2").publisher(VLP, vehicle="2") as publisher:
+        publisher.publish(INVALID)
+        with fleet.forging(refused=["2"]):
+            reader = fleet.bus("reader")
+            wait_for(lambda: [each for each in reader.services() if each.refused == ("2",)], what="the forged status")
+            assert [each.own_streams for each in reader.services()] == [[], []]
+            # 3 s without a message make the stream stale; the forged interval of years would not.
+            wait_for(lambda: "stale" in fleet.run("list").out, what="a stale stream of vehicle 2")
+            assert fleet.run("health", "-v", "2", "--max-age", "0.5").exit_code == 1
+            assert "ULog stream of vehicle 2" not in fleet.run("info").out
+
+
+@pytest.mark.process
 def test_events_and_verdicts_of_a_vehicle_are_its_own(fleet: Fleet, run_nedbus: Start) -> None:
     """`why -v 2`, `events` and the page show what the service of vehicle 2 reports, and nothing of vehicle 1."""
     run_nedbus("serve", *fleet.options("vehicle-2"), "--vehicle", "2", "-s", "sim:")
@@ -175,7 +212,10 @@ def test_refusal_cannot_be_hidden_by_another_vehicle(fleet: Fleet, run_nedbus: S
 
 @pytest.mark.process
 def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
-    """A service whose status key names no vehicle is named by health, info, list and the doctor."""
+    """A service whose status key names no vehicle is named by health, info, list, why and the doctor.
+
+    `why` also names the vehicles that only such a service could report.
+    """
     session, key = fleet.session("vehicle-1"), "nedbus/@service/old-1/status"
     status = {"host": "flyer", "version": "0.1.0", "sources": [{"source": "sim:", "addresses": [f"2/{VLP}"]}]}
     with answer_queries(session, key, _reply(key, status)):
@@ -186,8 +226,32 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
         assert "service old-1 on flyer runs nedbus 0.1.0" in health.err
         assert "service old-1 on flyer, nedbus 0.1.0" in fleet.run("info").out
         assert "old-1, which is older" in fleet.run("list").err
+        with fleet.bus("vehicle-1").publisher(VLP, vehicle="1") as publisher:
+            publisher.publish(INVALID)
+            assert "service old-1 on flyer runs nedbus 0.1.0" in fleet.run("why", "-v", "1").err
         doctor = run_command("doctor", *fleet.options("reader")).out
         assert "nedbus 0.1.0 on flyer: its status does not name its vehicle" in " ".join(doctor.split())
+
+
+@pytest.mark.process
+def test_vehicle_without_reports_is_named_beside_others(fleet: Fleet, run_nedbus: Start) -> None:
+    """`why` names a vehicle that only an older service reports, after the verdicts on all others; many in one line."""
+    run_nedbus("serve", *fleet.options("vehicle-2"), "--vehicle", "2", "-s", "sim:")
+    reader = fleet.bus("reader")
+    wait_for(lambda: service_of(reader, "2"), what="the service of vehicle 2")
+    statuses = {f"nedbus/@service/old-{number}/status": b'{"host": "h", "version": "0.1.0"}' for number in range(30)}
+    session = fleet.session("vehicle-1")
+    with (
+        fleet.bus("vehicle-1").publisher(VLP, vehicle="1") as publisher,
+        answer_queries(session, "nedbus/@service/*/status", reply_with(statuses)),
+    ):
+        publisher.publish(INVALID)
+        result = fleet.run("why")
+        assert result.exit_code == 0
+        assert result.out.startswith("2: ")
+        assert "no verdict on 1: published, but no nedbus service keeps the event history" in result.err
+        assert "10 more older services" in result.err
+        assert len(fleet.run("health", "--expect", "2").err.splitlines()) == 21
 
 
 @pytest.mark.process
@@ -196,14 +260,20 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
     [f"nedbus/2/{VLP}", f"nedbus/2/{VLP}/@rate/5", f"nedbus/2/{VLP}/@adv/pub/1a/1/_", f"nedbus/@rejected/2/{VLP}",
      "nedbus/2/@doctor/1a"],
 )  # fmt: skip
-def test_vehicle_cannot_put_on_keys_of_another(fleet: Fleet, key: str) -> None:
-    """A put of vehicle 1 on a key of vehicle 2 reaches no reader; a later one of vehicle 2 does."""
-    one, two = fleet.session("vehicle-1"), fleet.session("vehicle-2")
+def test_other_certificates_cannot_put_on_keys_of_a_vehicle(fleet: Fleet, key: str) -> None:
+    """A put of vehicle 1, a reader, an operator or a stranger on a key of vehicle 2 reaches no reader.
+
+    Neither does one of vehicle 1 on a key expression that includes the key; a later one of vehicle 2 does.
+    """
+    two = fleet.session("vehicle-2")
+    others = [fleet.session(name) for name in ("vehicle-1", "reader", "operator", "stranger")]
     subscriber = fleet.session("reader").declare_subscriber(key, zenoh.handlers.RingChannel(10))
     received: list[bytes] = []
 
     def is_received() -> bool:
-        one.put(key, b"1")
+        for other in others:
+            other.put(key, b"1")
+            other.put(key.replace("2", "*", 1), b"1")
         two.put(key, b"2")
         received.extend(sample.payload.to_bytes() for sample in iter(subscriber.handler.try_recv, None))
         return len(received) > 2
@@ -214,7 +284,10 @@ def test_vehicle_cannot_put_on_keys_of_another(fleet: Fleet, key: str) -> None:
 
 @pytest.mark.process
 def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
-    """Vehicle 1 can neither answer queries on keys of vehicle 2 nor declare its liveliness tokens."""
+    """Vehicle 1 can neither answer queries on keys of vehicle 2 nor declare its liveliness tokens.
+
+    Its answer on its own key cannot carry a key of vehicle 2, or one that includes it, either.
+    """
     one, reader = fleet.session("vehicle-1"), fleet.session("reader")
     keys = ("nedbus/@schema/2/VehicleAttitude", "nedbus/@service/2/x/status", f"nedbus/2/{VLP}")
     own = "nedbus/@service/1/x/status"
@@ -224,6 +297,10 @@ def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
             answering.enter_context(answer_queries(one, key, _reply(key, {})))
         wait_for(lambda: query(reader, own, timeout=DEADLINE), what="the reply on its own key")
         assert [query(reader, key, timeout=1.0) for key in keys] == [[], [], []]
+    carried = {"nedbus/@service/2/x/status": b"{}", "nedbus/@service/*/x/status": b"{}", own: b"{}"}
+    with answer_queries(one, own, reply_with(carried)):
+        replies = query(reader, "nedbus/@service/**/status", timeout=DEADLINE)
+        assert [str(reply.key_expr) for reply in replies] == [own]
     assert token_keys(reader, "nedbus/2/@alive/**", timeout=1.0) == []
     del token
 
@@ -273,3 +350,80 @@ def test_service_of_several_vehicles_has_a_certificate_that_says_so(
         wait_for(lambda: service_of(reader, "1") and service_of(reader, "2"), what="the reports about both vehicles")
         assert service_of(reader, "1") == service_of(reader, "2")
         assert fleet.run("health", "--expect", "1,2").exit_code == 0
+
+
+def peak_memory(process: Process) -> int:
+    """Return the largest resident memory of a process so far [kB]."""
+    status = Path(f"/proc/{process.popen.pid}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0])
+
+
+@pytest.mark.slow
+def test_flood_of_reports_and_heartbeats_takes_little_memory(
+    fleet: Fleet, pki: Path, start: Start, run_nedbus: Start
+) -> None:
+    """Puts of vehicle 1 on its @rejected and @adv keys let no reader need 1.5 times its memory at rest.
+
+    The readers are a script that reads nothing, the exporter and the page. The puts are as large as the router's rules
+    and the readers' own limits allow, and larger.
+    """
+    http = [HttpClient(free_port()) for _ in range(2)]
+    tls = {f"NEDBUS_{name.upper()}": str(path) for name, path in tls_settings(pki, "reader").items()}
+    script = start("-c", UNREAD, NEDBUS_CONNECT=fleet.endpoint, coverage=False, **tls)
+    readers = [script, *(
+        run_nedbus(command, "--wait", *fleet.options("reader"), "--http", client.where, coverage=False)
+        for command, client in zip(("export", "web"), http, strict=True)
+    )]  # fmt: skip
+    vehicle = fleet.bus("vehicle-1")
+    attitude = vehicle.publisher("vehicle_attitude", vehicle="1")
+    timestamps = itertools.count(1)
+
+    def received() -> list[float]:
+        """Return how many messages each reader has received."""
+        counts = [sum(client.values("nedbus_messages_received_total", topic="vehicle_attitude")) for client in http]
+        return [len(script.out.split()), *counts]
+
+    def reach_all() -> None:
+        """Publish messages until each reader has received one, and so all that was put before."""
+        before = received()
+
+        def are_reached() -> bool:
+            attitude.publish({"timestamp": next(timestamps), "q": (1.0, 0.0, 0.0, 0.0)})
+            return all(now > earlier for now, earlier in zip(received(), before, strict=True))
+
+        wait_for(are_reached, what="all readers")
+
+    wait_for(lambda: "ready" in script.out, what="the script")
+    for _ in range(3):
+        reach_all()
+    rest = [peak_memory(process) for process in readers]
+    session, block = vehicle._session, zenoh.CongestionControl.BLOCK
+    report, heartbeat = f"nedbus/@rejected/1/{VLP}", f"nedbus/1/{VLP}/@adv/pub/1a/1/_"
+    reason = json.dumps({"reason": "x" * 16_000}).encode()
+    for _ in range(4):
+        for _ in range(1500):
+            session.put(report, reason, congestion_control=block)
+            for size in (64, 4, 65, 16_384):
+                session.put(heartbeat, bytes(size), congestion_control=block)
+        session.put(report, bytes(2**20 - 1000), congestion_control=block)
+        reach_all()
+    peaks = [peak_memory(process) for process in readers]
+    assert [peak < 1.5 * least for peak, least in zip(peaks, rest, strict=True)] == [True, True, True], (rest, peaks)
+
+
+@pytest.mark.process
+def test_zenohd_logs_certificate_and_key_of_a_denial(pki: Path, tmp_path: Path, start: Start) -> None:
+    """At the level that docs/security.md names, a real zenohd logs who was denied what; the doctor adds the rule."""
+    endpoint = secure_endpoint()
+    file = write_config(pki, tmp_path / "router-secure.json5", endpoint)
+    level = "zenoh::net::routing::interceptor::access_control=trace"
+    zenohd = start_zenohd(start, "-c", str(file), RUST_LOG=f"info,{level}")
+    with open_client([endpoint], tls=client_tls(pki, "vehicle-1"), timeout=DEADLINE) as session:
+        session.put(f"nedbus/2/{VLP}", b"")
+
+        def denials() -> list[str]:
+            lines = (zenohd.out + zenohd.err).splitlines()
+            return [line for line in lines if "unauthorized" in line and f"nedbus/2/{VLP}" in line]
+
+        wait_for(denials, what="the denial in the log")
+    assert "vehicle-1" in denials()[0]

@@ -332,3 +332,14 @@ def test_loss_of_a_link_is_one_fault_of_its_service() -> None:
     forged = whole.about("1")
     other = AccountReport("other", "host", 100.0, {"3": vehicles["1"]})
     assert faults_of([forged, other], Expectation(expect=("3",), within=90.0)) == []
+
+
+def test_report_about_one_vehicle_replaces_no_event_of_another() -> None:
+    """Whoever reports about vehicle 1 can copy service, host and time of an event of vehicle 2, but not replace it."""
+    vehicles = {name: VehicleReport("info", "ok", has_position=True) for name in ("1", "2")}
+    lost = Event(ALL, "link_down", "begin", "bad", "no link to tcp/a", 50.0)
+    genuine = AccountReport("gcs", "host", 100.0, vehicles, (lost,)).about("2")
+    forged = AccountReport("gcs", "host", 100.0, vehicles, (replace(lost, severity="info", text="ok"),)).about("1")
+    for reports in ([forged, genuine], [genuine, forged]):
+        found = faults_of(reports, Expectation(within=90.0))
+        assert [fault.partition(", at")[0] for fault in found] == ["host: no link to tcp/a"]

@@ -11,6 +11,7 @@ from typing import Annotated, Final
 import typer
 
 from nedbus import Bus, Sample, __version__
+from nedbus.cli.absence import describe_outdated
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
@@ -65,7 +66,7 @@ def health(
         raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
     check = _Check(bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within))
     faults = [*check.service_faults(), *check.vehicle_faults()]
-    for remark in check.outdated():
+    for remark in check.outdated:
         if remark not in faults:
             write_stderr(to_text(f"nedbus: {remark}", MAX_TEXT))
     if json_output:
@@ -89,7 +90,10 @@ def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
 
 
 class _Check:
-    """Replies of services and publishers, and their faults; `ages`: age of each vehicle's newest message [s]."""
+    """Replies of services and publishers, and their faults.
+
+    `ages`: age of each vehicle's newest message [s]. `outdated`: a line for each older service.
+    """
 
     def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
         self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
@@ -97,17 +101,17 @@ class _Check:
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self._statuses = [each for each in bus.services() if not self._is_local or each.host == _HOST]
         self.services = dict.fromkeys(each.service for each in self._statuses)
+        self.outdated = describe_outdated(self._statuses)
         self.sources = {(each.service, source.source) for each in self._statuses for source in each.sources}
         # A source occurs once for each of its vehicles.
         self._sources = [source for status in self._statuses for source in status.sources]
         self.ages: dict[str, float] = {}  # as measured by the services
         for status in self._statuses:
-            for source in status.sources:
-                for stream in source.streams:
-                    name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
-                    is_published = stream.address in source.addresses
-                    if age is not None and name == status.vehicle and is_published:  # its word on others does not count
-                        self.ages[name] = min(age, self.ages.get(name, age))
+            published = {address for source in status.sources for address in source.addresses}
+            for stream in status.own_streams:
+                age = stream.health.age
+                if age is not None and stream.address in published:
+                    self.ages[status.vehicle] = min(age, self.ages.get(status.vehicle, age))
         self._reports = bus.accounts(within=expected.within or 0.0)
         self._known = {name for report in self._reports for name in report.vehicles}
         self._publishers = bus.publishers()
@@ -188,17 +192,9 @@ class _Check:
                 asked = replace(self._expected, expect=(name,), vehicles=None)
                 yield from faults_of([AccountReport("", _HOST, 0.0, own)], asked)
 
-    def outdated(self) -> Iterator[str]:
-        """Yield a line for each older service: its reports are not used."""
-        for status in self._statuses:
-            if status.is_outdated:
-                where = f"service {to_text(status.service, 64)} on {to_text(status.host or 'an unknown host', 64)}"
-                version = f"nedbus {to_text(status.version or 'of an unknown version', 20)}"
-                yield f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
-
     def _faults_of_history(self) -> Iterator[str]:
         if not self._expected.expect:  # else the vehicles are asked, and an unrelated service is no fault of theirs
-            yield from self.outdated()
+            yield from self.outdated
         if self._expected.valid or self._expected.within is not None:
             with_history = {report.service for report in self._reports}
             outdated = {status.service for status in self._statuses if status.is_outdated}

@@ -132,6 +132,8 @@ def why(
             history = bus.history()
             published = bus.vehicles()
             _require_history(bus, history, published, vehicle or ())
+            if not vehicle:
+                _name_unreported(bus, [name for name in published if name not in history.vehicles])
         where, advice = "the history of the services", _LIVE_ADVICE
     _require_vehicles(where, history.vehicles, vehicle or ())
     faults, texts = 0, list[str]()
@@ -163,6 +165,7 @@ def _verdict(history: EventHistory, vehicle: str, at: str | None) -> Verdict:
 def _require_history(bus: "Bus", history: EventHistory, published: Collection[str], vehicles: Collection[str]) -> None:
     for name in vehicles:
         if name in published and name not in history.vehicles:
+            _name_outdated(bus)
             hint = f"follow it with 'nedbus events --vehicle {name}'"
             raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
     if not history.vehicles:
@@ -171,6 +174,21 @@ def _require_history(bus: "Bus", history: EventHistory, published: Collection[st
         routers = " or ".join(bus.routers)
         reason = explain_absence(bus, ()).reason
         raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: {reason}")
+
+
+def _name_unreported(bus: "Bus", vehicles: Sequence[str]) -> None:
+    """Name vehicles that are published, but about which no service reports, and older services."""
+    if vehicles:
+        names = to_text(", ".join(vehicles), _MAX_TEXT)
+        write_stderr(f"no verdict on {names}: published, but no nedbus service keeps the event history")
+        _name_outdated(bus)
+
+
+def _name_outdated(bus: "Bus") -> None:
+    from nedbus.cli.absence import describe_outdated  # loads Zenoh, which files do not need
+
+    for line in describe_outdated(bus.services()):
+        write_stderr(line)
 
 
 def _describe(verdict: Verdict, story: Story, advice: str) -> Iterator[str]:

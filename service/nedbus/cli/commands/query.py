@@ -81,8 +81,7 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
 
 def _measured_by_services(bus: Bus) -> dict[str, Health]:
     """Return the health of the streams that services report, by address; one message reveals no usual interval."""
-    sources = [source for service in bus.services() for source in service.sources]
-    return {stream.address: stream.health for source in sources for stream in source.streams}
+    return {stream.address: stream.health for service in bus.services() for stream in service.own_streams}
 
 
 @command

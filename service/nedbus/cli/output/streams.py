@@ -16,7 +16,8 @@ from nedbus.log_event import about
 MAX_TEXT: Final = 1000  # maximum number of characters of an error or log line
 STRUCTURED: Final = "structured"  # name of the log handler if the log is read by a program: JSON, or the journal
 _MAX_CELL: Final = 120  # characters of a value from a peer
-_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r")
+# As listed by OWASP, with the wide forms of Japanese input.
+_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 _log = logging.getLogger("nedbus")
 
 

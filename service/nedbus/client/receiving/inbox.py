@@ -91,6 +91,7 @@ class Inbox:
         self.gaps = self._reorder.gaps
         limit = limit or (streams.MAX_KEYS if self.newest_only else CAPACITY)
         more_keys = f"more keys than the limit of {limit:,} have an unread message, so the oldest messages are dropped"
+        self._max_before_recovery = limit // 2
         self._limited = more_keys if self.newest_only else _SLOW
         self._unread = Unread(self._counters, newest_only=self.newest_only, limit=limit)
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # the oldest may go unanswered
@@ -106,6 +107,11 @@ class Inbox:
     def waiting(self) -> int:
         """Number of unread messages."""
         return len(self._unread)
+
+    @property
+    def may_recover(self) -> bool:
+        """True while at most half of the limit is unread; above it, recovered messages would displace unread ones."""
+        return self.waiting <= self._max_before_recovery
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue a batch in order of arrival, reject invalid samples and wake the reader.

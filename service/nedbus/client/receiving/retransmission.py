@@ -16,7 +16,6 @@ from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_hear
 from nedbus_msgs import PAYLOAD_LIMIT
 
 from .inbox import Inbox
-from .unread import CAPACITY
 from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
@@ -24,7 +23,6 @@ _log = logging.getLogger(__name__)
 _MAX_OPEN: Final = 64  # requests in flight
 _MAX_OPEN_HISTORY: Final = 16  # requests in flight to publishers that have delivered no message yet
 _MAX_OPEN_OF_KEY: Final = 4  # requests in flight on one key, whose publishers may never answer
-_MAX_WAITING: Final = CAPACITY // 2  # unread messages; above this, requests pause: answers would displace messages
 _TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
@@ -57,7 +55,7 @@ class Retransmission:
         recovered_key = ""
         for writer, answers in list(self._open.items()):
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
-        if self._inbox.waiting <= _MAX_WAITING:
+        if self._inbox.may_recover:
             for writer in list(self._inbox.gaps.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break

@@ -6,8 +6,10 @@ import pytest
 
 from nedbus.cli.output.streams import csv_line
 
+WIDE = ("\uff1d1", "\uff0b1", "\uff0d1", "\uff20A1")
 
-@pytest.mark.parametrize("text", ["=1+1", "+SUM(A1)", "-A1", "@A1", "\t=1", "\r=1"])
+
+@pytest.mark.parametrize("text", ["=1+1", "+SUM(A1)", "-A1", "@A1", "\t=1", "\r=1", "\n=1", *WIDE])
 def test_text_cell_is_not_a_formula(text: str) -> None:
     """A text that a spreadsheet would evaluate is preceded by an apostrophe."""
     assert csv_line([text]).strip('"').startswith(f"'{text[0]}")

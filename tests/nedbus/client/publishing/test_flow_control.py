@@ -123,6 +123,12 @@ def test_window_is_shared_by_active_publishers() -> None:
     assert shared.share("a", 100, now=1.8) == WINDOW
 
 
+def test_each_of_many_publishers_has_a_window_of_100_messages() -> None:
+    """However many publishers share the window, 100 messages of each may be unacknowledged."""
+    shared = SharedWindow()
+    assert [shared.share(f"{number}", 100, now=0.0) for number in range(500)][-1] == 100
+
+
 def test_shares_of_two_threads_do_not_overwrite_each_other() -> None:
     """A publisher that asks for its share while another thread does waits, so neither entry is lost."""
     shared = SharedWindow()

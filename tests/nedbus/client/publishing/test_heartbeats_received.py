@@ -13,7 +13,7 @@ from tests.flights.local_position import decode
 from tests.flights.messages import VLP
 from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
-from tests.waits import wait_for
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 
 def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> None:
@@ -56,3 +56,20 @@ def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, zenoh_session: Ses
     assert key == f"{publisher.key}/@rate/1"
     assert number < 10 < publisher.published
     undeclare()
+
+
+def test_unread_heartbeats_are_bounded_in_bytes(endpoint: str, zenoh_session: Session) -> None:
+    """A reader that is busy holds at most 4096 heartbeats of at most 64 bytes: larger ones are not received."""
+    end, block = "nedbus/end", zenoh.CongestionControl.BLOCK
+    with open_client([endpoint], timeout=DEADLINE) as reader:
+        take, undeclare = follow_heartbeats(reader, f"nedbus/*/{VLP}")
+        ended = reader.declare_subscriber(end, zenoh.handlers.RingChannel(1))
+        wait_for_matching(zenoh_session, end)
+        wait_for_matching(zenoh_session, f"nedbus/1/{VLP}/@adv/pub/1a/1/_")
+        for number in range(5000):
+            zenoh_session.put(f"nedbus/{number}/{VLP}/@adv/pub/1a/1/_", bytes(4), congestion_control=block)
+            zenoh_session.put(f"nedbus/5000/{VLP}/@adv/pub/1a/1/_", bytes(65), congestion_control=block)
+        zenoh_session.put(end, b"", congestion_control=block)
+        wait_for(ended.handler.try_recv, what="the end")
+        assert [key.split("/")[1] for key, _ in take()] == [str(number) for number in range(904, 5000)]
+        undeclare()

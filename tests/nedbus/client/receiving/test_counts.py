@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 import tracemalloc
@@ -265,15 +266,36 @@ def test_rejection_reports_have_address_and_reason(bus: nedbus.Bus, zenoh_sessio
 
 
 def test_reports_during_a_flood_are_returned(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """`take` returns at most 1000 reports, even if they arrive faster than it reads them."""
+    """`take` returns at most 250 reports, even if they arrive faster than it reads them."""
     rejections = bus.rejections()
     wait_for_matching(zenoh_session, ADDRESS.rejected_key())
     zenoh_session.put(ADDRESS.rejected_key(), b'{"reason": "x is NaN"}')
     report = rejections._handler.recv()
     flood = iter(5000 * [report])
     rejections._handler = cast("Any", SimpleNamespace(try_recv=lambda: next(flood, None)))
-    assert [len(rejections.take()) for _ in range(6)] == [1000, 1000, 1000, 1000, 1000, 0]
+    assert [len(rejections.take()) for _ in range(21)] == [*(20 * [250]), 0]
     rejections.close()
+
+
+def test_unread_reports_are_bounded_in_bytes(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """A reader holds at most 250 reports of at most 16 kB, 4 MB: larger ones are not received, older ones dropped."""
+    key, block = ADDRESS.rejected_key(), zenoh.CongestionControl.BLOCK
+    newest = bus._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+    rejections = bus.rejections()
+    wait_for_matching(zenoh_session, key)
+    for number in range(300):
+        for size in (17_000, 16_000):
+            report = json.dumps({"reason": f"{number}", "fields": "x" * size})
+            zenoh_session.put(key, report, congestion_control=block)
+
+    def is_last() -> bool:
+        sample = newest.handler.try_recv()
+        return sample is not None and b'"reason": "299"' in sample.payload.to_bytes()
+
+    wait_for(is_last, what="the last report")
+    assert [report.reason for report in rejections.take()] == [f"{number}" for number in range(50, 300)]
+    rejections.close()
+    newest.undeclare()
 
 
 def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:

@@ -19,7 +19,7 @@ from nedbus.client.receiving import Receiver, reorder, retransmission
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.timings import Timings
-from nedbus.transport import RetransmitRequest, Session, open_client, open_router
+from nedbus.transport import RawSample, RetransmitRequest, Session, open_client, open_router
 from tests.flights.local_position import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.lossy import Lossy, LossyQueue
@@ -28,13 +28,21 @@ from tests.peers.ports import free_endpoint
 from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_matching, wait_for_router
 
+from .raw_samples import make_queue, raw
+
 KEY = f"nedbus/7/{VLP}"
 
 
 @pytest.fixture
-def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lossy]:
+def limit() -> int | None:
+    """Return the limit of unread messages of the subscription; None for the default."""
+    return None
+
+
+@pytest.fixture
+def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, *, limit: int | None) -> Iterator[Lossy]:
     """Subscribe to all vehicles, and wait until the publisher is matched."""
-    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
+    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}", limit=limit)
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         lossy = Lossy(session, queue, Receiver(session, queue), publisher)
         monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.request)
@@ -271,18 +279,69 @@ def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytes
     assert lossy.subscription.counts == Counts(received=59, lost=1)
 
 
-def test_slow_reader_requests_lost_messages_only_after_reading(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slow reader requests lost messages only after reading, so that recovered ones do not displace unread ones."""
-    monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
-    lossy.queue.missing = {10}
-    lossy.publish(*range(20))
+@pytest.mark.parametrize(("limit", "unread"), [(20, 11), (21, 11)])
+def test_slow_reader_requests_lost_messages_only_after_reading(lossy: Lossy, unread: int) -> None:
+    """While more than half of the limit is unread, nothing is requested: it would displace unread messages."""
+    lossy.queue.missing = {unread}
+    lossy.publish(*range(unread + 5))
     wait_for(
-        lambda: (lossy.queue.waiting, lossy.queue.gaps.held) == (10, 9),
+        lambda: (lossy.queue.waiting, lossy.queue.gaps.held) == (unread, 4),
         what="the messages before and after the gap",
     )
-    requests_before = list(lossy.requests)
-    assert lossy.receive(20) == list(range(20))
-    assert (requests_before, lossy.requests) == ([], [(KEY, 10, 11)])
+    polls = lossy.queue.polls
+    wait_for(lambda: lossy.queue.polls > polls + 1, what="a poll in this state")
+    assert lossy.requests == []
+    assert lossy.receive(1) == [0]  # now half of it, or less
+    wait_for(lambda: lossy.queue.waiting == unread + 4, what="the recovered message")
+    assert lossy.requests == [(KEY, unread, unread + 1)]
+    assert lossy.receive(unread + 4) == list(range(1, unread + 5))
+    assert lossy.subscription.counts == Counts(received=unread + 5)
+
+
+def test_unanswered_requests_of_a_key_are_bounded(lossy: Lossy, zenoh_session: Session) -> None:
+    """At most 4 requests to publishers of one key are open, which may never answer; those of other keys are served."""
+    taken: list[zenoh.Query] = []
+    key = f"nedbus/foreign/{VLP}"
+    misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+    foreign = [zenoh.ext.declare_advanced_publisher(zenoh_session, key, sample_miss_detection=misses) for _ in range(7)]
+    wait_for_matching(zenoh_session, key)
+    with answer_queries(zenoh_session, f"{key}/@adv/pub/**", taken.append):
+        lossy.queue.missing = {1}
+        for publisher in foreign:
+            for timestamp in range(3):
+                publisher.put(encode(message(timestamp)), encoding=encoding_of("sim"))
+        assert lossy.receive(7) == [0] * 7
+        wait_for(lambda: len(lossy.queue.gaps.requesting) == 7, what="the gaps of all publishers of the key")
+        wait_for(lambda: taken, what="a request")
+        lossy.publish(0, 1, 2)
+        assert lossy.receive(3) == [0, 1, 2]
+        assert 4 <= lossy.max_open <= 5
+        taken.clear()
+    for publisher in foreign:
+        publisher.undeclare()
+
+
+def test_delivery_makes_the_next_request_early() -> None:
+    """Attempts for a gap are 0.1 to 0.8 s apart; once it is filled, those for the next one are close again."""
+    inbox = make_queue("every")
+    inbox.put([raw(0)])
+    inbox.put([raw(2), raw(4)])
+    [writer] = inbox.gaps.requesting
+    now, pauses = 1.0, list[float]()
+
+    def attempt(found: dict[int, RawSample]) -> None:
+        nonlocal now
+        assert inbox.next_request(writer, now) is not None
+        inbox.on_retransmission(writer, found, ended=True, now=now)
+        assert writer.request is not None
+        pauses.append(round(writer.request.retry_at - now, 3))
+        now = writer.request.retry_at
+
+    for _ in range(5):
+        attempt({})
+    attempt({1: raw(1)})
+    attempt({})
+    assert pauses == [0.1, 0.2, 0.4, 0.8, 0.8, 0.05, 0.1]
 
 
 def test_unexpected_error_loses_only_the_recovered_message(
