@@ -95,7 +95,9 @@ class Arrays(Generic[M]):
 
     def decode_few(self, payloads: Iterable[bytes]) -> MessageArray | None:
         """Decode up to MAX_FEW payloads one by one; return None if one may be invalid."""
-        size, tags, tag_mask = self._size, self._codec.tags, self._codec.tag_mask
+        size = self._size
+        tags = self._codec.tags
+        tag_mask = self._codec.tag_mask
         elements = bytearray()
         for payload in payloads:
             if len(payload) != size or (number := int.from_bytes(payload, "big")) & tag_mask != tags:

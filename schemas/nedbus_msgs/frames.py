@@ -67,7 +67,9 @@ def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
 
 
 # Each conversion swaps axes or is a half turn, and is therefore its own inverse.
-enu_to_ned, flu_to_frd, yaw_enu_to_ned = ned_to_enu, frd_to_flu, yaw_ned_to_enu
+enu_to_ned = ned_to_enu
+flu_to_frd = frd_to_flu
+yaw_enu_to_ned = yaw_ned_to_enu
 variances_enu_to_ned, quaternion_enu_to_ned = variances_ned_to_enu, quaternion_ned_to_enu
 
 
@@ -231,7 +233,9 @@ class CommonOrigin:
             origin = (message.ref_lat, message.ref_lon, message.ref_alt)[: 3 if message.z_global else 2]
             self._is_confirmed = origin == self._first
             if projection is None or not self._is_confirmed:
-                self._vehicle, self._first, self.altitude = vehicle, origin, math.nan
+                self._vehicle = vehicle
+                self._first = origin
+                self.altitude = math.nan
                 projection = self.projection = MapProjection(message.ref_lat, message.ref_lon)
         if math.isnan(self.altitude) and message.z_global:
             self.altitude = message.ref_alt

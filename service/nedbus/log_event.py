@@ -107,7 +107,9 @@ class UnexpectedErrors(AbstractContextManager[None]):
     """
 
     def __init__(self, log: logging.Logger, text: str, *args: object) -> None:
-        self._log, self._text, self._logged = log, (text, *args), False
+        self._log = log
+        self._text = (text, *args)
+        self._logged = False
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
         return error is not None and self.survives(error)

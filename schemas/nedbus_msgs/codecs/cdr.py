@@ -30,7 +30,10 @@ class CdrLayout:
     """
 
     def __init__(self, layout: Layout) -> None:
-        body, size, unpadded, self.bool_mask = "<", 0, 0, 0
+        body = "<"
+        size = 0
+        unpadded = 0
+        self.bool_mask = 0
         self.offsets: dict[str, int] = {}
         for name, kind in layout.types.items():
             padding = 0 if kind.is_text else -size % kind.size

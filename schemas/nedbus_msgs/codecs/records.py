@@ -25,7 +25,9 @@ class Encoded(NamedTuple):
 
 def encode_upgraded(definition: Definition[Any], fields: Mapping[str, object]) -> Encoded:
     """Encode the fields of any PX4 release, as `upgrade_with` accepts them; raise InvalidMessageError."""
-    plan, codec, validation = definition.plan(tuple(fields)), codec_of(definition), definition.validation
+    plan = definition.plan(tuple(fields))
+    codec = codec_of(definition)
+    validation = definition.validation
     upgraded = upgrade_fields(definition, fields)
     if (values := validation.row_of(upgraded)) is not None:
         with suppress(OverflowError):  # beyond float32
@@ -44,8 +46,12 @@ def record_encoder(
     this record to `encode_upgraded`, which decides and reports the reasons.
     `unpack`: return the values of a record; each element of an array is a value.
     """
-    plan, encode_flat, new = definition.plan(tuple(types)), codec_of(definition).encode_flat, tuple.__new__
-    values_of, provided, missing = _compile(definition, types), plan.provided, plan.missing
+    plan = definition.plan(tuple(types))
+    encode_flat = codec_of(definition).encode_flat
+    new = tuple.__new__
+    values_of = _compile(definition, types)
+    provided = plan.provided
+    missing = plan.missing
     row_class: type[Row | FlatRow] = definition.row if definition.has_text else definition.flat_row
     unflatten = definition.validation.unflatten if definition.has_text else None
 
@@ -66,7 +72,9 @@ def _compile(
     definition: Definition[Any], types: Mapping[str, FieldType]
 ) -> Callable[[bytes, Callable[[bytes], Values]], Values | None]:
     """Compile a function from a record to the valid values of a message; false or an exception if it is not valid."""
-    plan, validation, fields = definition.plan(tuple(types)), definition.validation, definition.types
+    plan = definition.plan(tuple(types))
+    validation = definition.validation
+    fields = definition.types
     copied = [(types[old], fields[name]) for name, old in plan.names.items()]
     if "timestamp" not in plan.provided or any((a.values, a.is_text) != (b.values, b.is_text) for a, b in copied):
         return lambda *_: None
@@ -88,7 +96,9 @@ def _conversion(
     definition: Definition[Any], types: Mapping[str, FieldType], functions: dict[str, Callable[..., Any]]
 ) -> str:
     """Return the expression of a message's values in those of a record; add the functions that convert fields."""
-    plan, positions, accessors = definition.plan(tuple(types)), positions_of(types), accessors_of(types)
+    plan = definition.plan(tuple(types))
+    positions = positions_of(types)
+    accessors = accessors_of(types)
     parts, begin, end = list[str](), 0, -1  # values[begin:end] is the last part, if it only copies values
     for name, kind in definition.types.items():
         old, star = plan.names.get(name), "*" * kind.is_array

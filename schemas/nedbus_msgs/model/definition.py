@@ -71,7 +71,9 @@ class FieldReader:
 
     def _reader_of(self, message: object) -> Callable[[Any], tuple[Any, ...]]:
         """Return a function that reads the fields of messages of this type."""
-        names, absent, positions = self.names, self._absent, getattr(message, "_positions", None)
+        names = self.names
+        absent = self._absent
+        positions = getattr(message, "_positions", None)
         if isinstance(message, Mapping):
             return lambda fields: tuple([fields.get(name, absent) for name in names])
         if positions is None and all(hasattr(message, name) for name in names):

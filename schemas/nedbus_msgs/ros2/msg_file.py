@@ -169,7 +169,9 @@ def _range_of(field: MsgField) -> InRange | None:
         raise ValueError(f"malformed @range of {field.name}; expected limits, such as [@range 0, 100]")
     if found is None or field.type.base == "bool" or field.type.is_text:
         return None
-    least, greatest, or_ = float(found[2] or "-inf"), float(found[4] or "inf"), float(invalid[1]) if invalid else None
+    least = float(found[2] or "-inf")
+    greatest = float(found[4] or "inf")
+    or_ = float(invalid[1]) if invalid else None
     lowest, highest = (-math.inf, math.inf) if field.type.is_float else field.type.limits
     first, last = max(least, lowest), min(greatest, highest)
     if first > last or (not field.type.is_float and math.ceil(first) > last):

@@ -109,7 +109,9 @@ class FoxgloveServer:
             self._unseen.add(address)  # it may never have another message
 
     def _log_position(self, sample: Sample[VehicleLocalPosition]) -> None:
-        vehicle, message, time_ns = sample.vehicle, sample.message, _time_of(sample)
+        vehicle = sample.vehicle
+        message = sample.message
+        time_ns = _time_of(sample)
         if vehicle not in self._channels:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
             self._channels[vehicle] = pose, LocationFixChannel(f"/{vehicle}/location", context=self._context)

@@ -28,7 +28,10 @@ class LateFilter:
 
         `arrived`: arrival time on this host's monotonic clock [ns].
         """
-        sent, stamp, address, late = sample.sent, sample.stamp, sample.address, 0
+        sent = sample.sent
+        stamp = sample.stamp
+        address = sample.address
+        late = 0
         if sent is None or stamp is None:
             return True
         if not sample.retained:
@@ -82,6 +85,8 @@ class _PublisherClock:
         self._sent, self._arrived = sent, arrived
         offset = arrived - sent
         if arrived - self._since > DRIFT:
-            self._before, self._smallest, self._since = self._smallest, offset, arrived
+            self._before = self._smallest
+            self._smallest = offset
+            self._since = arrived
         self._smallest = min(self._smallest, offset)
         return offset - min(self._before, self._smallest)

@@ -192,7 +192,9 @@ class Ros2Bridge:
             self._apply(decision)
 
     def _apply(self, decision: Decision) -> None:
-        address, topic, other = decision.address, decision.topic, decision.other
+        address = decision.address
+        topic = decision.topic
+        other = decision.other
         if decision.action == "publish":
             self._open(address)
             self._withdrawn.pop(address, None)

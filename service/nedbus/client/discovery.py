@@ -326,7 +326,9 @@ class Rejections:
 
 def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     """Yield key and content of JSON replies within the memory limit; log the discarded ones, one line per reason."""
-    free, oversized, invalid = _MAX_MEMORY, 0, ""
+    free = _MAX_MEMORY
+    oversized = 0
+    invalid = ""
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
         # Upper bound of the memory of a parsed reply, measured with CPython 3.11.

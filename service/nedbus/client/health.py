@@ -358,7 +358,9 @@ class StreamHealth:
         last, steps = self._time, self._steps
         if last is None or timestamp < last:
             return self._step_back(timestamp, last, received)
-        self._earlier, self._time, step = last, timestamp, timestamp - last
+        self._earlier = last
+        self._time = timestamp
+        step = timestamp - last
         is_gap = step > _FACTOR * self._usual_step > 0 and len(steps) >= _MIN_STEPS
         self._gaps += is_gap and not self._is_on_change
         steps.append(step)

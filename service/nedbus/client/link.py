@@ -25,7 +25,9 @@ class LinkCallback(AbstractContextManager["LinkCallback"]):
     """
 
     def __init__(self, watch: "LinkWatch", call: Callable[[bool], object], *, is_up: bool) -> None:
-        self._watch, self._call, self._is_up = watch, call, is_up
+        self._watch = watch
+        self._call = call
+        self._is_up = is_up
         self._closed = False
 
     def close(self) -> None:

@@ -116,7 +116,9 @@ class NewestMessage(Generic[M_co]):
             self._measured = measured
         elif self._measured is not None or arrived < self._arrived:
             return
-        self.sample, self._arrived, self._number = sample, arrived, self._view.number
+        self.sample = sample
+        self._arrived = arrived
+        self._number = self._view.number
 
 
 class Monitor(Mapping[Address, NewestMessage[Message]]):
@@ -233,7 +235,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         Samples are read in the order of arrival. One that seems to have arrived before the last one shows a step of the
         wall clock, which is the change of the difference between the two clocks.
         """
-        now, utc, before = time.monotonic_ns(), clock.utc_ns(), self._to_utc
+        now = time.monotonic_ns()
+        utc = clock.utc_ns()
+        before = self._to_utc
         if sample.retained:
             return -math.inf if sample.sent is None else now - max(0, utc - sample.sent)
         self._to_utc, arrival = utc - now, now - max(0, utc - sample.received)

@@ -199,7 +199,9 @@ class Daemon:
         session = self._session = self._open()
         if session is None:
             return True
-        settings, queries, is_client = self._settings, QueryServer(session), self.role == "client"
+        settings = self._settings
+        queries = QueryServer(session)
+        is_client = self.role == "client"
         replies = StatusReplies(
             queries,
             self.id,
@@ -231,7 +233,9 @@ class Daemon:
 
     def _apply_plan(self, registry: PublisherRegistry) -> int:
         """Stop removed sources and start new ones, in the order of the plan; return the number of unchanged sources."""
-        removed, ordered, new = list(self._workers), list[Worker](), list[Worker]()
+        removed = list(self._workers)
+        ordered = list[Worker]()
+        new = list[Worker]()
         router = self._session if self.role == "router" else None
         for planned in self._plan:
             worker = next((each for each in removed if each.planned == planned), None)

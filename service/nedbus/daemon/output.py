@@ -156,7 +156,9 @@ class SourceOutput:
 
     def _publish(self, message: SourceMessage, stream: _Stream, received: float | None = None) -> None:
         """Validate a message of a claimed address, and publish or reject it; `received`: time, by default now."""
-        address, publisher, lost = message.address, stream.publisher, message.lost
+        address = message.address
+        publisher = stream.publisher
+        lost = message.lost
         if publisher is None:
             raise KeyError(address)
         if message.error is not None:

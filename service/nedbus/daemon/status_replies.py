@@ -33,7 +33,9 @@ class StatusReplies:
         status: Callable[[], ServiceStatus],
         report: Callable[[float], AccountReport],
     ) -> None:
-        self._queries, self._service, self._prefix = queries, service, prefix
+        self._queries = queries
+        self._service = service
+        self._prefix = prefix
         self._make_status, self._make_report = status, report
         self._lock = threading.Lock()
         self._vehicles: set[str] = set()

@@ -230,7 +230,9 @@ class Worker:
             failures += 1
 
     def _run_replay(self, source: ReplaySource) -> None:
-        run, last, speed = source.open(), self._run, source.options.speed
+        run = source.open()
+        last = self._run
+        speed = source.options.speed
         if last is None or last.summary != run.summary:
             _log.info("%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name))
             self._warned.clear()

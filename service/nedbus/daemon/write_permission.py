@@ -80,10 +80,14 @@ class WritePermission:
         self._thread.join(_GRACE)
 
     def _run(self) -> None:
-        due, routers, vehicles = 0.0, frozenset[str](), set[str]()
+        due = 0.0
+        routers = frozenset[str]()
+        vehicles = set[str]()
         errors = UnexpectedErrors(_log, "unexpected error while probing the write permission (logged once)")
         while not self._stop.wait(TIMINGS.probe_poll):
-            now, last_routers, last_vehicles = time.monotonic(), routers, vehicles
+            now = time.monotonic()
+            last_routers = routers
+            last_vehicles = vehicles
             with errors:
                 routers, vehicles = routers_of(self._session), self._vehicles()
                 if routers != last_routers:

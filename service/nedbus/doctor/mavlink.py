@@ -90,8 +90,12 @@ def _check_ignored(link: str, traffic: _Traffic) -> Iterator[Finding]:
 
 def _listen(link: Link) -> _Traffic:
     """Collect what arrives; request SDLOG_BACKEND and TIMESYNC from each PX4."""
-    traffic, senders, addresses = _Traffic(), Senders(), DuplicateIds()
-    end, next_heartbeat, parser = time.monotonic() + TIMINGS.listen, 0.0, None
+    traffic = _Traffic()
+    senders = Senders()
+    addresses = DuplicateIds()
+    end = time.monotonic() + TIMINGS.listen
+    next_heartbeat = 0.0
+    parser = None
     sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
     heartbeat = dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3

@@ -126,7 +126,9 @@ def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls 
     found = [(name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items()]
     findings = [(name, finding) for name, finding in found if finding is not None]
     wrong = {finding.seen for _, finding in findings if finding.state == "wrong"}
-    tls, reason, advice = None, None, ""
+    tls = None
+    reason = None
+    advice = ""
     try:
         if settings.tls is not None:
             settings.tls.zenoh_settings()

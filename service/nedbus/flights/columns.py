@@ -99,7 +99,9 @@ class _Part:
 
     def add(self, payloads: Sequence[Any]) -> str:
         """Add records; return why the first unusable one is."""
-        size, head, reason = self._size, self._stream.head, ""
+        size = self._size
+        head = self._stream.head
+        reason = ""
         if not size:
             self._fields += payloads
         elif not head or ({*map(len, payloads)} == {size} and all(each.startswith(head) for each in payloads)):

@@ -153,7 +153,9 @@ def _write(
 ) -> tuple[int, str]:
     """Write the valid messages; return the number of rejected ones, and the reason of the first."""
     pending: list[tuple[Message, Address, Provenance, int]] = []
-    rejected, first_reason, start = 0, "", None
+    rejected = 0
+    first_reason = ""
+    start = None
     for done, each in enumerate(messages, 1):
         definition = each.definition or BY_TOPIC[each.address.topic]
         try:

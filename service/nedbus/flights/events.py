@@ -63,7 +63,9 @@ def read_file_events(*paths: Path) -> FileEvents:
 
 def read_flight_events(flight: Flight) -> FileEvents:
     """Detect the events of the selected vehicle in an open flight; raise the errors of its call."""
-    event_log, ended, end = EventLog(MAX_FILE_EVENTS), set[str](), 0.0
+    event_log = EventLog(MAX_FILE_EVENTS)
+    ended = set[str]()
+    end = 0.0
     readers = flight._open({*EVENT_TOPICS})
     try:
         messages = flight._merge(readers, lambda names: ended.update(names.values()))
@@ -107,7 +109,9 @@ def follow(
     for message in messages:
         if message.dropout:
             event_log.add_dropout(message.address.vehicle, message.dropout, due)
-        due, reason, payload = message.at, message.error, None
+        due = message.at
+        reason = message.error
+        payload = None
         checks.advance(due)
         if reason is None:
             try:

@@ -99,7 +99,9 @@ class Flight(AbstractContextManager["Flight"]):
 
     def __init__(self, paths: Sequence[Path], options: ReadOptions = _BUILT_IN, *, vehicle: str = ANY) -> None:
         self._readers: list[FlightReader] = []  # of the first pass, one for each file
-        self._paths, self._options, self._vehicle = require_files(paths), options, vehicle
+        self._paths = require_files(paths)
+        self._options = options
+        self._vehicle = vehicle
         self._selection = Selection(vehicle=vehicle)
         self._watches: list[FileUtc] = []  # the UTC of each file, from the first pass
         self._columns: list[dict[Address, Columns]] = []  # of each file, if the first pass is one of columns
@@ -384,7 +386,10 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         *,
         rows: bool,
     ) -> None:
-        self._flight, self._readers, self._selection, self._rows = flight, readers, selection, rows
+        self._flight = flight
+        self._readers = readers
+        self._selection = selection
+        self._rows = rows
         self._start, self._end = period
         self.skipped: Counter[Address] = Counter()
         self._reasons: dict[Address, str] = {}
@@ -453,7 +458,9 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
 
     def _select(self) -> Generator[tuple[Address, Definition[Any], Encoded, int, Provenance]]:
         """Yield address, definition, payload, log time [ns] and provenance of the selected messages."""
-        flight, readers, is_found = self._flight, self._readers, False
+        flight = self._flight
+        readers = self._readers
+        is_found = False
         try:
             for message in flight._merge(readers, lambda _: None):
                 is_late = self._end is not None and message.at > self._end

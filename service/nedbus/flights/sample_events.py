@@ -40,7 +40,9 @@ def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
 
     Raises ArgumentError for anything but a sample.
     """
-    event_log, offsets, due = EventLog(MAX_FILE_EVENTS), dict[str, float](), 0.0
+    event_log = EventLog(MAX_FILE_EVENTS)
+    offsets = dict[str, float]()
+    due = 0.0
     checks = Checks(event_log)
     for each in Order[_Received]().arrange(_received(samples)):
         sample, due = each.sample, each.at

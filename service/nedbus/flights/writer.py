@@ -76,7 +76,9 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     def __init__(
         self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0, starts: Mapping[str, int] | None = None
     ) -> None:
-        self.path, self._boot_utc, self._starts = Path(path), boot_utc, starts or {}
+        self.path = Path(path)
+        self._boot_utc = boot_utc
+        self._starts = starts or {}
         self.messages = self.omitted = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)

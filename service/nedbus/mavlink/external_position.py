@@ -310,12 +310,16 @@ class _Delay:
             self._start(min(offset, self._candidate), now)
         self._candidate = math.inf
         if now - self._window > _WINDOW:
-            self._window, self._previous, self._shortest = now, self._shortest, offset
+            self._window = now
+            self._previous = self._shortest
+            self._shortest = offset
         self._shortest = min(self._shortest, offset)
         return offset - min(self._shortest, self._previous)
 
     def _start(self, offset: float, now: float) -> None:
-        self._shortest, self._previous, self._window = offset, math.inf, now
+        self._shortest = offset
+        self._previous = math.inf
+        self._window = now
 
 
 def odometry_of(position: Position) -> Odometry:

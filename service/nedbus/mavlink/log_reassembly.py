@@ -76,7 +76,10 @@ class Reassembly:
         if length > _MAX_LENGTH or (first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS):
             return Chunk("malformed")
         if sequence == 0 and content.startswith(_MAGIC) and content != self._first:
-            self._first, self._last, self._synchronised, self._old_run = content, 0, True, 0
+            self._first = content
+            self._last = 0
+            self._synchronised = True
+            self._old_run = 0
             self._rate = PacketRate()
             self._rate.add(now or 0.0)
             return Chunk("delivered", content, begins=True)
@@ -85,7 +88,9 @@ class Reassembly:
         step = (sequence - self._last) % _MODULUS
         if step == 0 or (step > _MAX_STEP and not self._is_ahead(sequence)):
             return Chunk("duplicate")
-        self._last, self._old_run, lost = sequence, 0, step - 1
+        self._last = sequence
+        self._old_run = 0
+        lost = step - 1
         if now is not None:
             if lost:
                 lost += _MODULUS * max(0, round((self._rate.expected(now) - lost) / _MODULUS))

@@ -133,7 +133,9 @@ class _Frame:
     __slots__ = ("_frame", "_layout", "_number", "_payload")
 
     def __init__(self, number: int, layout: _Layout, frame: bytes, payload: bytes) -> None:
-        self._number, self._layout, self._frame = number, layout, frame
+        self._number = number
+        self._layout = layout
+        self._frame = frame
         self._payload = payload.ljust(layout.size, b"\0")  # zeros are not sent
 
     def __getattr__(self, name: str) -> Any:
@@ -175,7 +177,9 @@ class _LogData(_Frame):
     __slots__ = ("data", "first_message_offset", "length", "sequence", "target_component", "target_system")
 
     def __init__(self, number: int, layout: _Layout, frame: bytes, payload: bytes) -> None:
-        self._number, self._layout, self._frame = number, layout, frame
+        self._number = number
+        self._layout = layout
+        self._frame = frame
         payload = payload.ljust(_LOG_HEADER.size, b"\0")  # zeros are not sent
         fields = _LOG_HEADER.unpack_from(payload)
         self.sequence, self.target_system, self.target_component, self.length, self.first_message_offset = fields

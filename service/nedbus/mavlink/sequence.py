@@ -18,7 +18,9 @@ class PacketRate:
     """Mean rate at which a sender's packets arrive, over the last 5 to 10 s."""
 
     def __init__(self) -> None:
-        self._count, self._first, self._last = 0.0, 0.0, 0.0
+        self._count = 0.0
+        self._first = 0.0
+        self._last = 0.0
 
     def add(self, now: float) -> None:
         """Add a packet; lost ones would let wrong losses explain further ones."""
@@ -153,7 +155,9 @@ class SequenceCounter:
         if main.number == earlier.number:
             main.number = self._links
             self._links += 1
-        self._main, self._second, self._earlier = earlier, main, None
+        self._main = earlier
+        self._second = main
+        self._earlier = None
         return -self._skipped
 
     def _add_after_gap(self, main: _Link, sequence: int, now: float) -> int:
@@ -178,7 +182,9 @@ class SequenceCounter:
             return self._go_on(main, sequence, now)
         if behind <= _MAX_OVERTAKEN:
             return self._add_late(sequence)
-        self._earlier, self._skipped, self._is_late = main, 0, False
+        self._earlier = main
+        self._skipped = 0
+        self._is_late = False
         self._is_numbered = False
         self._main = self._new_link(sequence, now)
         self.link = self._main.number

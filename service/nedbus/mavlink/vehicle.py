@@ -40,7 +40,9 @@ _LINK_TIMEOUT: Final = 2.0  # s without a new message on the first link after wh
 _SENT_ONCE: Final = frozenset({"sensor_gps", "vehicle_odometry"})  # their messages have `time_usec`
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
-_POSITION, _STATUS, _QUATERNION = 32, 230, 31
+_POSITION = 32
+_STATUS = 230
+_QUATERNION = 31
 STREAMS: Final = {
     _POSITION: (40, 0.0, "vehicle_local_position"),
     _STATUS: (54, 0.0, "vehicle_local_position vehicle_global_position"),
@@ -155,7 +157,10 @@ class Vehicle:
         lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
         if not (lost or self.rebooted):
             return message
-        rebooted, self.rebooted, self.lost, self._certain = self.rebooted, False, self.lost - lost, 0
+        rebooted = self.rebooted
+        self.rebooted = False
+        self.lost = self.lost - lost
+        self._certain = 0
         return replace(message, lost=message.lost + lost, rebooted=rebooted)
 
     def next_request(self, now: float) -> tuple[int, float] | None:
@@ -293,7 +298,9 @@ class Vehicle:
                 self._store("yaw", now + _VALUE_TIMEOUT, **yaw)
             case "GPS_GLOBAL_ORIGIN" if _is_origin(message):
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
-                latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+                latitude = message.latitude / 1e7
+                longitude = message.longitude / 1e7
+                altitude = message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
                 self._store("origin", math.inf, xy_global=True, z_global=True, **known)
                 self._arrivals[ORIGIN] = math.inf  # the vehicle sends the origin once per request
@@ -303,7 +310,9 @@ class Vehicle:
                 self._store("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
             case "ODOMETRY":
                 covariance, known = message.velocity_covariance, {}
-                north, east, down = covariance[0], covariance[6], covariance[11]
+                north = covariance[0]
+                east = covariance[6]
+                down = covariance[11]
                 if math.isfinite(north + east) and min(north, east) >= 0 and north + east > 0:
                     known["evh"] = math.sqrt(north + east)
                 if math.isfinite(down) and down > 0:
@@ -404,7 +413,9 @@ class _StatusTexts:
 
     def __init__(self) -> None:
         self._current = (0, 0)  # severity and id of the incomplete text
-        self._data, self._next, self._time = b"", 0, 0.0
+        self._data = b""
+        self._next = 0
+        self._time = 0.0
         self._waiting: deque[dict[str, object]] = deque(maxlen=_MAX_WAITING)
 
     def add(self, message: Any, now: float) -> None:
@@ -415,7 +426,9 @@ class _StatusTexts:
             self._finish("...")
         gap = b"..." if sequence > self._next else b""
         self._data += gap + data.partition(b"\0")[0]  # at most 256 chunks
-        self._current, self._next, self._time = current, sequence + 1, now
+        self._current = current
+        self._next = sequence + 1
+        self._time = now
         if not message.id or len(data) < _CHUNK or b"\0" in data:
             self._finish()
 

@@ -26,7 +26,9 @@ from .http_server import Page
 MAX_STREAMS: Final = 1000
 """Streams exported individually, positions first; the rest are summed as vehicle and topic "other"."""
 
-_COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
+_COUNTER = core.CounterMetricFamily
+_GAUGE = core.GaugeMetricFamily
+_HISTOGRAM = core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
 _LOG_STREAM: Final = ("vehicle", "source")

@@ -85,7 +85,9 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
     authority = load_certificate(folder / "ca.crt")
     found = []
     for path in folder.glob("*.crt"):
-        loaded, certificate, problem = load_certificate(path), Certificate.read(path), ""
+        loaded = load_certificate(path)
+        certificate = Certificate.read(path)
+        problem = ""
         with suppress(OSError, ValueError, TypeError):  # the key is missing, or not readable by this user
             key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
             problem = "" if key.public_key() == loaded.public_key() else "does not match the key next to it"

@@ -138,7 +138,9 @@ class Estimator:
         """Return the attitude of a multicopter whose thrust causes the acceleration, without wind."""
         state, (ax, ay, az) = self._at(truth.time), truth.acceleration
         cos, sin = math.cos(truth.heading), math.sin(truth.heading)
-        forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
+        forward = ax * cos + ay * sin
+        right = ay * cos - ax * sin
+        up = _GRAVITY - az
         roll = math.atan2(right, math.hypot(forward, up))
         q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + state.heading)
         delta = euler_to_quaternion(0.0, 0.0, state.deltas["heading"])

@@ -275,7 +275,9 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
     # A timestamp of 0 is unset, and a few wild ones do not determine the period.
     valid = {name: _without_wild(times[times > 0]) for name, times in stamps.items() if times.any()}
     firsts, lasts = ({name: int(end(each)) for name, each in valid.items()} for end in (np.min, np.max))
-    rate, first, last = float(given), min(firsts.values(), default=2**62), max(lasts.values(), default=0)
+    rate = float(given)
+    first = min(firsts.values(), default=2**62)
+    last = max(lasts.values(), default=0)
     first = start if first + _STALE < start <= last else first
     count = max(0.0, (last - first) / 1e6 * rate + 1)
     if count > _MAX_ROWS:

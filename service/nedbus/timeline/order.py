@@ -125,7 +125,9 @@ class _Track(Generic[M]):
 
     def _place(self, item: _Item[M]) -> int | None:
         """Return the place of a message that continues the vehicle's clock, None for a doubtful one."""
-        stream, stamp, log = item.stream, item.stamp, item.log
+        stream = item.stream
+        stamp = item.stamp
+        log = item.log
         before, distance = self.last.get(stream), stamp - self.newest
         is_back = before is not None and stamp < before
         agrees = log is not None and self.lag is not None and abs(log - stamp - self.lag) <= _NEAR

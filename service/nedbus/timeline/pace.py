@@ -14,7 +14,9 @@ class Pace:
 
     def __init__(self, speed: float = 1.0) -> None:
         self.skipped = 0
-        self._speed, self._last, self._due = speed, 0.0, 0.0
+        self._speed = speed
+        self._last = 0.0
+        self._due = 0.0
 
     def publish_at(self, at: float) -> float:
         """Return when to publish the message at a time on the axis [s], as seconds since the first message."""

@@ -179,7 +179,9 @@ class VehicleClock:
         elapsed = self._elapsed(now)
         passed = _UNKNOWN_PAUSE if elapsed is None else 1e6 * elapsed + _MARGIN
         begin = newest - newest % self._modulus
-        same, after, before = begin + time, begin + self._modulus + time, begin - self._modulus + time
+        same = begin + time
+        after = begin + self._modulus + time
+        before = begin - self._modulus + time
         if after <= newest + passed:
             return after
         if begin and newest - before <= _UNKNOWN_PAUSE:

@@ -42,7 +42,9 @@ class FleetTokens:
     """
 
     def __init__(self, open_session: Callable[[], Session], selection: Selection, *, prefix: str) -> None:
-        self._open_session, self._prefix, self._selection = open_session, prefix, selection
+        self._open_session = open_session
+        self._prefix = prefix
+        self._selection = selection
         self._keys: set[str] = set()
         self._numbers: Counter[str] = Counter()  # of keys, by vehicle
         self._excluded: set[str] = set()

@@ -54,7 +54,9 @@ class Uplinks:
         tls: Tls | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._session, self._tls, self._now = session, tls, now
+        self._session = session
+        self._tls = tls
+        self._now = now
         self._is_client = is_client
         names = [" or ".join(endpoints)] if is_client else endpoints
         # Last logged state of each link, None at first, and the time of its change [s].

@@ -70,7 +70,9 @@ class RetransmitRequest:
     """
 
     def __init__(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> None:
-        self._key, self._publisher, self._numbers = key, publisher, numbers
+        self._key = key
+        self._publisher = publisher
+        self._numbers = numbers
         selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
         capacity = min(len(numbers), MAX_REPLIES) + _SPARE
         any_key = zenoh.ReplyKeyExpr.ANY

@@ -44,9 +44,14 @@ class PayloadLayout:
     """
 
     def __init__(self, fields: tuple[PayloadField, ...], size: int, padding: int) -> None:
-        self.fields, self.size, self.padding = fields, size, padding
+        self.fields = fields
+        self.size = size
+        self.padding = padding
         self._indices: list[tuple[str, int | slice]] = []  # index of each field among the unpacked values
-        code, end, count, self.bool_mask = "<", 0, 0, 0
+        code = "<"
+        end = 0
+        count = 0
+        self.bool_mask = 0
         for name, kind, offset in fields:
             self._indices.append((name, slice(count, count + kind.values) if kind.is_array else count))
             code += f"{offset - end}x{kind.form}"
@@ -138,7 +143,9 @@ class Formats:
         if not self._texts.get(name):
             raise ValueError(f"the format of {name} is missing, or has no fields")
         for found in FIELD.finditer(self._texts[name]):
-            kind, field, length = found[1], prefix + found[3], int(found[2]) if found[2] else None
+            kind = found[1]
+            field = prefix + found[3]
+            length = int(found[2]) if found[2] else None
             if length == 0:
                 raise ValueError(f"the array {field} has length 0")
             if kind in BASIC_TYPES:

@@ -263,7 +263,9 @@ class LogMessageBuilder:
         return None
 
     def _read_event(self, fields: dict[str, Any]) -> LoggedText | None:
-        timestamp, level, key = fields["timestamp"], fields["log_levels"] >> 4, (fields["id"], fields["event_sequence"])
+        timestamp = fields["timestamp"]
+        level = fields["log_levels"] >> 4
+        key = (fields["id"], fields["event_sequence"])
         if (timestamp, *key) in self._seen or (event := self._decode(fields["id"], bytes(fields["arguments"]))) is None:
             return None
         self._seen.append((timestamp, *key))

@@ -113,7 +113,10 @@ class UlogParser:
             try:
                 self._begin(is_end=is_end)
             except UlogError:
-                self._is_readable, self._boundaries, self._buffer, self._records = False, [], b"", []
+                self._is_readable = False
+                self._boundaries = []
+                self._buffer = b""
+                self._records = []
                 raise
         while self._boundaries and self._boundaries[0] <= self._offset + len(self._buffer):
             boundary = self._boundaries.pop(0) - self._offset
@@ -159,7 +162,9 @@ class UlogParser:
 
     def _consume_data(self, at: int) -> int:
         """Consume consecutive data messages except the last, whose successor needs inspection; return its position."""
-        buffer, known, records = self._buffer, self._known, self._records
+        buffer = self._buffer
+        known = self._known
+        records = self._records
         make = tuple.__new__  # needs half the time of a NamedTuple's constructor
         found = known.get(buffer[at : at + _DATA_HEADER])
         if found and self._sync < at:

@@ -86,7 +86,9 @@ class ChangeDetector:
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings in a message whose `missing` fields were not provided; None if nothing has changed."""
         values = self._read(message)
-        self.earlier, self.stamp, state = self.stamp, values[0], values[1:]
+        self.earlier = self.stamp
+        self.stamp = values[0]
+        state = values[1:]
         last, self.last = self.last, message
         if state == self._state and (missing is self.missing or missing == self.missing):
             return None
@@ -172,7 +174,10 @@ class AidDetector(ChangeDetector):
         return rules.AID_SOURCES[self.topic]
 
     def _start_run(self, *, is_fused: bool | None) -> None:
-        self._is_fused, self._since, self._count, self._rejected = is_fused, self.stamp, 0, 0
+        self._is_fused = is_fused
+        self._since = self.stamp
+        self._count = 0
+        self._rejected = 0
 
     def _change_to(self, kind: str, text: str) -> Iterator[Finding]:
         before, self.kind = self.kind, kind
@@ -386,7 +391,9 @@ def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
     if warning is None or was is None or was == warning:
         return
-    remaining, numbers, left = after["remaining"], {"warning": warning}, ""
+    remaining = after["remaining"]
+    numbers = {"warning": warning}
+    left = ""
     if remaining is not None and 0 <= remaining <= 1:
         numbers, left = {"warning": warning, "remaining": remaining}, f", {100 * remaining:.0f} % left"
     if warning:

@@ -218,7 +218,9 @@ class Vehicle:
         """Report EVIDENCE whose messages stopped while positions arrive, and those that resumed, by PX4's time."""
         if self._position is None:
             return
-        now, silent, resumed = min(self._position.stamp, self._position.earlier), dict[str, int](), list[str]()
+        now = min(self._position.stamp, self._position.earlier)
+        silent = dict[str, int]()
+        resumed = list[str]()
         if not 0 <= now - self._checked <= _MAX_PAUSE:  # positions resume: other messages may follow them
             self._resumed = now
         self._checked = now

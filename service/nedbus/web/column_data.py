@@ -89,7 +89,9 @@ class Tracks:
         points = history.points(seen // step * step, end)
         broken = False
         for position, point in enumerate(points.tolist(), end - len(points)):
-            east, north, doubtful = point[_EAST], point[_NORTH], point[_DOUBTFUL]
+            east = point[_EAST]
+            north = point[_NORTH]
+            doubtful = point[_DOUBTFUL]
             broken = math.isnan(east) or (broken and position % step > 0)
             kind = names[-1 if doubtful > 0 else 0]
             put(position // step % ring, {"east": round(east, 2), kind: math.nan if broken else round(north, 2)})

@@ -45,7 +45,9 @@ class Map:
         self.shown: list[str] = []
         self.shown_events: list[Event] = []
         self.size = 600.0, 500.0  # pixels, until the browser reports its own
-        self.focus, self.is_long, self.truth = "all", False, True
+        self.focus = "all"
+        self.is_long = False
+        self.truth = True
         self._style, self._background = style, background
         self._tracks = Tracks()
         self._ring = table("east", "north", "radius")
@@ -125,7 +127,9 @@ class Map:
         taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
         labels: dict[str, bool] = {}
         for each, x, y in sorted(places, key=lambda known: known[0] is not chosen):
-            name, low, size = each.vehicle, y + _MARK, len(each.vehicle) * _LETTER + 2 * _MARK
+            name = each.vehicle
+            low = y + _MARK
+            size = len(each.vehicle) * _LETTER + 2 * _MARK
             is_left = x + size > right / scale  # otherwise it would extend beyond the map
             begin, end = (x - size, x) if is_left else (x, x + size)
             if each is chosen or all(

@@ -96,7 +96,10 @@ class _Check:
     """
 
     def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
-        self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
+        self._vehicle = vehicle
+        self._count = count
+        self._max_age = max_age
+        self._expected = expected
         self._routers = " or ".join(bus.routers)
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self._statuses = [each for each in bus.services() if not self._is_local or each.host == _HOST]

@@ -23,8 +23,12 @@ _MAX_FLAGS: Final = 8  # with their names, in a summary
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
 _MIN_PAGE: Final = 10  # minimum number of lines between two headers
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
-_ADDRESS, _POSITION, _STATE = "VEHICLE/TOPIC", f"{'X m':>7} {'Y m':>7} {'Z m':>7}", "STATE"
-_VELOCITY, _HEADING, _EPH = f"{'VX m/s':>6} {'VY m/s':>6} {'VZ m/s':>6}", "HDG deg", "EPH m"
+_ADDRESS = "VEHICLE/TOPIC"
+_POSITION = f"{'X m':>7} {'Y m':>7} {'Z m':>7}"
+_STATE = "STATE"
+_VELOCITY = f"{'VX m/s':>6} {'VY m/s':>6} {'VZ m/s':>6}"
+_HEADING = "HDG deg"
+_EPH = "EPH m"
 _OPTIONAL: Final = (_EPH, _HEADING, _VELOCITY)  # in the order of removal on a narrow terminal
 
 
@@ -100,7 +104,9 @@ def _to_summary(message: Message) -> str:
 
     A false flag has its value; of a message with many flags, only the number of the false ones is shown.
     """
-    numbers, flags, false_flags = [], [], []
+    numbers = []
+    flags = []
+    false_flags = []
     for name, kind in message.DEFINITION.types.items():
         value = getattr(message, name)
         if kind.base == "bool":

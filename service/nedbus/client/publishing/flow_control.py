@@ -95,7 +95,9 @@ class _Request:
     """A request to acknowledge the first `number` messages, repeated until all readers reply to one of its queries."""
 
     def __init__(self, number: int, routers: list[str], *, read: bool, now: float) -> None:
-        self.number, self.read, self.routers = number, read, routers
+        self.number = number
+        self.read = read
+        self.routers = routers
         self.sent = self.last_reply = now
         self.queries: set[Replies] = set()  # queries that have not timed out
         self.replies: dict[str, bool] = {}  # whether each reader is closed
@@ -125,7 +127,10 @@ class FlowControl:
     def __init__(
         self, writer: Writer, window: SharedWindow, *, needs_router: bool, listener: MatchingListener | None = None
     ) -> None:
-        self._writer, self._shared, self._needs_router, self._listener = writer, window, needs_router, listener
+        self._writer = writer
+        self._shared = window
+        self._needs_router = needs_router
+        self._listener = listener
         self.cancelled = threading.Event()  # set to end a wait with ClosedError
         self._lock = threading.RLock()  # reentrant, because a signal handler may publish or close
         self._readers = ReaderProxies()
@@ -143,7 +148,9 @@ class FlowControl:
         Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
         """
         if self._listener and not self._listener.is_matched() and self._readers.is_empty and self._request is None:
-            self._acknowledged[True], self._due, self.check_at = published, published, published + _MATCH_EVERY
+            self._acknowledged[True] = published
+            self._due = published
+            self.check_at = published + _MATCH_EVERY
             return
         if self._wait(published, self._window, read=True, timeout=_TRICKLE_PERIOD):
             # While a request is open, no other is due: `_due` may have passed.
@@ -189,11 +196,15 @@ class FlowControl:
         self._next_request = now + min(_RETRY_PAUSE + now - request.sent, _QUERY_TIMEOUT)
         number = (request.number - 1) % 2**32
         selector = f"{ack_key(writer.key)}?publisher={writer.name};number={number};read={request.read:d}"
-        session, priority, timeout = writer.session, writer.priority, _QUERY_TIMEOUT
+        session = writer.session
+        priority = writer.priority
+        timeout = _QUERY_TIMEOUT
         request.queries.add(send_query(session, selector, timeout=timeout, priority=priority, congestion_control=_DROP))
 
     def _poll(self, now: float) -> None:
-        request, is_stale, self._polled = self._request, now - self._polled > _STALE_POLL, now
+        request = self._request
+        is_stale = now - self._polled > _STALE_POLL
+        self._polled = now
         if request is None or not request.poll(now):
             return
         froze = now - request.last_reply > TIMINGS.lease / 2

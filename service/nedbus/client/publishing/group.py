@@ -34,7 +34,9 @@ class Group:
     """
 
     def __init__(self, writer: Writer, put: Callable[[Sequence[Outgoing]], object], heartbeats: Heartbeats) -> None:
-        self._writer, self._put, self._heartbeats = writer, put, heartbeats
+        self._writer = writer
+        self._put = put
+        self._heartbeats = heartbeats
         self._held: list[Outgoing] = []  # each until it has been put
         self._left = 1  # messages until the group is complete
         self._successive, self._last = 0, 0.0  # messages since a pause; monotonic time of the last one [s]

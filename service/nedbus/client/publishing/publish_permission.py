@@ -15,7 +15,10 @@ class PublishPermission:
     """The write permissions of a session with a client certificate, probed once per vehicle and link to a router."""
 
     def __init__(self, session: Session, endpoints: Sequence[str], *, tls: Tls, prefix: str) -> None:
-        self._session, self._endpoints, self._tls, self._prefix = session, endpoints, tls, prefix
+        self._session = session
+        self._endpoints = endpoints
+        self._tls = tls
+        self._prefix = prefix
         self._lock = threading.Lock()
         self._routers = frozenset[str]()  # for which the permissions below hold: rules change only with a restart
         self._refused: dict[str, bool] = {}  # by vehicle

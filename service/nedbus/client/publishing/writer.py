@@ -30,7 +30,9 @@ class Writer:
     def __init__(
         self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: zenoh.Encoding | None = None
     ) -> None:
-        self.session, self.key, self.published = heartbeats.session, key, 0
+        self.session = heartbeats.session
+        self.key = key
+        self.published = 0
         self.priority = Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
         self.last_put = 0.0  # monotonic time of the last message [s]
         self.is_silent = True  # before the first message, and once a heartbeat has followed the last one

@@ -35,7 +35,9 @@ class Decoder:
     """
 
     def __init__(self, layouts: LayoutLookup, *, prefix: str) -> None:
-        self.invalid, self.prefix, self._layouts = 0, prefix, layouts
+        self.invalid = 0
+        self.prefix = prefix
+        self._layouts = layouts
         self.reasons: dict[Address, str] = {}
         self._warned: set[int] = set()  # hashes, because keys may be long
         self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject

@@ -43,7 +43,9 @@ class Reorder:
         clock: Callable[[], float],
     ) -> None:
         self.gaps = Gaps()
-        self._streams, self._admit, self._counters = streams, admit, counters
+        self._streams = streams
+        self._admit = admit
+        self._counters = counters
         self._recovers, self._clock = recovers, clock
         self._settling_until = float("-inf")
 
@@ -53,7 +55,9 @@ class Reorder:
         The message that the writer of a key is expected to send next needs no further checks. Inside a run of such
         messages of one writer the senders are compared at its end.
         """
-        known, delivered, new_arrival = self._streams.get, self.gaps.delivered, tuple.__new__
+        known = self._streams.get
+        delivered = self.gaps.delivered
+        new_arrival = tuple.__new__
         received, now = clock.utc_ns(), self._clock()
         last, count = None, 0  # the writer of the current run, and its messages; in a small batch each is a run
         has_runs = len(batch) >= _LONG_RUN
@@ -79,7 +83,9 @@ class Reorder:
                     else:
                         if count > 1:
                             self._check_run(count, now, overflowed)
-                        last, count, stream.last_active = (writer if has_runs else None), 1, now
+                        last = writer if has_runs else None
+                        count = 1
+                        stream.last_active = now
                     writer.expected = (writer.expected + 1) % NUMBERS
                     delivered.append(arrival)
                     continue

@@ -31,7 +31,10 @@ class Unread:
     """
 
     def __init__(self, counters: LossCounters, *, newest_only: bool, limit: int) -> None:
-        self.newest_only, self.arrived, self._counters, self._limit = newest_only, 0, counters, limit
+        self.newest_only = newest_only
+        self.arrived = 0
+        self._counters = counters
+        self._limit = limit
         self._bytes = 0
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}

@@ -53,7 +53,10 @@ class RecordedStream:
     def __init__(
         self, ros2_topic: str, address: Address, definition: Definition[Any], layout: Layout, missing: frozenset[str]
     ) -> None:
-        self.ros2_topic, self.address, self.definition, self.layout = ros2_topic, address, definition, layout
+        self.ros2_topic = ros2_topic
+        self.address = address
+        self.definition = definition
+        self.layout = layout
         self.lacking = missing  # by the metadata of the channel
         self.strict_bools = frozenset(name for name, kind in layout.types.items() if kind.base == "bool")
         self.cdr = cdr_layout(layout)

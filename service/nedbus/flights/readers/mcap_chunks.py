@@ -174,7 +174,9 @@ class ChunkFile:
             if begin < previous:
                 raise ValueError(begin)
             previous = stop
-        self._chunks, self._end, self.summary = chunks, start, summary
+        self._chunks = chunks
+        self._end = start
+        self.summary = summary
 
     def _scan(self, offset: int, stop: int, *, is_listed: bool = False) -> Iterator[tuple[int, int, int]]:
         """Scan a range; yield opcode, begin and end of chunks, and of schemas, channels and messages between them.

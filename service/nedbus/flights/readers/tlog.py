@@ -130,7 +130,10 @@ class TlogReader(FlightReader):
     def message_of(self, record: Record) -> SourceMessage:
         """Return a record as a message, with its author, and the losses and the reboot before it."""
         message = super().message_of(record)
-        message.lost, message.rebooted, self._lost, self._rebooted = self._lost, self._rebooted, 0, False
+        message.lost = self._lost
+        message.rebooted = self._rebooted
+        self._lost = 0
+        self._rebooted = False
         message.source = self._source
         return message
 
@@ -149,7 +152,9 @@ class TlogReader(FlightReader):
         """Yield each frame with its time [us]; after damage, search for two consecutive records."""
         with self._file as file:
             self._end = _end_of_content(file, self.total)
-            data, at, is_synchronised = b"", 0, True
+            data = b""
+            at = 0
+            is_synchronised = True
             while True:
                 if len(data) - at < 2 * _MAX_RECORD:
                     data, at = data[at:] + file.read(_BLOCK), 0

@@ -63,7 +63,9 @@ class UlogReader(FlightReader):
 
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
-        plain, data, make = self._plain, ulog.Data, tuple.__new__
+        plain = self._plain
+        data = ulog.Data
+        make = tuple.__new__
         for records in self._read():
             for record in records:
                 if isinstance(record, data) and record[0] in plain:

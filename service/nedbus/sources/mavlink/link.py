@@ -239,12 +239,17 @@ class PeerChoice:
         if peer == self.peer:
             if self._other is not None and now - self._other[1] < _PEER_TIMEOUT:
                 self.second = self._other[0]
-            self._other, self._run, self._last = None, 0, now
+            self._other = None
+            self._run = 0
+            self._last = now
             return
         self._run = self._run + 1 if self._other is not None and self._other[0] == peer else 1
         self._other = peer, now
         if now - self._last > _PEER_TIMEOUT or self._run >= _PEER_RUN:
-            self.peer, self._other, self._run, self._last = peer, None, 0, now
+            self.peer = peer
+            self._other = None
+            self._run = 0
+            self._last = now
 
 
 class DuplicateIds:

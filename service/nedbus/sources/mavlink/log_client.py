@@ -92,7 +92,9 @@ class LogStreamClient:
     def __init__(
         self, log: Set[Literal["1", "armed", "take"]], *, system: int, component: int, header: float | None = None
     ) -> None:
-        self._log, self._ids, self._longest_header = log, (system, component), header
+        self._log = log
+        self._ids = (system, component)
+        self._longest_header = header
         self._owner = "another client"
         self.header_seconds: float | None = None
         self._is_px4 = self._armed = self._is_left = False
@@ -127,7 +129,9 @@ class LogStreamClient:
 
     def on_heartbeat(self, autopilot: int, now: float, *, armed: bool) -> list[Command]:
         """Handle a HEARTBEAT of the autopilot; `autopilot`: MAV_AUTOPILOT."""
-        self._is_px4, self._armed, self._last_heartbeat = autopilot == dialect.MAV_AUTOPILOT_PX4, armed, now
+        self._is_px4 = autopilot == dialect.MAV_AUTOPILOT_PX4
+        self._armed = armed
+        self._last_heartbeat = now
         if not self._is_px4 and self.status.state == "idle":
             self._enter("refused", "not_px4", now, _name("MAV_AUTOPILOT", autopilot))
         elif self.status.reason == "link_lost":
@@ -136,7 +140,9 @@ class LogStreamClient:
 
     def adopt(self, now: float) -> None:
         """Continue a stream of an earlier process that is addressed to this client, and whose definitions are known."""
-        self._awaited, self._has_header, self._has_sent_command = None, True, True
+        self._awaited = None
+        self._has_header = True
+        self._has_sent_command = True
         self._resume(now)
 
     def leave(self) -> None:
@@ -162,10 +168,15 @@ class LogStreamClient:
         if self._awaited == "stop" or is_rejected or state in ("stopping", "stopped"):
             pass
         elif begins:
-            self._awaited, self._has_header, self._restarts, self.header_seconds = None, True, 0, None
+            self._awaited = None
+            self._has_header = True
+            self._restarts = 0
+            self.header_seconds = None
             self._unreadable = ""
             self._enter("header", None, now)
-            self._header_start, self._last_acked, self._header_messages = now, now, 1
+            self._header_start = now
+            self._last_acked = now
+            self._header_messages = 1
             self._header_pause = self._interval = 0.0
         elif state == "header" and not acked:
             self._end_header(now)
@@ -258,7 +269,9 @@ class LogStreamClient:
             self._due = now + (TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0)
 
     def _send(self, kind: Literal["start", "stop"], now: float, *, tries: int = 0) -> list[Command]:
-        self._awaited, self._tries, self._has_sent_command = kind, tries + 1, True
+        self._awaited = kind
+        self._tries = tries + 1
+        self._has_sent_command = True
         self._due = now + TIMINGS.log_answer * (2**tries if kind == "start" else 1)
         return [Command(kind)]
 
@@ -270,7 +283,9 @@ class LogStreamClient:
             self._pings.clear()
             if not self._measurements:
                 self._round_trips = []
-        self._awaited, self._tries, self._due = "pong", self._tries + 1, now + TIMINGS.log_answer
+        self._awaited = "pong"
+        self._tries = self._tries + 1
+        self._due = now + TIMINGS.log_answer
         self._pings.add(ping)
         return [Command("ping", ping)]
 
@@ -351,7 +366,9 @@ class LogStreamClient:
                 self._enter("starting", "silent", now, now - self._last_data)
             elif self.status.reason != "no_data":  # "no_data" stays while START is retried
                 self._enter("starting", None, now)
-            self._awaited, self._has_header, self._due = "data", False, now + TIMINGS.log_answer
+            self._awaited = "data"
+            self._has_header = False
+            self._due = now + TIMINGS.log_answer
         elif state == "stopping":
             self._enter("stopped", None, now)
         elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:  # the stream exists, but is slow
@@ -367,7 +384,9 @@ class LogStreamClient:
         return []
 
     def _on_timeout(self, now: float, *, is_lost: bool) -> list[Command]:
-        state, awaited, self._awaited = self.status.state, self._awaited, None
+        state = self.status.state
+        awaited = self._awaited
+        self._awaited = None
         is_repeated = self._tries < _TRIES
         if awaited == "stop":
             if is_repeated:

@@ -52,7 +52,9 @@ class LogStream:
         self, name: str, options: MavlinkOptions, client: LogStreamClient, state: StreamFile | None = None
     ) -> None:
         self.state = state or StreamFile(None, 0)
-        self._name, self._client, self._address = name, client, Address(name, DEFAULT_TOPIC)
+        self._name = name
+        self._client = client
+        self._address = Address(name, DEFAULT_TOPIC)
         self._topics = options.chosen_topics
         self._folder = Path(options.save).expanduser() if options.save else None
         self._file: LogFile | None = None
@@ -222,7 +224,10 @@ class LogStream:
         if seconds >= _WINDOW:
             self._rate = self._window_bytes / seconds
             self._delay = self._delays / self._delayed if self._delayed else None
-            self._window_start, self._window_bytes, self._delays, self._delayed = now, 0, 0.0, 0
+            self._window_start = now
+            self._window_bytes = 0
+            self._delays = 0.0
+            self._delayed = 0
         self._estimate_lost()  # a gap may precede the first message
         state = self._client.status
         return LogStreamStatus(
@@ -267,7 +272,10 @@ class LogStream:
     ) -> SourceMessage:
         address, definition = stream.address, stream.definition
         self._streamed.add(address)
-        lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
+        lost = self._unreported
+        self._unreported = 0
+        dropout = self._dropout
+        self._dropout = 0.0
         return SourceMessage(
             0.0, address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload, arrived=now
         )
@@ -343,7 +351,10 @@ class LogStream:
                 self.state.append(struct.pack("<HB", len(body), ord("A")) + body)
         if not (self._has_data and self._is_pending) or (self._folder and now < self._next_file):
             return
-        pending, self._pending, self._is_pending, self._pending_size = self._pending, deque(), False, 0
+        pending = self._pending
+        self._pending = deque()
+        self._is_pending = False
+        self._pending_size = 0
         if self._folder is None:
             return
         self._next_file = now + _FILE_INTERVAL
@@ -377,7 +388,9 @@ class _MeanSize:
     def add(self, sizes: Iterable[int]) -> None:
         """Add the sizes of messages."""
         for size in sizes:
-            self._count, self._sum, self._squares = self._count + 1, self._sum + size, self._squares + size * size
+            self._count = self._count + 1
+            self._sum = self._sum + size
+            self._squares = self._squares + size * size
         if not self.is_known and self._count >= _MIN_SIZES:
             variance = max(0.0, self._squares / self._count - self.mean**2)
             self.is_known = math.sqrt(variance / self._count) <= _MAX_ERROR * self.mean

@@ -87,7 +87,9 @@ class LogReceiver:
     """
 
     def __init__(self, reader: LinkReader, options: MavlinkOptions, send: Callable[[Any, Peer], object]) -> None:
-        self._reader, self._options, self._send = reader, options, send
+        self._reader = reader
+        self._options = options
+        self._send = send
         self.vehicles: dict[int, _Vehicle] = {}
         self._waiting = ReceiveQueue()
         self._stop = threading.Event()
@@ -175,7 +177,9 @@ class LogReceiver:
         return True
 
     def _follow_stream(self, vehicle: _Vehicle, received: Received) -> Received | Rejection:
-        message, kind, now = received.message, received.message.get_type(), received.time
+        message = received.message
+        kind = received.message.get_type()
+        now = received.time
         if kind.startswith("LOGGING_DATA"):
             return self._process_data(received, vehicle, kind)
         if received.peer != vehicle.peers.peer:  # another link, or a stranger

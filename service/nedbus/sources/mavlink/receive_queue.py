@@ -106,7 +106,9 @@ class ReceiveQueue:
         self._error: BaseException | None = None
         self._count = self._dropped = 0
         self._turn = 0.0  # `used` of the vehicle that is served
-        self._load, self._overload_end, self._longest_wait = LinkLoad(), 0.0, 0.0
+        self._load = LinkLoad()
+        self._overload_end = 0.0
+        self._longest_wait = 0.0
 
     def put(self, *items: Received | Rejection) -> None:
         """Add messages; drop the oldest ones of the longest queue while there are too many."""

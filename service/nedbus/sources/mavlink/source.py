@@ -55,7 +55,9 @@ class MavlinkSource:
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
-        self._routers, self._tls, self._prefix = routers, tls, prefix
+        self._routers = routers
+        self._tls = tls
+        self._prefix = prefix
 
     def listen(self, router: Session | None) -> Iterator[LiveItem]:
         """Receive messages; raise SourceError if the link cannot be opened or fails."""
@@ -73,7 +75,9 @@ class _LinkSession:
     """One open link: request and convert messages, send heartbeats; with `log=`, decode the ULog streams."""
 
     def __init__(self, link: Link, options: MavlinkOptions, *, name: str, access: BusAccess | None = None) -> None:
-        self._link, self._options, self._name = link, options, name
+        self._link = link
+        self._options = options
+        self._name = name
         self._sender = dialect.MAVLink(None, SYSTEM, COMPONENT)
         self._sending = threading.Lock()
         self._unsent = 0  # messages that the link did not accept, to be logged
@@ -135,7 +139,10 @@ class _LinkSession:
             log.end()
 
     def _handle(self, received: Received) -> Iterator[SourceMessage | Rejection]:
-        message, system, now, chunk = received.message, received.system, received.time, received.chunk
+        message = received.message
+        system = received.system
+        now = received.time
+        chunk = received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
             options, name = self._options, self._name_of(system)

@@ -103,7 +103,9 @@ class StreamRegistry:
     """All keys with publishers or messages, and the stream that owns each address."""
 
     def __init__(self, options: Px4ZenohOptions, *, vehicle: str, supplied: Definitions | None = None) -> None:
-        self._options, self._vehicle, self._supplied = options, vehicle, supplied or {}
+        self._options = options
+        self._vehicle = vehicle
+        self._supplied = supplied or {}
         self._streams: dict[str, Px4Stream] = {}
         self._owners: dict[Address, Px4Stream] = {}
         self._reboots: dict[str, int] = {}  # by vehicle
@@ -163,7 +165,9 @@ class StreamRegistry:
             if step == 0:
                 raise NotAcceptedError(f"sequence number {attachment.sequence} is a duplicate")
             if step < 0:
-                is_repeated, stream.rebooted, restarted = now - stream.rebooted < _TIMEOUT, now, True
+                is_repeated = now - stream.rebooted < _TIMEOUT
+                stream.rebooted = now
+                restarted = True
                 if is_repeated:
                     reason = f"sequence numbers go back and forth, as if two vehicles shared this key; {_HINT}"
                     raise NotAcceptedError(reason)
