@@ -198,7 +198,7 @@ def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bus: nedbus.Bus) -> None:
-    """`nedbus schema` queries the definition of a topic that is not built in; unpublished topics are usage errors."""
+    """`nedbus schema` queries a definition that is not built in, by topic or message; others are usage errors."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )
@@ -208,6 +208,7 @@ def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bu
         shown = json.loads(run_command("schema", "wheel_encoders", "-c", endpoint).out)
         assert shown["description"] == "A message defined at run time."
         assert list(shown["properties"]) == ["timestamp", "wheel_speed"]
+        assert json.loads(run_command("schema", "WheelEncoders", "-c", endpoint).out) == shown
     for wrong in ("wheel_encoders_b", "WheelEncoders", "*"):
         ended = run_command("schema", wrong, "-c", endpoint)
         assert (ended.exit_code, ended.out) == (2, "")
