@@ -499,7 +499,8 @@ def test_fields_converted_from_heartbeat_are_those_of_the_page() -> None:
     row = next(
         line for line in TEXTS[ROOT / "docs" / "live.md"].splitlines() if line.startswith("| `vehicle_status` | `HEAR")
     )
-    named, _, absent = row.partition("; neither")
+    named, _, others = row.partition("; the sensors of")
+    absent = others.partition("; not ")[2]
     heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, 128, 0, 4, 3)
     heartbeat.pack(mavlink.MAVLink(None, 1, 1))
     provided = CONVERSIONS["HEARTBEAT"][1](heartbeat)

@@ -67,9 +67,7 @@ def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
 
 
 # Each conversion swaps axes or is a half turn, and is therefore its own inverse.
-enu_to_ned = ned_to_enu
-flu_to_frd = frd_to_flu
-yaw_enu_to_ned = yaw_ned_to_enu
+enu_to_ned, flu_to_frd, yaw_enu_to_ned = ned_to_enu, frd_to_flu, yaw_ned_to_enu
 variances_enu_to_ned, quaternion_enu_to_ned = variances_ned_to_enu, quaternion_ned_to_enu
 
 

@@ -46,7 +46,7 @@ _COMMANDS: Final[Mapping[str, _Command]] = {
     "web": _Command("bridges", "Serve a web page with a map, the faults and plots of all vehicles."),
     "record": _Command("recordings", "Record messages to an MCAP file until Ctrl-C."),
     "convert": _Command("files", "Convert flight logs to an MCAP recording."),
-    "plot": _Command("files", "Plot flights: track, altitude, speed, flags, resets and events."),
+    "plot": _Command("files", "Plot flights: track, height, speed, flags, resets and events; or fields over time."),
     "pki": _Command("pki", "Manage keys, certificates and access rules for tls/ endpoints."),
 }
 """All commands, in the order of the help. The list of commands imports none of their modules."""

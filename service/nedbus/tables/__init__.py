@@ -23,6 +23,6 @@ else:
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
 
 __all__ = [
-    "MAX_STREAMS", "addresses_of", "align", "array_of", "array_warnings", "draw", "missing_of", "read",
-    "read_positions",
+    "MAX_STREAMS", "addresses_of", "align", "array_of", "array_warnings", "draw", "draw_fields", "missing_of", "read",
+    "read_plotted",
 ]  # fmt: skip

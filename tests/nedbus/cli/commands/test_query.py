@@ -209,12 +209,12 @@ def test_duration_without_data_exits_with_1(endpoint: str, command: str, key_exp
 @pytest.mark.parametrize("command", ["list", "echo", "hz", "get", "info"])
 def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a router, a command exits with 1 and prints one line with the endpoint, the time waited and a remedy."""
-    bus_class = nedbus.Bus  # `nedbus` resolves this name in nedbus.client, where the test replaces it
+    bus_class = nedbus.Bus
 
     def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
         return bus_class(settings, timeout=timeout / 10)
 
-    monkeypatch.setattr("nedbus.client.Bus", connect_soon)
+    monkeypatch.setattr("nedbus.Bus", connect_soon)
     where = free_endpoint()
     ended = run_command(command, "-c", where)
     assert ended.exit_code == 1
