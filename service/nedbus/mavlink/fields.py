@@ -18,6 +18,10 @@ _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # 12: body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
 _TRANSITIONS: Final = {dialect.MAV_VTOL_STATE_TRANSITION_TO_FW, dialect.MAV_VTOL_STATE_TRANSITION_TO_MC}
 _VTOL_STATES: Final = {*_TRANSITIONS, dialect.MAV_VTOL_STATE_FW, dialect.MAV_VTOL_STATE_MC}
+_MULTICOPTERS: Final = {
+    dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_COAXIAL, dialect.MAV_TYPE_HELICOPTER, dialect.MAV_TYPE_HEXAROTOR,
+    dialect.MAV_TYPE_OCTOROTOR, dialect.MAV_TYPE_TRICOPTER, dialect.MAV_TYPE_DODECAROTOR, dialect.MAV_TYPE_DECAROTOR,
+}  # fmt: skip
 
 
 def _number(value: int, unit: float, *unknown: int) -> float | None:
@@ -89,6 +93,15 @@ def _status(message: Any) -> dict[str, object]:
         "system_type": message.type,
         "system_id": message.get_srcSystem(), "component_id": message.get_srcComponent(),
     }  # fmt: skip
+
+
+def can_be_vtol(system_type: object) -> bool:
+    """Return whether a vehicle of this MAV_TYPE can be a VTOL.
+
+    ArduCopter (4.5.7) sends the `vtol_state` of a VTOL in hover for a quadrotor, and ArduPlane has the type of a fixed
+    wing also if it is a VTOL.
+    """
+    return system_type not in _MULTICOPTERS
 
 
 def vtol_status(state: int) -> dict[str, object]:

@@ -17,7 +17,7 @@ from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, Address, decode_text, is
 from nedbus_msgs.frames import wrap
 
 from .boot_time import new_clock, read_time, time_since_boot
-from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY, vtol_status
+from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY, can_be_vtol, vtol_status
 from .senders import text_source
 from .sequence import REPEATED
 
@@ -354,7 +354,8 @@ class Vehicle:
                 fields |= self._recall("global status", now)
             case "vehicle_status":
                 fields |= self._recall("sensors", now)
-                fields |= self._recall("vtol", now)
+                if can_be_vtol(fields.get("system_type")):
+                    fields |= self._recall("vtol", now)
             case "sensor_gps" if utc := self._recall("utc", now):
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 

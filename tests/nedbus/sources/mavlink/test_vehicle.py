@@ -452,6 +452,19 @@ def test_status_of_a_vtol_has_its_transition(
     assert "is_vtol" not in handle(vehicle, heartbeat, 111.0).fields
 
 
+@pytest.mark.parametrize(
+    ("kind", "is_vtol"),
+    [(dialect.MAV_TYPE_QUADROTOR, False), (dialect.MAV_TYPE_HEXAROTOR, False), (dialect.MAV_TYPE_FIXED_WING, True)],
+)
+def test_multicopter_is_no_vtol(kind: int, is_vtol: bool) -> None:
+    """ArduCopter 4.5.7 sends the VTOL state of a multicopter, as in a .tlog of its SITL; a fixed wing can be a VTOL."""
+    vehicle = new_vehicle("*")
+    vehicle.handle(position(1000), 100.0)
+    vehicle.handle(dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_MC, 2), 100.0)
+    heartbeat = dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3)
+    assert ("is_vtol" in handle(vehicle, heartbeat, 101.0).fields) == is_vtol
+
+
 def test_origin_beyond_the_antimeridian_is_kept(vehicle: Vehicle) -> None:
     """PX4 up to 1.15 sends an origin east of 180 degrees."""
     vehicle.handle(dialect.MAVLink_gps_global_origin_message(-170_000_000, 1_800_000_100, 0), 100.0)
