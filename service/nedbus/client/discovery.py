@@ -203,8 +203,8 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     Large replies then do not delay the messages of the bus. Ignores oversized replies, and what a service says of
     other vehicles than that of the key.
 
-    The first status of each vehicle comes first, older services last: whoever shows only some leaves out those of the
-    vehicles that claim most services.
+    The list begins with one status of each vehicle and ends with older services. A program that shows only its
+    beginning thus leaves out no vehicle because another one claims many services.
     """
     found: dict[tuple[str | None, str], ServiceStatus] = {}
     for vehicle, service, content in _find(session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout):

@@ -38,7 +38,7 @@ def test_changes_between_streamed_and_converted_messages_are_no_resets(
 
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.name.removesuffix(".bin.gz"))
 def test_no_message_is_rejected_and_no_estimate_contradicted(monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
-    """No message of a real PX4 is rejected, streamed or converted, and no estimate is said to be wrong."""
+    """No streamed or converted message of a real PX4 is rejected, and none contradicts the estimate."""
     service = Service(path, monkeypatch).run()
     assert service.rejected == []
     assert service.output.rejected == 0

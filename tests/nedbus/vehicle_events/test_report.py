@@ -335,7 +335,7 @@ def test_loss_of_a_link_is_one_fault_of_its_service() -> None:
 
 
 def test_report_about_one_vehicle_replaces_no_event_of_another() -> None:
-    """Whoever reports about vehicle 1 can copy service, host and time of an event of vehicle 2, but not replace it."""
+    """A report about vehicle 1 with the service, host and time of an event of vehicle 2 does not replace that event."""
     vehicles = {name: VehicleReport("info", "ok", has_position=True) for name in ("1", "2")}
     lost = Event(ALL, "link_down", "begin", "bad", "no link to tcp/a", 50.0)
     genuine = AccountReport("gcs", "host", 100.0, vehicles, (lost,)).about("2")

@@ -124,7 +124,7 @@ def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", SHORT_FLIGHTS)
 def test_no_message_of_a_short_flight_is_rejected(tmp_path: Path, name: str) -> None:
-    """All messages of short recordings are valid, and no estimate is said to be wrong."""
+    """All messages of short recordings are valid, and none contradicts the estimate."""
     result = run_command("convert", str(DATA / name), str(tmp_path / "a.mcap"), "--topics", "*")
     assert (result.exit_code, "rejected" in result.out + result.err) == (0, False), result
     assert [event.text for event in nedbus.events(DATA / name) if event.kind.endswith("_contradicted")] == []
