@@ -46,10 +46,20 @@ for _ in sys.stdin:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="logs, recordings (default: a simulation)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "files",
+        nargs="*",
+        type=Path,
+        metavar="FILE",
+        help="logs, recordings (default: a simulation)",
+    )
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--vs", type=Path, help="a second checkout of nedbus, measured in the same run")
+    parser.add_argument(
+        "--vs", type=Path, help="a second checkout of nedbus, measured in the same run"
+    )
     arguments = parser.parse_args()
     checkouts = (HERE, Checkout(arguments.vs)) if arguments.vs else (HERE,)
     with tempfile.TemporaryDirectory() as folder:
@@ -64,14 +74,19 @@ def measure(path: Path, checkouts: tuple[Checkout, ...], rounds: int) -> None:
     """Detect the events of a file with each checkout, and print the times and their ratio."""
     running = [checkout.start("-c", ADD, str(path)) for checkout in checkouts]
     try:
-        (count, *_), times = [int(expect(process)) for process in running], [list[float]() for _ in running]
+        (count, *_), times = (
+            [int(expect(process)) for process in running],
+            [list[float]() for _ in running],
+        )
         for _ in range(rounds):
             for process, measured in zip(running, times, strict=True):
                 resume(process)
                 measured.append(float(expect(process)))
     finally:
         end(*running)
-    costs = [f"{min(measured):.2f} us (median {statistics.median(measured):.2f})" for measured in times]
+    costs = [
+        f"{min(measured):.2f} us (median {statistics.median(measured):.2f})" for measured in times
+    ]
     ratio = f", {min(times[0]) / min(times[1]) - 1:+.1%}" if len(times) > 1 else ""
     print(f"{path.name}, {count} messages: {' vs. '.join(costs)} per message{ratio}", flush=True)
 

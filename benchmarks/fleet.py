@@ -28,7 +28,9 @@ def main() -> None:
     """Publish according to the arguments."""
     vehicles, seconds, endpoint = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
     noise = sys.argv[4:] == ["noise"]
-    messages = np.repeat(nedbus.to_array([nedbus.VehicleLocalPosition(**FIELDS)]), vehicles if noise else 1)
+    messages = np.repeat(
+        nedbus.to_array([nedbus.VehicleLocalPosition(**FIELDS)]), vehicles if noise else 1
+    )
     random = np.random.default_rng(1)
     with nedbus.connect(endpoint) as bus:
         publishers = [bus.publisher(TOPIC, vehicle=f"v{number}") for number in range(vehicles)]
@@ -42,7 +44,9 @@ def main() -> None:
             if wait > 0:
                 time.sleep(wait)
             # One process simulates the hosts of all vehicles: encode their messages at once.
-            for publisher, payload in zip(publishers, payloads * (vehicles // len(payloads)), strict=True):
+            for publisher, payload in zip(
+                publishers, payloads * (vehicles // len(payloads)), strict=True
+            ):
                 publisher.publish_encoded(payload, FIELD_TYPES.keys())
         print(f"{late:.3f}", flush=True)
         sys.stdin.readline()
@@ -56,7 +60,9 @@ def _encode(messages: Any, tick: int, random: np.random.Generator | None) -> lis
         for name in NOISY:
             messages[name] = random.random(len(messages), np.float32)
     payloads = encode_array(messages)
-    return [payloads[start : start + PAYLOAD_SIZE] for start in range(0, len(payloads), PAYLOAD_SIZE)]
+    return [
+        payloads[start : start + PAYLOAD_SIZE] for start in range(0, len(payloads), PAYLOAD_SIZE)
+    ]
 
 
 if __name__ == "__main__":

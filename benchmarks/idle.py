@@ -57,9 +57,13 @@ with nedbus.connect(sys.argv[1]) as bus, bus.subscribe() as subscription:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=15.0)
-    parser.add_argument("--vs", type=Path, help="a second checkout of nedbus, measured in the same run")
+    parser.add_argument(
+        "--vs", type=Path, help="a second checkout of nedbus, measured in the same run"
+    )
     arguments = parser.parse_args()
     for checkout in (HERE, Checkout(arguments.vs)) if arguments.vs else (HERE,):
         print(f"\n{checkout.folder}")
@@ -70,7 +74,11 @@ def measure_idle(checkout: Checkout, seconds: float) -> None:
     """Measure services without readers, an idle subscription, and many buses."""
     with tempfile.TemporaryDirectory() as folder:
         ended = f"ulog:{write_log(Path(folder) / 'flight.ulg', range(0, 100_000, 10_000), x=1.0)}"
-        for source, name in (("sim:", "one simulated vehicle"), (ended, "ended replay"), ("px4-zenoh:", "no PX4 yet")):
+        for source, name in (
+            ("sim:", "one simulated vehicle"),
+            (ended, "ended replay"),
+            ("px4-zenoh:", "no PX4 yet"),
+        ):
             endpoint = f"tcp/127.0.0.1:{processes.free_port()}"
             arguments = ("serve", "-l", endpoint, "-s", source)
             with processes.nedbus_process(*arguments, checkout=checkout, setup=NAMES) as service:
@@ -90,7 +98,10 @@ def measure_idle(checkout: Checkout, seconds: float) -> None:
             times.append(1e3 * (time.perf_counter() - begin))
             time.sleep(0.37)  # not a multiple of any thread's period
         processes.end(process)
-        print(f"    latest(): {statistics.median(times):.1f} ms, at most {max(times):.1f} ms", flush=True)
+        print(
+            f"    latest(): {statistics.median(times):.1f} ms, at most {max(times):.1f} ms",
+            flush=True,
+        )
 
 
 def measure(process: Process, seconds: float) -> str:
@@ -98,16 +109,27 @@ def measure(process: Process, seconds: float) -> str:
     time.sleep(2.0)  # until the work at startup has ended
     (used,), before, start = processes.cpu_seconds(process), switches(process), time.monotonic()
     time.sleep(seconds)
-    (used_after,), after, passed = processes.cpu_seconds(process), switches(process), time.monotonic() - start
+    (used_after,), after, passed = (
+        processes.cpu_seconds(process),
+        switches(process),
+        time.monotonic() - start,
+    )
     processes.resume(process)
-    python = {int(thread): name for thread, name in json.loads(expect(process)).items() if name != "benchmark"}
+    python = {
+        int(thread): name
+        for thread, name in json.loads(expect(process)).items()
+        if name != "benchmark"
+    }
     threads, wakes, forced = Counter[str](), Counter[str](), 0
     for thread in before.keys() & after.keys():
         name = python.get(thread) or f"{psutil.Process(thread).name()} (not Python)"
         threads[name] += 1
         wakes[name] += after[thread].voluntary - before[thread].voluntary
         forced += after[thread].involuntary - before[thread].involuntary
-    lines = [f"\n    {count / passed:8.1f} a second: {threads[name]} {name}" for name, count in wakes.most_common(9)]
+    lines = [
+        f"\n    {count / passed:8.1f} a second: {threads[name]} {name}"
+        for name, count in wakes.most_common(9)
+    ]
     return (
         f"{100 * (used_after - used) / passed:.1f} % of a core, {processes.memory_mb(process):.0f} MB,"
         f" {(wakes.total() + forced) / passed:.0f} context switches a second, {wakes.total() / passed:.1f} of them"
@@ -117,7 +139,10 @@ def measure(process: Process, seconds: float) -> str:
 
 def switches(process: Process) -> dict[int, Any]:
     """Return the context switches of each thread so far; voluntary switches are wake-ups."""
-    return {each.id: psutil.Process(each.id).num_ctx_switches() for each in psutil.Process(process.pid).threads()}
+    return {
+        each.id: psutil.Process(each.id).num_ctx_switches()
+        for each in psutil.Process(process.pid).threads()
+    }
 
 
 if __name__ == "__main__":

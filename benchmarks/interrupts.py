@@ -44,16 +44,23 @@ LOAD: Final = "while True: sum(range(100_000))"
 
 def main() -> None:
     """Interrupt each command `count` times; print a line for each command, and the stacks of each that does not end."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("commands", nargs="*", default=list(COMMANDS), help=f"of {', '.join(COMMANDS)}")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "commands", nargs="*", default=list(COMMANDS), help=f"of {', '.join(COMMANDS)}"
+    )
     parser.add_argument("--count", type=int, default=50, help="interrupts of each command")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--earliest", type=float, default=0.0, help="s after the start of the process")
+    parser.add_argument(
+        "--earliest", type=float, default=0.0, help="s after the start of the process"
+    )
     parser.add_argument("--latest", type=float, default=4.0)
     parser.add_argument("--load", type=int, default=2, help="processes that load the machine")
     arguments = parser.parse_args()
     moments = random.Random(arguments.seed)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job would pass SIGINT on as ignored
+    # a background job would pass SIGINT on as ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack, router() as (_, endpoint):
         flight = Path(folder) / "flight.mcap"
         convert_replay("sim:?duration=60", flight)
@@ -61,8 +68,15 @@ def main() -> None:
         stack.callback(end, *loads)
         stack.enter_context(nedbus_process("serve", "--source", "sim:", "--connect", endpoint))
         for name in arguments.commands:
-            replaced = {"FLIGHT": str(flight), "ROUTER": endpoint, "RECORDING": str(Path(folder) / "new.mcap")}
-            chosen = [moments.uniform(arguments.earliest, arguments.latest) for _ in range(arguments.count)]
+            replaced = {
+                "FLIGHT": str(flight),
+                "ROUTER": endpoint,
+                "RECORDING": str(Path(folder) / "new.mcap"),
+            }
+            chosen = [
+                moments.uniform(arguments.earliest, arguments.latest)
+                for _ in range(arguments.count)
+            ]
             measure(name, replaced, chosen)
 
 
@@ -71,13 +85,18 @@ def measure(name: str, replaced: dict[str, str], moments: list[float]) -> None:
     codes, slowest, failures = collections.Counter[int](), 0.0, 0
     for moment in moments:
         port, text = free_port(), COMMANDS[name]
-        for old, new in (replaced | {"PORT": str(port), "ENDPOINT": f"tcp/127.0.0.1:{port}"}).items():
+        for old, new in (
+            replaced | {"PORT": str(port), "ENDPOINT": f"tcp/127.0.0.1:{port}"}
+        ).items():
             text = text.replace(old, new)
         code, seconds, errors = interrupt(text.split(), moment)
         codes[code], slowest = codes[code] + 1, max(slowest, seconds)
-        started = "Traceback" not in errors or "nedbus/cli" in errors  # before that the interpreter prints a traceback
+        # before that the interpreter prints a traceback
+        started = "Traceback" not in errors or "nedbus/cli" in errors
         fault = f"{seconds:.1f} s" if seconds > LIMIT else ""
-        fault = fault or (f"exit code {code}" if started and code not in CODES.get(name, {130, KILLED}) else "")
+        fault = fault or (
+            f"exit code {code}" if started and code not in CODES.get(name, {130, KILLED}) else ""
+        )
         fault = fault or ("traceback" if started and "Traceback" in errors else "")
         path = Path(replaced["RECORDING"])
         if path.exists():
@@ -88,7 +107,10 @@ def measure(name: str, replaced: dict[str, str], moments: list[float]) -> None:
             print(f"{name}: Ctrl-C {moment:.3f} s after the start: {fault}\n{errors}", flush=True)
     verdict = "MISSED" if failures else "met"
     shown = ", ".join(f"{count} x {code}" for code, count in sorted(codes.items()))
-    print(f"{name}: {len(moments)} interrupts, exit codes {shown}; slowest end {slowest:.1f} s  {verdict}", flush=True)
+    print(
+        f"{name}: {len(moments)} interrupts, exit codes {shown}; slowest end {slowest:.1f} s  {verdict}",
+        flush=True,
+    )
 
 
 def interrupt(arguments: list[str], moment: float) -> tuple[int, float, str]:

@@ -71,14 +71,18 @@ with nedbus.connect(sys.argv[1]) as bus, bus.subscribe() as subscription:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=int, default=20)
     seconds = parser.parse_args().seconds
     print(f"{VEHICLES} vehicles, four topics, {seconds} s      CPU: publisher  router  reader")
     raw = measure("raw Zenoh", PLAN + RAW_PUBLISHER, RAW_READER, seconds)
     ours = measure("nedbus", PLAN + PUBLISHER, READER, seconds)
     ratios = [one / other for one, other in zip(ours, raw, strict=True)]
-    print(f"{'nedbus / raw':40} {ratios[0]:10.2f} {ratios[1]:7.2f} {ratios[2]:7.2f}, all {sum(ours) / sum(raw):.2f}")
+    print(
+        f"{'nedbus / raw':40} {ratios[0]:10.2f} {ratios[1]:7.2f} {ratios[2]:7.2f}, all {sum(ours) / sum(raw):.2f}"
+    )
 
 
 def measure(name: str, publish: str, read: str, seconds: int) -> list[float]:

@@ -21,7 +21,8 @@ from .processes import TIMEOUT, Process, end, free_port, start
 
 VEHICLES: Final = 40
 STREAMS: Final = 200
-SPEED: Final = 0.25  # 2,040 messages a second in total, which the service sustains on a busy machine too
+# 2,040 messages a second in total, which the service sustains on a busy machine too
+SPEED: Final = 0.25
 REQUESTS: Final = 20
 _PUBLISHED: Final = "nedbus_messages_published_total{"
 
@@ -39,7 +40,10 @@ class Service:
     def __init__(self) -> None:
         ports = [free_port(), free_port()]
         self.url = f"http://127.0.0.1:{ports[0]}"
-        sources = [f"--source=sim:?vehicle={number}&seed={number}&speed={SPEED}" for number in range(1, VEHICLES + 1)]
+        sources = [
+            f"--source=sim:?vehicle={number}&seed={number}&speed={SPEED}"
+            for number in range(1, VEHICLES + 1)
+        ]
         self.process: Process = start(
             "-m", "nedbus", "serve", "-l", f"tcp/127.0.0.1:{ports[1]}", "--http", self.url.removeprefix("http://"),
             *sources,
@@ -74,16 +78,27 @@ class Service:
         return Interval(messages / passed, used / messages * 1e6)
 
     def _cpu(self) -> dict[int, float]:
-        return {each.id: each.user_time + each.system_time for each in psutil.Process(self.process.pid).threads()}
+        return {
+            each.id: each.user_time + each.system_time
+            for each in psutil.Process(self.process.pid).threads()
+        }
 
     def _published(self) -> float:
-        return sum(float(line.rpartition(" ")[2]) for line in self.get().splitlines() if line.startswith(_PUBLISHED))
+        return sum(
+            float(line.rpartition(" ")[2])
+            for line in self.get().splitlines()
+            if line.startswith(_PUBLISHED)
+        )
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=6, help="pairs of intervals, without and with scrapes")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--pairs", type=int, default=6, help="pairs of intervals, without and with scrapes"
+    )
     parser.add_argument("--seconds", type=int, default=6, help="duration of an interval [s]")
     arguments = parser.parse_args()
     service = Service()
@@ -98,8 +113,11 @@ def main() -> None:
         )
         rates, costs = [], []
         for pair in range(arguments.pairs):
-            order = (False, True) if pair % 2 else (True, False)  # alternating, so drift affects both
-            intervals = {scraped: service.measure(arguments.seconds, scraped=scraped) for scraped in order}
+            # alternating, so drift affects both
+            order = (False, True) if pair % 2 else (True, False)
+            intervals = {
+                scraped: service.measure(arguments.seconds, scraped=scraped) for scraped in order
+            }
             rates.append(1 - intervals[True].rate / intervals[False].rate)
             costs.append(intervals[True].cpu / intervals[False].cpu - 1)
             print(

@@ -23,7 +23,9 @@ PERIOD = 10_000  # us
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=int, default=20)
     count = parser.parse_args().seconds * 1_000_000 // PERIOD
     fields = {name: value for name, value in FIELDS.items() if name != "timestamp"}

@@ -38,9 +38,16 @@ class Checkout(NamedTuple):
         errors: int | None = subprocess.DEVNULL,
     ) -> Process:  # fmt: skip
         """Start a Python process that imports this checkout; `errors`: target of its stderr."""
-        packages = {"PYTHONPATH": os.pathsep.join(str(self.folder / each) for each in ("service", "schemas"))}
+        packages = {
+            "PYTHONPATH": os.pathsep.join(
+                str(self.folder / each) for each in ("service", "schemas")
+            )
+        }
         return start(
-            *arguments, python=python or self.python, environment={**packages, **(environment or {})}, errors=errors
+            *arguments,
+            python=python or self.python,
+            environment={**packages, **(environment or {})},
+            errors=errors,
         )
 
 
@@ -94,7 +101,9 @@ def end(*processes: Process, timeout: float = 0.0) -> None:
 
 
 @contextmanager
-def nedbus_process(*arguments: str, checkout: Checkout = HERE, setup: str = "") -> Iterator[Process]:
+def nedbus_process(
+    *arguments: str, checkout: Checkout = HERE, setup: str = ""
+) -> Iterator[Process]:
     """Run a nedbus command inside a `with` block; `setup`: Python code that runs before it."""
     process = checkout.start("-c", f"{setup}\nfrom nedbus.cli import main\nmain()", *arguments)
     try:
@@ -108,7 +117,9 @@ def nedbus_process(*arguments: str, checkout: Checkout = HERE, setup: str = "") 
 def router(checkout: Checkout = HERE) -> Iterator[tuple[Process, str]]:
     """Run a router on a free port; yield its process and endpoint."""
     port = free_port()
-    with nedbus_process("router", "--listen", f"tcp/127.0.0.1:{port}", checkout=checkout) as process:
+    with nedbus_process(
+        "router", "--listen", f"tcp/127.0.0.1:{port}", checkout=checkout
+    ) as process:
         wait_for_router(port, process)
         yield process, f"tcp/127.0.0.1:{port}"
 
@@ -117,7 +128,8 @@ def free_port() -> int:
     """Return a free port of loopback that no outgoing connection takes while a router is down."""
     while True:
         with socket.socket() as free, suppress(OSError):
-            free.bind(("127.0.0.1", random.randint(20_000, 32_000)))  # outgoing connections use ports from 32,768 up
+            # outgoing connections use ports from 32,768 up
+            free.bind(("127.0.0.1", random.randint(20_000, 32_000)))
             return int(free.getsockname()[1])
 
 

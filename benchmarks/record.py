@@ -23,14 +23,18 @@ ENDS: Final = 60.0  # s; timeout of the recorder for writing the rest
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--vehicles", type=int, default=200)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, router() as (_, endpoint):
         path, log = Path(folder) / "fleet.mcap", Path(folder) / "log"
         with log.open("w") as errors:
-            recorder = start("-m", "nedbus", "record", "-c", endpoint, "-o", str(path), errors=errors)
+            recorder = start(
+                "-m", "nedbus", "record", "-c", endpoint, "-o", str(path), errors=errors
+            )
         count, seconds = arguments.vehicles, arguments.seconds
         publisher = start("-m", "benchmarks.fleet", str(count), str(seconds), endpoint, "noise")
         try:

@@ -95,7 +95,9 @@ def _motion(quantity: Quantity, messages: Sequence[Fields]) -> list[Point]:
     pairs = [*pairwise(messages)]
     seconds = [(after["timestamp"] - before["timestamp"]) / 1e6 for before, after in pairs]
     steps = [
-        _wrapped(quantity, [after[value] - before[value] for value in _VALUES.get(quantity, (quantity,))])
+        _wrapped(
+            quantity, [after[value] - before[value] for value in _VALUES.get(quantity, (quantity,))]
+        )
         for before, after in pairs
     ]
     counter = RESET_COUNTERS[quantity]
@@ -106,9 +108,15 @@ def _motion(quantity: Quantity, messages: Sequence[Fields]) -> list[Point]:
         if quantity == "heading" and math.isfinite(turned):
             moved[index] = (turned,)
             continue
-        near = [each for each in (index - 1, index + 1) if 0 <= each < len(pairs) and not is_reset[each]]
-        rates = [[step / seconds[each] for step in steps[each]] for each in near if seconds[each] > 0]
-        moved[index] = tuple(seconds[index] * sum(each) / len(each) for each in zip(*rates, strict=True))
+        near = [
+            each for each in (index - 1, index + 1) if 0 <= each < len(pairs) and not is_reset[each]
+        ]
+        rates = [
+            [step / seconds[each] for step in steps[each]] for each in near if seconds[each] > 0
+        ]
+        moved[index] = tuple(
+            seconds[index] * sum(each) / len(each) for each in zip(*rates, strict=True)
+        )
         moved[index] = moved[index] or (math.nan,) * len(steps[index])
     return moved
 
@@ -119,30 +127,41 @@ def _wrapped(quantity: Quantity, steps: Sequence[float]) -> Point:
 
 def residuals(folder: Path, *, thinned: bool) -> dict[Quantity, dict[str, list[float]]]:
     """Return the residuals of each rule at all resets of the logs in a folder, by quantity."""
-    found: dict[Quantity, dict[str, list[float]]] = {name: {rule: [] for rule in RULES} for name in UNITS}
+    found: dict[Quantity, dict[str, list[float]]] = {
+        name: {rule: [] for rule in RULES} for name in UNITS
+    }
     for path in sorted(folder.rglob("*.ulg")):
         for reset in resets_in(path, thinned=thinned):
             for name, rule in RULES.items():
                 jump = rule(reset.quantity, reset.before, reset.after)
-                found[reset.quantity][name].append(_residual(reset, jump or (0.0,) * len(reset.moved)))
+                found[reset.quantity][name].append(
+                    _residual(reset, jump or (0.0,) * len(reset.moved))
+                )
     return found
 
 
 def _residual(reset: Reset, jump: Point) -> float:
     values = _VALUES.get(reset.quantity, (reset.quantity,))
     steps = [reset.after[value] - reset.before[value] for value in values]
-    track = [step - size - moved for step, size, moved in zip(steps, jump, reset.moved, strict=True)]
+    track = [
+        step - size - moved for step, size, moved in zip(steps, jump, reset.moved, strict=True)
+    ]
     return math.hypot(*_wrapped(reset.quantity, track))
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", nargs="?", type=Path, default=LOGS.parent, help="logs, also in its subfolders")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=LOGS.parent, help="logs, also in its subfolders"
+    )
     arguments = parser.parse_args()
     for thinned in (False, True):
         print(
-            f"{'thinned to 10 Hz' if thinned else 'at full rate':<16} {'resets':>6}", *(f"{rule:>10}" for rule in RULES)
+            f"{'thinned to 10 Hz' if thinned else 'at full rate':<16} {'resets':>6}",
+            *(f"{rule:>10}" for rule in RULES),
         )
         for quantity, by_rule in residuals(arguments.folder, thinned=thinned).items():
             sums = (f"{sum(each):>10.3f}" for each in by_rule.values())

@@ -40,10 +40,14 @@ with nedbus.connect(sys.argv[1]) as bus, bus.subscribe(mode="every") as subscrip
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sessions", type=int, default=960)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--vs", type=Path, help="a second checkout of nedbus, measured in the same run")
+    parser.add_argument(
+        "--vs", type=Path, help="a second checkout of nedbus, measured in the same run"
+    )
     arguments = parser.parse_args()
     for checkout in (HERE, Checkout(arguments.vs)) if arguments.vs else (HERE,):
         print(f"{checkout.folder}, {arguments.sessions} sessions")
@@ -63,7 +67,9 @@ def measure(checkout: Checkout, sessions: int, rounds: int) -> None:
         wait_for_router(port, routing)
         processes.append(checkout.start("-c", READER, endpoint, str(PROCESSES * sessions)))
         expect(processes[0])
-        processes += [checkout.start("-c", BUSES, endpoint, str(sessions), f"p{n}-") for n in range(PROCESSES)]
+        processes += [
+            checkout.start("-c", BUSES, endpoint, str(sessions), f"p{n}-") for n in range(PROCESSES)
+        ]
         *_, missing = json.loads(expect(processes[0]))
         for number in range(1, rounds + 1):
             time.sleep(5.0)
@@ -77,7 +83,9 @@ def measure(checkout: Checkout, sessions: int, rounds: int) -> None:
             first, last, missing_now = json.loads(expect(processes[0]))
             verdict = "met" if missing_now == missing and first - up < DOWN else "MISSED"
             times = f"first message after {first - up:.2f} s, one of all streams after {last - up:.1f} s"
-            print(f"restart {number}: {missing_now - missing} missing, {times}  {verdict}", flush=True)
+            print(
+                f"restart {number}: {missing_now - missing} missing, {times}  {verdict}", flush=True
+            )
             missing = missing_now
     finally:
         end(routing, *processes)

@@ -116,16 +116,24 @@ OPEN = {
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=int, default=0, help="default: 10, and 60 with 500 vehicles")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seconds", type=int, default=0, help="default: 10, and 60 with 500 vehicles"
+    )
     parser.add_argument("--names", type=int, help="measure the opening of this many names instead")
-    parser.add_argument("--vs", type=Path, help="a second checkout of nedbus, measured in the same run")
+    parser.add_argument(
+        "--vs", type=Path, help="a second checkout of nedbus, measured in the same run"
+    )
     arguments = parser.parse_args()
     limit = arguments.seconds
     if arguments.names:
         measure_names(arguments.names, Checkout(arguments.vs) if arguments.vs else None)
         return
-    print("vehicles readers  seconds  received / sent       lost  CPU us/message: publisher router reader   MB: same")
+    print(
+        "vehicles readers  seconds  received / sent       lost  CPU us/message: publisher router reader   MB: same"
+    )
     for vehicles, readers, seconds, way in (
         (1, 1, 10, "rows"),
         (10, 1, 10, "rows"),
@@ -142,7 +150,11 @@ def measure_names(count: int, other: Checkout | None) -> None:
     """Print the time per opening [us] at the start and at the end, of Zenoh and of each checkout."""
     print("opened     by          first 100  last 100")
     for way in ("latest", "every", "publisher"):
-        for name, checkout, code in (("zenoh", HERE, ZENOH), ("nedbus", HERE, NEDBUS), ("other", other, NEDBUS)):
+        for name, checkout, code in (
+            ("zenoh", HERE, ZENOH),
+            ("nedbus", HERE, NEDBUS),
+            ("other", other, NEDBUS),
+        ):
             if checkout is not None:
                 with router(checkout) as (_, endpoint):
                     process = checkout.start("-c", code + OPENING, way, endpoint, str(count))
@@ -166,13 +178,19 @@ def measure(vehicles: int, readers: int, seconds: int, way: str) -> str:
         delay = expect(publisher)
         time.sleep(2.0)
         sent = vehicles * seconds * RATE
-        used = [(late - early) / sent * 1e6 for early, late in zip(before, cpu_seconds(*processes), strict=True)]
+        used = [
+            (late - early) / sent * 1e6
+            for early, late in zip(before, cpu_seconds(*processes), strict=True)
+        ]
         memory = [memory_mb(process) for process in processes]
         for reader in receiving:
             resume(reader)
         results = [json.loads(expect(reader)) for reader in receiving]
         end(*receiving, publisher)
-    received, lost = min(each["received"] for each in results), max(each["lost"] for each in results)
+    received, lost = (
+        min(each["received"] for each in results),
+        max(each["lost"] for each in results),
+    )
     return (
         f"{vehicles:8} {readers:7} {seconds:8}  {received:8} / {sent:<8} {lost:8}"
         f"  {used[0]:23.1f} {used[1]:6.1f} {used[2]:6.1f}   {memory[0]:.0f} {memory[1]:.0f} {memory[2]:.0f}"

@@ -82,10 +82,16 @@ while subscriber.handler.recv():
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--names", type=int, default=50_000, help="number of vehicles")
-    parser.add_argument("--interval", type=float, default=0.0, help="interval between two vehicles [s]")
-    parser.add_argument("--checkout", type=Path, default=ROOT, help="checkout to measure (default: this one)")
+    parser.add_argument(
+        "--interval", type=float, default=0.0, help="interval between two vehicles [s]"
+    )
+    parser.add_argument(
+        "--checkout", type=Path, default=ROOT, help="checkout to measure (default: this one)"
+    )
     arguments = parser.parse_args()
     checkout, stage = Checkout(arguments.checkout), arguments.names // STAGES
     pages = {name: f"127.0.0.1:{free_port()}" for name in ("service", "export", "web")}
@@ -111,7 +117,9 @@ def main() -> None:
         end(*processes.values())
 
 
-def measure(processes: dict[str, Process], pages: dict[str, str], stage: int, timeout: float) -> None:
+def measure(
+    processes: dict[str, Process], pages: dict[str, str], stage: int, timeout: float
+) -> None:
     """Run all stages, print the state after each, and the growth from the first to the last."""
     print("vehicles    per s  open ms  MB: " + " ".join(f"{name:>9}" for name in processes))
     stages = []
@@ -122,12 +130,22 @@ def measure(processes: dict[str, Process], pages: dict[str, str], stage: int, ti
         stages.append([memory_mb(process) for process in processes.values()])
         memory = " ".join(f"{each:9.1f}" for each in stages[-1])
         scrapes = "; ".join(f"{name} {scrape(pages[name])}" for name in ("service", "export"))
-        print(f"{number * stage:8} {stage / seconds:8.1f} {opening:8.2f}      {memory}   {scrapes}", flush=True)
+        print(
+            f"{number * stage:8} {stage / seconds:8.1f} {opening:8.2f}      {memory}   {scrapes}",
+            flush=True,
+        )
     growth = dict(
-        zip(processes, (late - early for early, late in zip(stages[0], stages[-1], strict=True)), strict=True)
+        zip(
+            processes,
+            (late - early for early, late in zip(stages[0], stages[-1], strict=True)),
+            strict=True,
+        )
     )
     for name, first in zip(processes, stages[0], strict=True):
-        kilobytes, beyond = 1024 * growth[name] / stage / (STAGES - 1), (growth[name] - growth["raw"]) / first
+        kilobytes, beyond = (
+            1024 * growth[name] / stage / (STAGES - 1),
+            (growth[name] - growth["raw"]) / first,
+        )
         verdict = "" if name in {"raw", "publisher"} else "met" if beyond <= 0.1 else "MISSED: 10 %"
         print(f"{name:10} {kilobytes:8.2f} kB per vehicle, {beyond:.0%} more than raw  {verdict}")
 

@@ -25,8 +25,14 @@ def states(vehicle: str) -> Iterator[str]:
             except nedbus.NoDataError:
                 yield "ALARM: nothing arrived for 1 s"
             else:
-                known = {flag: getattr(sample.message, flag) for flag in GOOD.keys() - sample.missing}
-                doubts = [f"{flag} is {known[flag]}" for flag, good in GOOD.items() if known.get(flag, good) != good]
+                known = {
+                    flag: getattr(sample.message, flag) for flag in GOOD.keys() - sample.missing
+                }
+                doubts = [
+                    f"{flag} is {known[flag]}"
+                    for flag, good in GOOD.items()
+                    if known.get(flag, good) != good
+                ]
                 doubts += [f"{flag} is unknown" for flag in VALID if flag not in known]
                 yield f"ALARM: {', '.join(doubts).lower()}" if doubts else "good"
 

@@ -9,7 +9,11 @@ import numpy as np
 import nedbus
 
 try:
-    with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
+    with (
+        suppress(KeyboardInterrupt),
+        nedbus.connect() as bus,
+        bus.subscribe(mode="every") as subscription,
+    ):
         for batch in subscription.batches():
             for address in batch.addresses:
                 own = nedbus.mask_invalid(batch.of(address))  # NaN while v_xy_valid is false

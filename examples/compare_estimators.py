@@ -18,7 +18,9 @@ try:
                 truth = message.position
             elif sample.topic == "estimator_local_position" and truth and message.position:
                 error = math.dist(message.position, truth)
-                print(f"estimator {sample.instance}: {error:6.2f} m off, reports eph {message.eph:5.2f} m")
+                print(
+                    f"estimator {sample.instance}: {error:6.2f} m off, reports eph {message.eph:5.2f} m"
+                )
 except BrokenPipeError:
     os._exit(0)  # the reader, such as `head`, has ended: a normal exit would print the rest
 except nedbus.ConnectError as exc:

@@ -14,7 +14,11 @@ def show_highest_speeds(samples: Iterable[nedbus.Sample]) -> None:
     for sample in samples:  # from a bus or from a file
         message = sample.message
         speed = math.hypot(message.vx, message.vy, message.vz)
-        if message.v_xy_valid and message.v_z_valid and speed > fastest.get(sample.vehicle, 0.0) + 0.5:
+        if (
+            message.v_xy_valid
+            and message.v_z_valid
+            and speed > fastest.get(sample.vehicle, 0.0) + 0.5
+        ):
             fastest[sample.vehicle] = speed
             print(f"{sample.vehicle}: {speed:.1f} m/s", flush=True)
 

@@ -13,7 +13,11 @@ try:
         for sample in bus.latest():
             age = "unknown" if sample.latency is None else f"{sample.latency:.3f} s"
             position = sample.message.position
-            where = "no valid position" if position is None else " ".join(f"{metres:.2f}" for metres in position)
+            where = (
+                "no valid position"
+                if position is None
+                else " ".join(f"{metres:.2f}" for metres in position)
+            )
             doubt = ", dead reckoning" if sample.message.dead_reckoning else ""
             print(f"{sample.vehicle}: {where}, {age} old{doubt}")
 except BrokenPipeError:

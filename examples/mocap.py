@@ -8,10 +8,17 @@ from contextlib import suppress
 import nedbus
 
 
-def read_pose(seconds: float) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+def read_pose(
+    seconds: float,
+) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
     """Return position (NED, m) and attitude (w, x, y, z): replace this circle by your system's pose."""
     turn = 0.5 * seconds
-    return (math.cos(turn), math.sin(turn), -1.5), (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+    return (math.cos(turn), math.sin(turn), -1.5), (
+        math.cos(turn / 2),
+        0.0,
+        0.0,
+        math.sin(turn / 2),
+    )
 
 
 try:
@@ -21,10 +28,18 @@ try:
         while True:
             measured = time.monotonic_ns() // 1000  # one monotonic clock for both times
             position, q = read_pose(measured / 1e6)
-            pose = {"pose_frame": nedbus.VehicleOdometry.POSE_FRAME_NED, "position": position, "q": q}
-            variances = {"position_variance": (1e-4, 1e-4, 1e-4), "orientation_variance": (1e-4, 1e-4, 1e-4)}
+            pose = {
+                "pose_frame": nedbus.VehicleOdometry.POSE_FRAME_NED,
+                "position": position,
+                "q": q,
+            }
+            variances = {
+                "position_variance": (1e-4, 1e-4, 1e-4),
+                "orientation_variance": (1e-4, 1e-4, 1e-4),
+            }
             times = {"timestamp_sample": measured, "timestamp": time.monotonic_ns() // 1000}
-            publisher.publish({**times, **pose, **variances})  # without a velocity, because none is measured
+            # without a velocity, because none is measured
+            publisher.publish({**times, **pose, **variances})
             time.sleep(0.02)
 except nedbus.ConnectError as exc:
     sys.exit(str(exc))

@@ -11,7 +11,11 @@ import nedbus
 async def show(subscription: nedbus.AsyncSubscription) -> None:
     async for sample in subscription:
         position = sample.message.position
-        where = "no valid position" if position is None else " ".join(f"{metres:8.2f}" for metres in position)
+        where = (
+            "no valid position"
+            if position is None
+            else " ".join(f"{metres:8.2f}" for metres in position)
+        )
         print(f"{sample.vehicle}: {where}")
 
 

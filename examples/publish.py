@@ -13,7 +13,8 @@ try:
         while True:
             now = time.monotonic()
             position = {"x": 10 * math.cos(now), "y": 10 * math.sin(now), "z": -5.0}
-            publisher.publish({**position, "xy_valid": True, "z_valid": True})  # timestamp: the time since boot
+            # timestamp: the time since boot
+            publisher.publish({**position, "xy_valid": True, "z_valid": True})
             time.sleep(0.02)
 except nedbus.ConnectError as exc:
     sys.exit(str(exc))

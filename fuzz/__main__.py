@@ -24,17 +24,23 @@ ROOT: Final = Path(__file__).parents[1]
 BUILD: Final = ROOT / "build" / "fuzz"
 _HANG: Final = 10  # s for one input
 _MEMORY: Final = 512  # MB of the process
-_MAX_LENGTH: Final = {"mcap": 20_000, "ulog": 10_000, "mavlink": 8_000}  # maximum input size [bytes]; others 4096
-_GRACE: Final = 600  # s; a harness is killed this long after its time; on a busy machine it starts slowly
+# maximum input size [bytes]; others 4096
+_MAX_LENGTH: Final = {"mcap": 20_000, "ulog": 10_000, "mavlink": 8_000}
+# s; a harness is killed this long after its time; on a busy machine it starts slowly
+_GRACE: Final = 600
 _LEAST_EDGES: Final = 100
 _SHOWN: Final = 25  # lines of output for a finding
 
 
 def main() -> int:
     """Run the harnesses, as many at once as there are processors, and print a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parsers", nargs="*", choices=[*PARSERS, []], help="default: all")
-    parser.add_argument("--seconds", type=float, default=600, help="total duration for all parsers [s]")
+    parser.add_argument(
+        "--seconds", type=float, default=600, help="total duration for all parsers [s]"
+    )
     options = parser.parse_args()
     chosen = options.parsers or [*PARSERS]
     if find_spec("atheris") is None:
@@ -60,7 +66,9 @@ def fuzz(name: str, seconds: int) -> bool:
     command = [sys.executable, "-m", "fuzz.harness", name, *flags, str(corpus)]
     limit = seconds + _GRACE
     try:
-        done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, timeout=limit, check=False)
+        done = subprocess.run(
+            command, cwd=ROOT, text=True, capture_output=True, timeout=limit, check=False
+        )
         error, output, code = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as exc:
         error, output, code = str(exc), "", -1

@@ -5,7 +5,8 @@ import sys
 
 import atheris
 
-atheris.enabled_hooks.add("str")  # guides inputs to what `startswith` expects; the hook for `re` lacks arguments
+# guides inputs to what `startswith` expects; the hook for `re` lacks arguments
+atheris.enabled_hooks.add("str")
 with atheris.instrument_imports(include=["nedbus", "nedbus_msgs", "mcap"]):
     from . import parsers
 

@@ -72,14 +72,18 @@ def parse_ulog(data: bytes) -> int:
     verify, log = bool(data[:1] > b"\x7f"), data[2:]
     size = max(int.from_bytes(data[1:2], "big") ** 2, len(log) // _MAX_PIECES, 1)
     whole = _records(log, len(log) or 1, verify=verify)
-    assert _plain(_records(log, size, verify=verify)) == _plain(whole), "the records depend on the chunk size"
+    assert _plain(_records(log, size, verify=verify)) == _plain(whole), (
+        "the records depend on the chunk size"
+    )
     streams: dict[ulog.Subscription, ulog.LoggedStream] = {}
     texts = ulog.LogMessageBuilder()
     count = 0
     for count, record in enumerate(texts.merge(whole), 1):  # noqa: B007 - counts
         if isinstance(record, ulog.Data):
             with suppress(ValueError):  # of a format that cannot be a message
-                stream = streams.get(record.subscription) or ulog.LoggedStream("1", record.subscription)
+                stream = streams.get(record.subscription) or ulog.LoggedStream(
+                    "1", record.subscription
+                )
                 streams[record.subscription] = stream
                 _validate(stream.definition, stream.decode(record.payload))
     return count
@@ -91,7 +95,10 @@ def parse_mcap(data: bytes) -> int:
     count = 0
     try:
         os.write(descriptor, data)
-        with suppress(SourceError), McapReader(Path(f"/proc/self/fd/{descriptor}"), ReadOptions(topics=None)) as reader:
+        with (
+            suppress(SourceError),
+            McapReader(Path(f"/proc/self/fd/{descriptor}"), ReadOptions(topics=None)) as reader,
+        ):
             for count, record in enumerate(reader.records(), 1):  # noqa: B007 - counts
                 with suppress(DecodeError):
                     _validate(record.stream.definition, record.stream.decode(record.payload))
@@ -146,7 +153,9 @@ def parse_cdr(data: bytes) -> int:
     assert repr(again) == repr(fields)  # not ==, because NaN differs from itself
     if valid.all():
         encode = codec_of(definition).encode
-        assert encode(arrays_of(definition).to_message(accepted[0])) == encode(message), "the array differs"
+        assert encode(arrays_of(definition).to_message(accepted[0])) == encode(message), (
+            "the array differs"
+        )
     return 1
 
 
@@ -199,7 +208,9 @@ def parse_mavlink(data: bytes) -> int:
                 vehicle.count_lost(item.lost, now, counted=item.chunk.lost if item.chunk else 0)
                 found = [vehicle.handle(item.message, now)]
                 if item.chunk is not None:
-                    log = logs.setdefault(system, LogStream(str(system), options, receiver.vehicles[system].client))
+                    log = logs.setdefault(
+                        system, LogStream(str(system), options, receiver.vehicles[system].client)
+                    )
                     found += log.add(item.chunk, now)
                 for each in found:
                     if isinstance(each, SourceMessage):
@@ -240,7 +251,9 @@ def frames(data: bytes) -> Iterator[bytes]:
         number = MAVLINK_KINDS[kind % _REMOTE % len(MAVLINK_KINDS)]
         other = bool(kind & _REMOTE)
         sequences[other] += 1 + bool(kind & _LOST)
-        head = bytes([len(payload), 0, 0, sequences[other] % 256, 1 + other, 1]) + number.to_bytes(3, "little")
+        head = bytes([len(payload), 0, 0, sequences[other] % 256, 1 + other, 1]) + number.to_bytes(
+            3, "little"
+        )
         crc = x25crc(head + payload)
         crc.accumulate(bytes([dialect.mavlink_map[number].crc_extra]))
         yield bytes([dialect.PROTOCOL_MARKER_V2]) + head + payload + struct.pack("<H", crc.crc)

@@ -41,7 +41,11 @@ _PIECE: Final = 249  # bytes of a message of the log stream
 
 def ulog_seeds() -> Iterator[bytes]:
     """Yield trimmed logs of real vehicles with each kind of record, for both modes of the parser."""
-    for log in (_trim((DATA / "boot_time_utc_us.ulg").read_bytes()), _streamed_log(), _log_of_each_record()):
+    for log in (
+        _trim((DATA / "boot_time_utc_us.ulg").read_bytes()),
+        _streamed_log(),
+        _log_of_each_record(),
+    ):
         for verify in (0, 255):
             for size in (4, 255):
                 yield bytes([verify, size]) + log
@@ -70,7 +74,13 @@ def msg_seeds() -> Iterator[bytes]:
     parts = {path.stem: path.read_bytes() for path in sorted((DATA / "msg").glob("*.msg"))}
     yield from parts.values()
     nested = parts["PositionSetpoint"]
-    yield parts["PositionSetpointTriplet"] + b"\n" + b"=" * 80 + b"\nMSG: px4_msgs/PositionSetpoint\n" + nested
+    yield (
+        parts["PositionSetpointTriplet"]
+        + b"\n"
+        + b"=" * 80
+        + b"\nMSG: px4_msgs/PositionSetpoint\n"
+        + nested
+    )
     yield b"uint64 timestamp\nfloat32[4] q # [-] @range -1,1 @invalid NaN\nchar[8] text\nuint8 A=1\nstring S = 'a'\n"
     for definition in MESSAGES.values():
         yield definition_text(definition, definition.current).encode()
@@ -103,7 +113,9 @@ def mavlink_seeds() -> Iterator[bytes]:
     kinds = {number: payload for number, payload in telemetry if number in MAVLINK_KINDS}
     for number, payload in kinds.items():
         yield _framed([heartbeat, (number, payload), (number, payload)])
-    yield _framed([heartbeat, *(each for each in telemetry if each[0] in MAVLINK_KINDS)][:_TELEMETRY])
+    yield _framed(
+        [heartbeat, *(each for each in telemetry if each[0] in MAVLINK_KINDS)][:_TELEMETRY]
+    )
     yield _framed([heartbeat, *stream[:_STREAM]])
     result = struct.pack("<HBBiBB", dialect.MAV_CMD_LOGGING_START, 0, 0, 0, *MAVLINK_IDS)
     answer = dialect.MAVLINK_MSG_ID_COMMAND_ACK, result
@@ -141,7 +153,13 @@ def _trim(log: bytes) -> bytes:
         end = offset + 3 + int.from_bytes(log[offset : offset + 2], "little")
         kind, content, whole = log[offset + 2], log[offset + 3 : end], log[offset:end]
         kinds[kind] = kinds.get(kind, 0) + 1
-        name = content.partition(b":")[0] if kind == ord("F") else content[3:] if kind == ord("A") else b""
+        name = (
+            content.partition(b":")[0]
+            if kind == ord("F")
+            else content[3:]
+            if kind == ord("A")
+            else b""
+        )
         if kind == ord("D"):
             ids[content[:2]] = ids.get(content[:2], _MESSAGES) + 1
             is_kept = ids[content[:2]] <= _MESSAGES
@@ -149,7 +167,11 @@ def _trim(log: bytes) -> bytes:
             ids[content[1:3]] = 0 if name in _TOPICS else _MESSAGES
             is_kept = name in _TOPICS
         else:
-            is_kept = name in _TOPICS if kind == ord("F") else kinds[kind] <= _MESSAGES and len(content) < 500
+            is_kept = (
+                name in _TOPICS
+                if kind == ord("F")
+                else kinds[kind] <= _MESSAGES and len(content) < 500
+            )
         trimmed += whole if is_kept else b""
         offset = end
     return bytes(trimmed)
@@ -157,7 +179,9 @@ def _trim(log: bytes) -> bytes:
 
 def _streamed_log() -> bytes:
     """Return the log of the recorded stream, trimmed."""
-    messages = filter(None, (stream_message(frame) for _, is_sent, frame in datagrams(SHORT) if is_sent))
+    messages = filter(
+        None, (stream_message(frame) for _, is_sent, frame in datagrams(SHORT) if is_sent)
+    )
     unique = {each.sequence: each.data for each in messages}
     return _trim(b"".join(unique.values()))
 
@@ -194,7 +218,9 @@ def _log_of_each_record() -> bytes:
         (b"R", struct.pack("<H", 1)),
     ]
     head = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 500)
-    return head + b"".join(struct.pack("<H", len(content)) + kind + content for kind, content in records)
+    return head + b"".join(
+        struct.pack("<H", len(content)) + kind + content for kind, content in records
+    )
 
 
 def _key(text: str) -> bytes:
@@ -204,7 +230,12 @@ def _key(text: str) -> bytes:
 def _recording(compression: CompressionType, index: IndexType) -> bytes:
     file = BytesIO()
     writer = Writer(
-        file, chunk_size=600, compression=compression, index_types=index, enable_crcs=False, enable_data_crcs=False
+        file,
+        chunk_size=600,
+        compression=compression,
+        index_types=index,
+        enable_crcs=False,
+        enable_data_crcs=False,
     )
     writer.start(profile="ros2", library="fuzz")
     for number, (definition, fields) in enumerate(_golden()):
@@ -222,7 +253,9 @@ def _recording(compression: CompressionType, index: IndexType) -> bytes:
             }
             channel = writer.register_channel(f"/fmu/out/{number}", "cdr", schema, metadata)
             writer.add_message(channel, number, encode_with(definition, values, layout), number, 1)
-    schema = writer.register_schema("px4_msgs/msg/Other", "ros2msg", b"uint64 timestamp\nfloat32[2] a\nchar[4] text\n")
+    schema = writer.register_schema(
+        "px4_msgs/msg/Other", "ros2msg", b"uint64 timestamp\nfloat32[2] a\nchar[4] text\n"
+    )
     channel = writer.register_channel("/vehicle_7/fmu/out/other_v1", "cdr", schema)
     writer.add_message(channel, 9, b"\0\1\0\0" + struct.pack("<Qff4s", 9, 1.0, 2.0, b"abc"), 9)
     writer.finish()
@@ -246,4 +279,6 @@ def _as_stream(log: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _framed(messages: Iterable[tuple[int, bytes]]) -> bytes:
     """Return the input of `parsers.frames` for these messages, given by id and payload."""
-    return b"".join(bytes([MAVLINK_KINDS.index(number), len(data)]) + data for number, data in messages)
+    return b"".join(
+        bytes([MAVLINK_KINDS.index(number), len(data)]) + data for number, data in messages
+    )

@@ -24,9 +24,14 @@ from .sync_adapter import sync_adapter
 
 # 25 examples per property, or 100 with `--hypothesis-profile=all`; no time limits, which fail on a busy machine.
 hypothesis.settings.register_profile(
-    "nedbus", max_examples=25, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+    "nedbus",
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
-hypothesis.settings.register_profile("all", hypothesis.settings.get_profile("nedbus"), max_examples=75)
+hypothesis.settings.register_profile(
+    "all", hypothesis.settings.get_profile("nedbus"), max_examples=75
+)
 hypothesis.settings.load_profile("nedbus")
 
 
@@ -43,8 +48,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if fixture in getattr(item, "fixturenames", ()):
                 item.add_marker(mark)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
-            item.add_marker(pytest.mark.timeout(600))  # three times their duration on four busy cores, with coverage
-        if "open_router" in vars(getattr(item, "module", item)):  # most tests of a module that imports it call it
+            # three times their duration on four busy cores, with coverage
+            item.add_marker(pytest.mark.timeout(600))
+        # most tests of a module that imports it call it
+        if "open_router" in vars(getattr(item, "module", item)):
             item.add_marker("router")
 
 
@@ -52,9 +59,13 @@ _may_start = True
 
 
 def _watch_tests(event: str, arguments: tuple[object, ...]) -> None:
-    if event == "resource.setrlimit" and arguments[0] != resource.RLIMIT_NOFILE:  # a router raises that one
-        raise AssertionError("this would limit pytest, too, and truncate its bytecode: limit a child process instead")
-    if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:  # Matplotlib runs fc-list once
+    # a router raises that one
+    if event == "resource.setrlimit" and arguments[0] != resource.RLIMIT_NOFILE:
+        raise AssertionError(
+            "this would limit pytest, too, and truncate its bytecode: limit a child process instead"
+        )
+    # Matplotlib runs fc-list once
+    if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:
         raise AssertionError("this test starts a process: mark it with pytest.mark.process")
 
 
@@ -102,7 +113,10 @@ def client(request: pytest.FixtureRequest, endpoint: str) -> Iterator[nedbus.Bus
         with nedbus.connect(endpoint) as bus:
             yield bus
     else:
-        with asyncio.Runner() as runner, sync_adapter(runner, nedbus.connect_async(endpoint)) as bus:
+        with (
+            asyncio.Runner() as runner,
+            sync_adapter(runner, nedbus.connect_async(endpoint)) as bus,
+        ):
             yield bus
 
 
@@ -137,14 +151,20 @@ def start(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Start]:
     """
     processes: list[Process] = []
 
-    def start_process(*arguments: str, coverage: bool = True, fresh: bool = False, **environment: str) -> Process:
+    def start_process(
+        *arguments: str, coverage: bool = True, fresh: bool = False, **environment: str
+    ) -> Process:
         where = tmp_path / f"process-{len(processes)}"
         where.mkdir()
         inherited = dict(os.environ) if coverage else without_coverage()
-        inherited = {name: value for name, value in inherited.items() if not name.startswith("NEDBUS_")}
+        inherited = {
+            name: value for name, value in inherited.items() if not name.startswith("NEDBUS_")
+        }
         environment = inherited | {"PYTHONFAULTHANDLER": "1"} | environment
         command = [sys.executable, *arguments]
-        process = Process(command, where, environment, None if fresh else request.getfixturevalue("fork_server"))
+        process = Process(
+            command, where, environment, None if fresh else request.getfixturevalue("fork_server")
+        )
         processes.append(process)
         return process
 

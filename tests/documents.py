@@ -68,7 +68,9 @@ class Block:
     @property
     def is_plain(self) -> bool:
         """True if the block consists of nedbus commands that need no shell."""
-        return not any(_SHELL.search(re.sub(r"\"[^\"]*\"|'[^']*'", "", each)) for each in self.commands)
+        return not any(
+            _SHELL.search(re.sub(r"\"[^\"]*\"|'[^']*'", "", each)) for each in self.commands
+        )
 
 
 def blocks_of(page: Path) -> Iterator[Block]:
@@ -77,7 +79,9 @@ def blocks_of(page: Path) -> Iterator[Block]:
     defaults = {language: (marker, reason) for language, marker, reason in _ALL.findall(text)}
     for found in _BLOCK.finditer(text):
         line = text.count("\n", 0, found.start(5))
-        marker, reason = (found[1] or "", found[2] or "") if found[1] else defaults.get(found[4], ("", ""))
+        marker, reason = (
+            (found[1] or "", found[2] or "") if found[1] else defaults.get(found[4], ("", ""))
+        )
         yield Block(page, line, found[4], textwrap.dedent(found[5]), marker, reason)
 
 
@@ -103,7 +107,9 @@ def parse_command(command: str) -> None:
     arguments = [each for each in shlex.split(command)[1:] if each != "..."]
     context = group.make_context("nedbus", arguments, resilient_parsing=False)
     while hasattr(group, "commands"):
-        name, group, arguments = group.resolve_command(context, [*context._protected_args, *context.args])
+        name, group, arguments = group.resolve_command(
+            context, [*context._protected_args, *context.args]
+        )
         if "--help" in arguments:
             return
         context = group.make_context(name, arguments, parent=context)
@@ -111,7 +117,9 @@ def parse_command(command: str) -> None:
 
 def nedbus_commands(block: Block) -> list[str]:
     """Return the nedbus command lines in a block, without shell pipes and redirections."""
-    found = [re.search(r"(?:^|[|&] ?)(nedbus (?:\"[^\"]*\"|[^|&>])*)", each) for each in block.commands]
+    found = [
+        re.search(r"(?:^|[|&] ?)(nedbus (?:\"[^\"]*\"|[^|&>])*)", each) for each in block.commands
+    ]
     return [match[1].strip() for match in found if match]
 
 
@@ -124,7 +132,15 @@ def shape_of(line: str) -> re.Pattern[str]:
     ))  # fmt: skip
 
 
-_CORE: Final = {"nedbus", "nedbus_msgs", "numpy", "pydantic", "msgpack", "zenoh", *sys.stdlib_module_names}
+_CORE: Final = {
+    "nedbus",
+    "nedbus_msgs",
+    "numpy",
+    "pydantic",
+    "msgpack",
+    "zenoh",
+    *sys.stdlib_module_names,
+}
 _COMMAND_EXTRAS: Final = {
     "web": "web", "foxglove": "foxglove", "plot": "plot", "record": "mcap", "convert": "mcap", "pki": "pki",
     "export": "metrics",

@@ -80,14 +80,27 @@ class Result:
 
 def main() -> int:
     """Run all or the selected mutants, and print a table of the tests that detected them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkout", type=Path, default=ROOT, help="checkout to test, with its tests")
-    parser.add_argument("--only", default="", metavar="REGEX", help="select mutants by path, kind or description")
-    parser.add_argument("--limit", type=float, default=900.0, help="timeout of the tests of a mutant [s]")
-    parser.add_argument("--out", type=Path, help="append results to this file; skip mutants already in it")
-    parser.add_argument("--no-baseline", action="store_true", help="skip the run without a mutation")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--checkout", type=Path, default=ROOT, help="checkout to test, with its tests"
+    )
+    parser.add_argument(
+        "--only", default="", metavar="REGEX", help="select mutants by path, kind or description"
+    )
+    parser.add_argument(
+        "--limit", type=float, default=900.0, help="timeout of the tests of a mutant [s]"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="append results to this file; skip mutants already in it"
+    )
+    parser.add_argument(
+        "--no-baseline", action="store_true", help="skip the run without a mutation"
+    )
     arguments = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # run the finally blocks
+    # run the finally blocks
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     checkout = arguments.checkout.resolve()
     faults = [fault for fault in read_table() if re.search(arguments.only, fault.name)]
     problems = [problem for fault in faults for problem in fault.problems(checkout)]
@@ -100,7 +113,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="nedbus-mutants-") as folder:
         tree = copy_tree(checkout, Path(folder))
         if not arguments.no_baseline:
-            files = sorted({name for fault in faults for name in fault.arguments(tree) if name.endswith(".py")})
+            files = sorted(
+                {name for fault in faults for name in fault.arguments(tree) if name.endswith(".py")}
+            )
             if found := find_failure(tree, files, "not compose", _BASELINE):
                 raise SystemExit(f"this test fails without a mutation: {found}")
         for number, fault in enumerate(faults, 1):
@@ -109,7 +124,9 @@ def main() -> int:
                 if arguments.out is not None:
                     with arguments.out.open("a") as out:
                         out.write(json.dumps(asdict(result)) + "\n")
-            _print(f"{number}/{len(faults)} {fault.name}: {results[fault.name].found_by or 'SURVIVES'}")
+            _print(
+                f"{number}/{len(faults)} {fault.name}: {results[fault.name].found_by or 'SURVIVES'}"
+            )
     return _report([results[fault.name] for fault in faults])
 
 
@@ -121,9 +138,20 @@ def read_table() -> list[Fault]:
 
 def copy_tree(checkout: Path, folder: Path) -> Path:
     """Copy the tracked and new files of a checkout, and link its shared data."""
-    listed = ["git", "-C", str(checkout), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = [
+        "git",
+        "-C",
+        str(checkout),
+        "ls-files",
+        "-z",
+        "--cached",
+        "--others",
+        "--exclude-standard",
+    ]
     tree = folder / "tree"
-    for name in subprocess.run(listed, check=True, capture_output=True, text=True).stdout.split("\0"):
+    for name in subprocess.run(listed, check=True, capture_output=True, text=True).stdout.split(
+        "\0"
+    ):
         if (checkout / name).is_file():
             (tree / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(checkout / name, tree / name)
@@ -142,7 +170,10 @@ def try_fault(tree: Path, fault: Fault, limit: float, *, stamp: int) -> Result:
     try:
         file.write_text(text.replace(fault.old, fault.new))
         os.utime(file, (stamp, stamp))  # a new time invalidates the compiled file
-        tried = ((find_failure(tree, fault.arguments(tree), marked, limit), tier) for tier, marked in TIERS.items())
+        tried = (
+            (find_failure(tree, fault.arguments(tree), marked, limit), tier)
+            for tier, marked in TIERS.items()
+        )
         found, tier = next((each for each in tried if each[0]), ("", ""))
     finally:
         file.write_text(text)
@@ -161,11 +192,27 @@ def find_failure(tree: Path, arguments: list[str], marked: str, limit: float) ->
 
 def run_tests(tree: Path, arguments: list[str], marked: str, limit: float) -> str:
     """Return the first test that fails, "time" after `limit` seconds, or "" if all pass."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", marked, *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        marked,
+        *arguments,
+    ]
     environment = os.environ | {"PYTHONPATH": f"{tree / 'service'}:{tree / 'schemas'}"}
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
-            command, cwd=tree, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            command,
+            cwd=tree,
+            env=environment,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
         )
         try:
             code = process.wait(limit)
@@ -187,7 +234,9 @@ def _report(results: Collection[Result]) -> int:
     """Print the table, and return the exit code."""
     _print("| fault | found by | tier |\n|---|---|---|")
     for result in results:
-        _print(f"| {result.fault} | {f'`{result.found_by}`' if result.found_by else 'survives'} | {result.tier} |")
+        _print(
+            f"| {result.fault} | {f'`{result.found_by}`' if result.found_by else 'survives'} | {result.tier} |"
+        )
     killed = sum(bool(result.found_by) for result in results)
     _print(f"killed {killed} of {len(results)}")
     return int(killed < len(results))

@@ -36,9 +36,13 @@ VEHICLES: Final = 8
 
 def main() -> None:
     """Run for `--seconds`, print the counts, and exit with 1 after a stall."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--restart", type=float, default=20.0, help="interval between kills of the router [s]")
+    parser.add_argument(
+        "--restart", type=float, default=20.0, help="interval between kills of the router [s]"
+    )
     parser.add_argument("--busy", type=int, default=2, help="number of busy processes")
     parser.add_argument("--limit", type=float, default=1.0, help="maximum delay of a tick [s]")
     parser.add_argument("--port", type=int, default=17_447)
@@ -63,7 +67,10 @@ def measure(seconds: float, restart: float, busy_count: int, port: int) -> dict[
 
     If the process does not end, its thread stacks are printed, and only the result of the control is returned.
     """
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"], text=True) for _ in range(busy_count)]
+    busy = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"], text=True)
+        for _ in range(busy_count)
+    ]
     router = _start("router", port)
     control = _start("control", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
     stress = _start("stress", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
@@ -85,7 +92,10 @@ def measure(seconds: float, restart: float, busy_count: int, port: int) -> dict[
         late = control.communicate(timeout=GRACE)[0]
     finally:
         _kill(stress, control, router, *busy)
-    return {**json.loads(counts or "{}"), "maximum tick delay of control": round(json.loads(late), 3)}
+    return {
+        **json.loads(counts or "{}"),
+        "maximum tick delay of control": round(json.loads(late), 3),
+    }
 
 
 def _listens(port: int) -> bool:
@@ -95,8 +105,20 @@ def _listens(port: int) -> bool:
     return False
 
 
-def _start(part: str, port: int, *arguments: str, stdout: int | None = None) -> subprocess.Popen[str]:
-    command = [sys.executable, "-X", "faulthandler", "-m", "tests.stress", "--part", part, "--port", str(port)]
+def _start(
+    part: str, port: int, *arguments: str, stdout: int | None = None
+) -> subprocess.Popen[str]:
+    command = [
+        sys.executable,
+        "-X",
+        "faulthandler",
+        "-m",
+        "tests.stress",
+        "--part",
+        part,
+        "--port",
+        str(port),
+    ]
     return subprocess.Popen([*command, *arguments], stdout=stdout, text=True)
 
 
@@ -117,7 +139,10 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
                     action()
                     counts[what] += 1
 
-        publishers = [bus.publisher("vehicle_local_position", vehicle=f"p{number}") for number in range(VEHICLES)]
+        publishers = [
+            bus.publisher("vehicle_local_position", vehicle=f"p{number}")
+            for number in range(VEHICLES)
+        ]
         message = nedbus.VehicleLocalPosition(timestamp=1)
 
         def put() -> None:
@@ -126,7 +151,9 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             stop.wait(0.01)
 
         def open_and_close() -> None:
-            with bus.publisher("vehicle_local_position", vehicle=f"c{counts['closed'] % VEHICLES}") as publisher:
+            with bus.publisher(
+                "vehicle_local_position", vehicle=f"c{counts['closed'] % VEHICLES}"
+            ) as publisher:
                 publisher.publish(message)
 
         def receive_some(mode: nedbus.Mode = "latest", max_rate: float | None = None) -> None:
@@ -146,7 +173,10 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             "every": lambda: receive_some("every"),
             "downsampled": lambda: receive_some(max_rate=5.0),
         }
-        threads = [threading.Thread(target=repeat, args=each, name=each[0], daemon=True) for each in actions.items()]
+        threads = [
+            threading.Thread(target=repeat, args=each, name=each[0], daemon=True)
+            for each in actions.items()
+        ]
         for thread in threads:
             thread.start()
         max_delay = _tick(seconds, dump_stacks=True)

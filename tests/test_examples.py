@@ -57,7 +57,8 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
     """Each example prints its result, and Ctrl-C ends it without an error message."""
     process = run_example(start, name, simulation, tmp_path)
     wait_for(
-        lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}"
+        lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0},
+        what=f"{name}: {process.err}",
     )
     assert PRINTS[name] in process.out, process.err
     if name != "fleet.py":  # it ends on its own
@@ -68,14 +69,19 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
 
 @pytest.mark.process
 @pytest.mark.parametrize("name", sorted(PRINTS.keys() - RARE))
-def test_example_ends_quietly_when_its_pipe_is_closed(simulation: str, tmp_path: Path, name: str) -> None:
+def test_example_ends_quietly_when_its_pipe_is_closed(
+    simulation: str, tmp_path: Path, name: str
+) -> None:
     """An example whose reader leaves, as in `| head -1`, prints no traceback.
 
     The default action of SIGPIPE is not used: it would also end a script whose connection to the router breaks.
     """
     script = tmp_path / name
     script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", simulation))
-    command, environment = [sys.executable, "-u", str(script)], os.environ | {"NEDBUS_CONNECT": simulation}
+    command, environment = (
+        [sys.executable, "-u", str(script)],
+        os.environ | {"NEDBUS_CONNECT": simulation},
+    )
     with subprocess.Popen(command, env=environment, stdout=PIPE, stderr=PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -107,7 +113,9 @@ def test_fastest_example_reads_files(start: Start, tmp_path: Path) -> None:
     assert process.out.splitlines()[-1].startswith("1: ")
 
 
-def test_publish_example_moves_its_vehicle(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+def test_publish_example_moves_its_vehicle(
+    start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
+) -> None:
     """examples/publish.py publishes changing positions with increasing timestamps."""
     process = run_example(start, "publish.py", endpoint, tmp_path)
     position, topic = nedbus.VehicleLocalPosition, "external_ins_local_position"
@@ -130,7 +138,10 @@ def test_alarm_example_survives_a_restart(run_nedbus: Start, start: Start, tmp_p
         return service
 
     alarm = run_example(start, "alarm.py", endpoint, tmp_path)
-    wait_for(lambda: f"vehicle 1: ALARM: nothing answers at {endpoint}" in alarm.out, what="the alarm of no router")
+    wait_for(
+        lambda: f"vehicle 1: ALARM: nothing answers at {endpoint}" in alarm.out,
+        what="the alarm of no router",
+    )
     service = serve()
     wait_for(lambda: alarm.out.splitlines()[-1:] == states[:1], what="the first message")
     service.kill()
@@ -141,7 +152,9 @@ def test_alarm_example_survives_a_restart(run_nedbus: Start, start: Start, tmp_p
     assert alarm.wait() == 0
 
 
-def test_alarm_example_names_the_flags(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+def test_alarm_example_names_the_flags(
+    start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
+) -> None:
     """examples/alarm.py reports each flag that makes a position doubtful, once."""
     alarm = run_example(start, "alarm.py", endpoint, tmp_path)
     publisher = bus.publisher(VLP, vehicle="1")
@@ -154,8 +167,14 @@ def test_alarm_example_names_the_flags(start: Start, endpoint: str, bus: nedbus.
         ("good", {}),
         ("ALARM: xy_valid is false", {"xy_valid": False}),
         ("good", {}),
-        ("ALARM: z_valid is false, dead_reckoning is true", {"z_valid": False, "dead_reckoning": True}),
-        ("ALARM: v_xy_valid is false, v_z_valid is false", {"v_xy_valid": False, "v_z_valid": False}),
+        (
+            "ALARM: z_valid is false, dead_reckoning is true",
+            {"z_valid": False, "dead_reckoning": True},
+        ),
+        (
+            "ALARM: v_xy_valid is false, v_z_valid is false",
+            {"v_xy_valid": False, "v_z_valid": False},
+        ),
     ):
         wait_for(lambda text=text, flags=flags: is_printed(text, flags), what=text)  # type: ignore[misc]
     assert alarm.out.count("xy_valid is false") == 2
@@ -175,7 +194,9 @@ def test_resets_example_plots_both_tracks(start: Start, tmp_path: Path) -> None:
     def drawn(color: tuple[float, float, float]) -> tuple[np.ndarray, ...]:
         return np.nonzero(np.abs(pixels - color).max(axis=2) < 0.1)
 
-    dotted, solid, cross = (drawn(color) for color in ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (1.0, 0.0, 0.0)))
+    dotted, solid, cross = (
+        drawn(color) for color in ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (1.0, 0.0, 0.0))
+    )
     # The figure of eight fills the plot; the dotted track differs from it only after the reset, marked by the cross.
     assert len(solid[0]) > 2000
     assert np.ptp(solid[0]) > 300

@@ -30,7 +30,10 @@ def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEA
 def wait_for_matching(zenoh_session: Session, key: str) -> None:
     """Wait until the session has a matching subscriber of this key; Zenoh drops earlier puts."""
     probe = zenoh_session.declare_publisher(key)
-    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
+    wait_for(
+        lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching,
+        what=f"a subscriber of {key}",
+    )
     probe.undeclare()
 
 

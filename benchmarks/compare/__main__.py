@@ -56,16 +56,30 @@ class Part:
 
 def main() -> None:
     """Measure and print; write the results of a complete run."""
-    complete = Part(find_forms(), list(LOADS), [DEFAULT_FLIGHT, *(each for each in FLIGHTS if each != DEFAULT_FLIGHT)])
+    complete = Part(
+        find_forms(),
+        list(LOADS),
+        [DEFAULT_FLIGHT, *(each for each in FLIGHTS if each != DEFAULT_FLIGHT)],
+    )
     parser = argparse.ArgumentParser(description="Compare nedbus with its peers.")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
-    parser.add_argument("--vs", type=Path, metavar="CHECKOUT", help="another checkout of nedbus to compare with")
-    for name, known in (("forms", complete.forms), ("loads", complete.loads), ("flights", complete.flights)):
+    parser.add_argument(
+        "--vs", type=Path, metavar="CHECKOUT", help="another checkout of nedbus to compare with"
+    )
+    for name, known in (
+        ("forms", complete.forms),
+        ("loads", complete.loads),
+        ("flights", complete.flights),
+    ):
         parser.add_argument(f"--{name}", nargs="+", choices=known, default=known)
     arguments = parser.parse_args()
     part = Part(arguments.forms, arguments.loads, arguments.flights)
     if arguments.vs:
-        part.forms = [name for form in part.forms for name in (form, *([form + BEFORE] if form in NEDBUS else []))]
+        part.forms = [
+            name
+            for form in part.forms
+            for name in (form, *([form + BEFORE] if form in NEDBUS else []))
+        ]
     results = measure(part, arguments.rounds, before=arguments.vs)
     if part == complete:
         write(results, arguments.rounds)
@@ -106,7 +120,10 @@ def measure(part: Part, rounds: int, *, before: Path | None = None) -> Results:
                         results.drop(name, f"fails: {exc}")
                         continue
                     results.add(flight, load, name, measured)
-                    print(f"round {number + 1}: {flight}, {load.name}: {name}: {describe(load, measured)}", flush=True)
+                    print(
+                        f"round {number + 1}: {flight}, {load.name}: {name}: {describe(load, measured)}",
+                        flush=True,
+                    )
     return results
 
 
@@ -135,9 +152,14 @@ def print_medians(results: Results) -> None:
     print()
     for flight, name, form in results.runs:
         load = LOADS[name]
-        keys = ("publish_cpu", "receive_cpu", "p50") if load.rate else ("rate", "publish_cpu", "receive_cpu")
+        keys = (
+            ("publish_cpu", "receive_cpu", "p50")
+            if load.rate
+            else ("rate", "publish_cpu", "receive_cpu")
+        )
         ratios = [
-            f"of {other} " + " / ".join(f"{results.ratio(flight, load, form, other, key):.2f}" for key in keys)
+            f"of {other} "
+            + " / ".join(f"{results.ratio(flight, load, form, other, key):.2f}" for key in keys)
             for other in ("raw", "straightforward")
             if results.has(flight, load, other) and form != other
         ]

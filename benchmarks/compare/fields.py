@@ -13,7 +13,9 @@ from typing import Any, Final
 
 VARIABLE: Final = "BENCH_FLIGHT"
 DEFAULT_FLIGHT: Final = "no origin"  # no terrain estimate either: dist_bottom_valid is false
-FLIGHTS: Final[dict[str, Any]] = json.loads((Path(__file__).parents[2] / "tests/data/flights.json").read_text())
+FLIGHTS: Final[dict[str, Any]] = json.loads(
+    (Path(__file__).parents[2] / "tests/data/flights.json").read_text()
+)
 FLIGHT: Final = os.environ.get(VARIABLE, DEFAULT_FLIGHT)
 
 _ABSENT: Final = {bool: False, int: 0, float: math.nan, tuple: (math.nan, math.nan)}
@@ -33,10 +35,15 @@ def _value(value: Any) -> Any:
 
 def _complete(provided: Mapping[str, Any]) -> dict[str, Any]:
     """Return all fields in PX4's order, with NaN, False or 0 for fields that the source does not provide."""
-    return {name: provided.get(name, _ABSENT[type(value)]) for name, value in _read("everything set").items()}
+    return {
+        name: provided.get(name, _ABSENT[type(value)])
+        for name, value in _read("everything set").items()
+    }
 
 
-COMPLETE: Final = [flight for flight in FLIGHTS if len(_read(flight)) == len(_read("everything set"))]
+COMPLETE: Final = [
+    flight for flight in FLIGHTS if len(_read(flight)) == len(_read("everything set"))
+]
 """Flights whose source provides all fields."""
 
 PROVIDED: Final = _read(FLIGHT)

@@ -64,7 +64,10 @@ def _run(subject: Subject, load: Load, *, flight: str, quiet: bool) -> Measured:
         resume(publisher)
     finally:
         end(*ends, timeout=2.0)
-    publish_cpu, receive_cpu = sent["cpu"] / load.messages * 1e6, got["cpu"] / max(1, got["received"]) * 1e6
+    publish_cpu, receive_cpu = (
+        sent["cpu"] / load.messages * 1e6,
+        got["cpu"] / max(1, got["received"]) * 1e6,
+    )
     return {
         "rate": got["received"] / got["seconds"],
         "kept": got["received"] / load.messages,

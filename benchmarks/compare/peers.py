@@ -39,7 +39,9 @@ def prepare(name: str) -> str:
     if not python.exists():
         print(f"installing {' '.join(packages)}", flush=True)
         venv.create(folder, with_pip=True)
-    subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True, capture_output=True)
+    subprocess.run(
+        [python, "-m", "pip", "install", "-q", *packages], check=True, capture_output=True
+    )
     return str(python)
 
 

@@ -25,7 +25,8 @@ HEAD: Final = (
     " | one-way p50 / p99 at 1 kHz, µs | at 100 Hz, µs | CPU µs/message at 1 kHz |"
 )
 
-BYTES: Final = {  # payload size with the default flight and a timestamp in ns, without transport overhead
+# payload size with the default flight and a timestamp in ns, without transport overhead
+BYTES: Final = {
     "raw": 244, "batches": 244, "rows": 244, "models": 244, "fields_in": 244, "straightforward": 916,
     "msgspec_array": 356, "pyzmq": 916, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
     "mavsdk_telemetry": 40, "rclpy_odometry": 708,
@@ -68,7 +69,10 @@ def flight_table(results: Results) -> str:
             f" · {results.ratio(flight, KHZ, form, 'raw', 'receive_cpu'):.2f}"
             for flight in flights
         ]
-        ten = [results.ratio(DEFAULT_FLIGHT, TEN, form, "raw", key) for key in ("publish_cpu", "receive_cpu", "p50")]
+        ten = [
+            results.ratio(DEFAULT_FLIGHT, TEN, form, "raw", key)
+            for key in ("publish_cpu", "receive_cpu", "p50")
+        ]
         lines.append(
             f"| {form.replace('_', ' ')} | {' | '.join(cells)} | {' / '.join(f'{each:.2f}' for each in ten)} |"
         )
@@ -91,7 +95,9 @@ def as_json(results: Results, rounds: int) -> dict[str, object]:
         "rounds": rounds,
         "flight": DEFAULT_FLIGHT,
         "flights": {flight: content["from"] for flight, content in FLIGHTS.items()},
-        "loads": {load.name: {"rate": load.rate, "vehicles": load.vehicles} for load in LOADS.values()},
+        "loads": {
+            load.name: {"rate": load.rate, "vehicles": load.vehicles} for load in LOADS.values()
+        },
         "bytes": BYTES,
         "results": measured,
         "bars": list(evaluate(results)),
@@ -155,4 +161,6 @@ def write(results: Results, rounds: int) -> None:
 
 def _replace(path: Path, name: str, text: str) -> None:
     marks = rf"(<!-- {name} -->\n).*?(\n<!-- /{name} -->)"
-    path.write_text(re.sub(marks, lambda found: found[1] + text + found[2], path.read_text(), flags=re.DOTALL))
+    path.write_text(
+        re.sub(marks, lambda found: found[1] + text + found[2], path.read_text(), flags=re.DOTALL)
+    )

@@ -71,7 +71,9 @@ class Results:
 
     def round_ratios(self, flight: str, load: Load, form: str, other: str, key: str) -> list[float]:
         """Return the ratio of two forms in each round."""
-        pairs = zip(self.runs[flight, load.name, form], self.runs[flight, load.name, other], strict=True)
+        pairs = zip(
+            self.runs[flight, load.name, form], self.runs[flight, load.name, other], strict=True
+        )
         return [one[key] / two[key] for one, two in pairs]
 
     def ratios(self, flight: str, load: Load, form: str, other: str) -> Iterator[tuple[str, float]]:

@@ -29,7 +29,9 @@ class Form(Protocol):
     """A module of benchmarks.compare.forms."""
 
     def publish(self, case: Case) -> AbstractContextManager[list[Send]]: ...
-    def receive(self, case: Case, ready: Callable[[], None], seen: Callable[[Any], bool]) -> None: ...
+    def receive(
+        self, case: Case, ready: Callable[[], None], seen: Callable[[Any], bool]
+    ) -> None: ...
 
 
 def main() -> None:
@@ -107,7 +109,11 @@ def receive(form: Form, case: Case, count: int, rate: float) -> None:
 
     def finish(end: tuple[float, float]) -> None:
         delays.sort()
-        found = {f"p{part}": delays[len(delays) * part // 100] / 1e3 for part in (50, 99)} if delays else {}
+        found = (
+            {f"p{part}": delays[len(delays) * part // 100] / 1e3 for part in (50, 99)}
+            if delays
+            else {}
+        )
         report(start, end, received=received, **found)
         os._exit(0)  # the form may wait forever for missing messages
 

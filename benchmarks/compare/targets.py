@@ -69,7 +69,8 @@ def evaluate(results: Results) -> Iterator[dict[str, object]]:
         measured = {
             flight: target.figure(results, flight)
             for flight in results.flights(target.load)
-            if results.has(flight, target.load, target.form, target.other) and target.applies_to(flight)
+            if results.has(flight, target.load, target.form, target.other)
+            and target.applies_to(flight)
         }
         if measured:
             worst = min(measured.values()) if target.at_least else max(measured.values())
@@ -83,7 +84,11 @@ def evaluate(results: Results) -> Iterator[dict[str, object]]:
     }
     if kept:
         missing = {name: share for name, share in kept.items() if share < 1.0}
-        yield {"bar": "nothing lost by any form of nedbus", "measured": missing or {"all": 1.0}, "holds": not missing}
+        yield {
+            "bar": "nothing lost by any form of nedbus",
+            "measured": missing or {"all": 1.0},
+            "holds": not missing,
+        }
 
 
 def print_targets(results: Results) -> None:

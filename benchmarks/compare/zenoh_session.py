@@ -37,11 +37,17 @@ def key(vehicle: str) -> str:
 def declare_publishers(session: zenoh.Session, case: Case) -> list[zenoh.Publisher]:
     """Declare a publisher for each vehicle."""
     control = zenoh.CongestionControl.BLOCK if case.lossless else zenoh.CongestionControl.DROP
-    return [session.declare_publisher(key(vehicle), congestion_control=control) for vehicle in case.vehicles]
+    return [
+        session.declare_publisher(key(vehicle), congestion_control=control)
+        for vehicle in case.vehicles
+    ]
 
 
 def receive_each(
-    case: Case, ready: Callable[[], None], seen: Callable[[int], bool], stamp: Callable[[bytes], int]
+    case: Case,
+    ready: Callable[[], None],
+    seen: Callable[[int], bool],
+    stamp: Callable[[bytes], int],
 ) -> None:
     """Receive payloads until `seen` returns False; `stamp` decodes a payload and returns its timestamp."""
     with open_session(case.endpoint) as session:

@@ -56,13 +56,19 @@ class Ages:
         ages = sorted(self.ages) or [0]
         found = {f"p{part}": ages[len(ages) * part // 100] / 1e6 for part in (50, 99)}
         steps = self.steps / seconds
-        print(json.dumps({"received": len(self.ages), "max": ages[-1] / 1e6, "steps": steps} | found | counts))
+        print(
+            json.dumps(
+                {"received": len(self.ages), "max": ages[-1] / 1e6, "steps": steps} | found | counts
+            )
+        )
 
 
 def main() -> None:
     """Read according to the arguments."""
     form, script, endpoint = sys.argv[1:4]
-    stamps, counts = open_nedbus(form, endpoint) if form in ("every", "latest") else open_raw(form, endpoint)
+    stamps, counts = (
+        open_nedbus(form, endpoint) if form in ("every", "latest") else open_raw(form, endpoint)
+    )
     ages = Ages()
     print("ready", flush=True)
     threading.Thread(target=watch, args=(ages, counts), daemon=True).start()
@@ -105,7 +111,9 @@ def open_raw(form: str, endpoint: str) -> tuple[Iterator[int], Counts]:
     """Subscribe with plain Zenoh, which counts nothing."""
     session = open_session(endpoint)
     channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
-    channel = zenoh.handlers.FifoChannel(1024) if form == "raw fifo" else zenoh.handlers.RingChannel(1)
+    channel = (
+        zenoh.handlers.FifoChannel(1024) if form == "raw fifo" else zenoh.handlers.RingChannel(1)
+    )
     subscriber = session.declare_subscriber(KEY, channel)
 
     def stamps() -> Iterator[int]:

@@ -27,13 +27,19 @@ AFTER: Final = 10  # s of vehicle 1 after the stuck reader continues
 TIMEOUT: Final = 120.0  # s for the rest of the replay
 MAX_GAP: Final = 0.2  # s
 LIVE, REPLAYED = "1", "2"
-CASES: Final = {"live": (LIVE, [LIVE]), "both": (LIVE, [LIVE, REPLAYED]), "replay": (REPLAYED, [LIVE, REPLAYED])}
+CASES: Final = {
+    "live": (LIVE, [LIVE]),
+    "both": (LIVE, [LIVE, REPLAYED]),
+    "replay": (REPLAYED, [LIVE, REPLAYED]),
+}
 HABITS: Final = ("never", "slowly", "stopped")
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--rate", type=int, default=1000)
     parser.add_argument("--messages", type=int, default=200_000)
@@ -43,7 +49,9 @@ def main() -> None:
     for case in arguments.case or CASES:
         for habit in arguments.habit or HABITS:
             try:
-                text = measure(case, habit, arguments.seconds, rate=arguments.rate, messages=arguments.messages)
+                text = measure(
+                    case, habit, arguments.seconds, rate=arguments.rate, messages=arguments.messages
+                )
                 print(text, flush=True)
             except (RuntimeError, TimeoutError) as exc:
                 print(f"{case}, {habit}: MISSED: {exc}", flush=True)
@@ -74,7 +82,11 @@ def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) ->
             resume(stuck)
             resume(healthy)
             expect(live, seconds + TIMEOUT)
-            took = f", sent in {json.loads(expect(replay))['seconds']:.1f} s" if replay is not None else ""
+            took = (
+                f", sent in {json.loads(expect(replay))['seconds']:.1f} s"
+                if replay is not None
+                else ""
+            )
             for reader in (stuck, healthy):
                 resume(reader)
             found = json.loads(expect(stuck)), json.loads(expect(healthy))
@@ -82,14 +94,20 @@ def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) ->
             for process in processes[2:]:
                 resume(process)
             end(*processes, timeout=5.0)
-    return f"{case}, {habit} for {seconds} s{took}\n" + "\n".join(_describe(*found, sent, stuck_reads))
+    return f"{case}, {habit} for {seconds} s{took}\n" + "\n".join(
+        _describe(*found, sent, stuck_reads)
+    )
 
 
 def _publisher(endpoint: str, count: int, rate: int, vehicle: str) -> Process:
-    return start("-m", "benchmarks.compare.role", "rows", "publish", endpoint, str(count), str(rate), vehicle)
+    return start(
+        "-m", "benchmarks.compare.role", "rows", "publish", endpoint, str(count), str(rate), vehicle
+    )
 
 
-def _describe(stuck: dict[str, Any], healthy: dict[str, Any], sent: dict[str, int], stuck_reads: str) -> list[str]:
+def _describe(
+    stuck: dict[str, Any], healthy: dict[str, Any], sent: dict[str, int], stuck_reads: str
+) -> list[str]:
     lines = []
     for vehicle, got in healthy.items():
         waits = vehicle == REPLAYED and stuck_reads == REPLAYED
@@ -103,7 +121,9 @@ def _describe(stuck: dict[str, Any], healthy: dict[str, Any], sent: dict[str, in
     for vehicle, got in stuck.items():
         kind = "live" if vehicle == LIVE else "replayed"
         counted = got["received"] + got["lost"] + got["dropped"]
-        is_exact = (counted if vehicle == LIVE else got["received"]) == sent[vehicle] and got["in order"]
+        is_exact = (counted if vehicle == LIVE else got["received"]) == sent[vehicle] and got[
+            "in order"
+        ]
         lines.append(
             f"  stuck,   {kind:8}: received {got['received']}, lost {got['lost']}, dropped {got['dropped']},"
             f" together {counted} of {sent[vehicle]}, {'in order' if got['in order'] else 'NOT IN ORDER'}"

@@ -50,15 +50,21 @@ def main() -> None:
     if habit == "reads":
         reads_on.set()
     with nedbus.connect(endpoint) as bus:
-        subscriptions = {vehicle: bus.subscribe(TOPIC, vehicle=vehicle, mode="every") for vehicle in vehicles}
+        subscriptions = {
+            vehicle: bus.subscribe(TOPIC, vehicle=vehicle, mode="every") for vehicle in vehicles
+        }
         got = {vehicle: Received() for vehicle in vehicles}
         for vehicle, subscription in subscriptions.items():
-            threading.Thread(target=read, args=(subscription, got[vehicle], habit, reads_on), daemon=True).start()
+            threading.Thread(
+                target=read, args=(subscription, got[vehicle], habit, reads_on), daemon=True
+            ).start()
         print("ready", flush=True)
         sys.stdin.readline()
         reads_on.set()
         sys.stdin.readline()
-        wait_for_quiet(lambda: max(each.last for each in got.values()), quiet=QUIET, timeout=TIMEOUT)
+        wait_for_quiet(
+            lambda: max(each.last for each in got.values()), quiet=QUIET, timeout=TIMEOUT
+        )
         report = {
             vehicle: {
                 "received": got[vehicle].received,
@@ -73,7 +79,9 @@ def main() -> None:
         os._exit(0)
 
 
-def read(subscription: nedbus.Subscription, got: Received, habit: str, reads_on: threading.Event) -> None:
+def read(
+    subscription: nedbus.Subscription, got: Received, habit: str, reads_on: threading.Event
+) -> None:
     """Read one subscription."""
     if habit == "never":
         reads_on.wait()

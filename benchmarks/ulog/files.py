@@ -42,7 +42,9 @@ print(first, count, time.perf_counter() - start, peak)
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("logs", nargs="*", type=Path, help="default: the logs of the tests")
     parser.add_argument("--megabytes", type=int, default=200)
     parser.add_argument("--repeat", type=int, default=5)
@@ -52,18 +54,25 @@ def main() -> None:
     for path in logs:
         ours, theirs = [], []
         for _ in range(options.repeat):
-            ours.append(seconds(partial(open_arrays, [path], ReadOptions(topics=None), lambda _: True)))
+            ours.append(
+                seconds(partial(open_arrays, [path], ReadOptions(topics=None), lambda _: True))
+            )
             theirs.append(seconds(partial(ULog, str(path))))
         medians = [statistics.median(ours), statistics.median(theirs)]
         total = [so_far + median for so_far, median in zip(total, medians, strict=True)]
         first = measure_replay(path)[0]
         ratio = medians[0] / medians[1]
-        print(f"{path.name}: {ratio:.2f} of pyulog's time, first message after {first:.3f} s (target: 0.3 s)")
+        print(
+            f"{path.name}: {ratio:.2f} of pyulog's time, first message after {first:.3f} s (target: 0.3 s)"
+        )
     print(f"all logs: {total[0] / total[1]:.2f} of pyulog's time (target: 1)")
     with tempfile.TemporaryDirectory() as folder:
         big = repeat_log(logs[-1], Path(folder) / "big.ulg", options.megabytes * 1_000_000)
         first, count, duration, peak = measure_replay(big)
-        print(f"{big.stat().st_size / 1e6:.0f} MB: first message after {first:.3f} s, {count:.0f} messages", end="")
+        print(
+            f"{big.stat().st_size / 1e6:.0f} MB: first message after {first:.3f} s, {count:.0f} messages",
+            end="",
+        )
         print(f" in {duration:.0f} s, {peak:.0f} MB of resident memory (target: below 100 MB)")
 
 
@@ -77,7 +86,12 @@ def seconds(call: Callable[[], object]) -> float:
 def measure_replay(path: Path) -> list[float]:
     """Replay a log in a subprocess; return time to the first message [s], count, total time [s], peak memory [MB]."""
     command = [sys.executable, "-c", REPLAY, os.fspath(path)]
-    return [float(word) for word in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
+    return [
+        float(word)
+        for word in subprocess.run(
+            command, check=True, capture_output=True, text=True
+        ).stdout.split()
+    ]
 
 
 def repeat_log(path: Path, target: Path, size: int) -> Path:
@@ -95,7 +109,9 @@ def repeat_log(path: Path, target: Path, size: int) -> Path:
             for record in records:
                 time = timestamp_of(record)
                 shifted = struct.pack("<Q", time + repetition * span)
-                file.write(record[:_TIMESTAMP] + shifted + record[_TIMESTAMP + 8 :] if time else record)
+                file.write(
+                    record[:_TIMESTAMP] + shifted + record[_TIMESTAMP + 8 :] if time else record
+                )
             if file.tell() >= size:
                 return target
     raise AssertionError
@@ -103,7 +119,9 @@ def repeat_log(path: Path, target: Path, size: int) -> Path:
 
 def records_of(data: bytes, at: int) -> Iterator[bytes]:
     """Yield the complete records of a log from a position on."""
-    while at + 3 <= len(data) and (stop := at + 3 + int.from_bytes(data[at : at + 2], "little")) <= len(data):
+    while at + 3 <= len(data) and (
+        stop := at + 3 + int.from_bytes(data[at : at + 2], "little")
+    ) <= len(data):
         yield data[at:stop]
         at = stop
 

@@ -33,31 +33,62 @@ from .service import published
 
 _SIZE: Final = 249  # bytes of ULog per LOGGING_DATA
 _STEPS: Final = 10
-_LOST: Final = re.compile(r"^nedbus_(?:source_lost|log_stream_messages_lost)\w*\{[^}]*\} (\S+)", re.MULTILINE)
+_LOST: Final = re.compile(
+    r"^nedbus_(?:source_lost|log_stream_messages_lost)\w*\{[^}]*\} (\S+)", re.MULTILINE
+)
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--recording", default="flight1", choices=("flight1", "default_topics"))
-    parser.add_argument("--minutes", type=float, default=10.0, help="duration of the stream at its natural rate")
-    parser.add_argument("--speed", type=float, default=8.0, help="1.3: 2,770 messages/s of the default topics")
-    parser.add_argument("--setup", default="", help="Python code that the service runs first, for experiments")
+    parser.add_argument(
+        "--minutes", type=float, default=10.0, help="duration of the stream at its natural rate"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=8.0, help="1.3: 2,770 messages/s of the default topics"
+    )
+    parser.add_argument(
+        "--setup", default="", help="Python code that the service runs first, for experiments"
+    )
     options = parser.parse_args()
-    recording, port, endpoint, http = read_stream(options.recording), *(free_port() for _ in range(3))
+    recording, port, endpoint, http = (
+        read_stream(options.recording),
+        *(free_port() for _ in range(3)),
+    )
     seconds = 60 * options.minutes
     prolong(recording, options.recording, seconds)
     source = f"mavlink:udpin:127.0.0.1:{port}?log=1&topics=*"
-    arguments = "serve", "-l", f"tcp/127.0.0.1:{endpoint}", "--http", f"127.0.0.1:{http}", "-s", source
+    arguments = (
+        "serve",
+        "-l",
+        f"tcp/127.0.0.1:{endpoint}",
+        "--http",
+        f"127.0.0.1:{http}",
+        "-s",
+        source,
+    )
     with nedbus_process(*arguments, setup=options.setup) as service:
         wait_for_router(endpoint, service)
         print(f"       before the stream {memory_mb(service):6.1f} MB", flush=True)
         deadline = 2 * seconds / options.speed + 60
-        with Px4LogStream(recording, port, speed=options.speed, waits=True, deadline=deadline) as peer:
+        with Px4LogStream(
+            recording, port, speed=options.speed, waits=True, deadline=deadline
+        ) as peer:
             for step in range(_STEPS):
-                (cpu_before,), before, began = cpu_seconds(service), published(http), time.monotonic()
+                (cpu_before,), before, began = (
+                    cpu_seconds(service),
+                    published(http),
+                    time.monotonic(),
+                )
                 peer.finished.wait(seconds / options.speed / _STEPS)
-                (cpu,), count, passed = cpu_seconds(service), published(http), time.monotonic() - began
+                (cpu,), count, passed = (
+                    cpu_seconds(service),
+                    published(http),
+                    time.monotonic() - began,
+                )
                 rate, share = (count - before) / passed, 100 * (cpu - cpu_before) / passed
                 print(
                     f"{step + 1:2}/{_STEPS}: {count:9.0f} messages ({rate:5.0f}/s), {lost(http)} lost,"
@@ -77,7 +108,9 @@ def prolong(recording: Recording, name: str, seconds: float) -> None:
     rate = _SIZE * len(data) / (data[-1].time - data[0].time)  # bytes of ULog per second
     begin = recording.header_end
     heartbeat = next(
-        each.content for each in recording.entries if isinstance(each.content, bytes) and is_heartbeat(each.content)
+        each.content
+        for each in recording.entries
+        if isinstance(each.content, bytes) and is_heartbeat(each.content)
     )
     stream = [
         Entry(begin + number * _SIZE / rate, message)
@@ -102,7 +135,11 @@ def messages(recording: str, size: int) -> Iterator[Message]:
     for sequence, start in enumerate(range(0, len(records), _SIZE), first):
         while number < len(begins) and begins[number] < start:
             number += 1
-        offset = begins[number] - start if number < len(begins) and begins[number] < start + _SIZE else 255
+        offset = (
+            begins[number] - start
+            if number < len(begins) and begins[number] < start + _SIZE
+            else 255
+        )
         yield Message(False, sequence % 2**16, offset, bytes(records[start : start + _SIZE]))
 
 

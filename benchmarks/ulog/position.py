@@ -45,7 +45,9 @@ class Setup:
     def __init__(self, recording: Recording, options: str, closing: ExitStack) -> None:
         self.port, self.endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
         source = f"mavlink:udpin:127.0.0.1:{self.port}?log=1{options}"
-        self.service = closing.enter_context(nedbus_process("serve", "-l", self.endpoint, "-s", source))
+        self.service = closing.enter_context(
+            nedbus_process("serve", "-l", self.endpoint, "-s", source)
+        )
         self.odometry: dict[int, float] = {}
         closing.enter_context(Px4LogStream(recording, self.port, on_message=self._on_message))
 
@@ -56,7 +58,9 @@ class Setup:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=15.0)
     print(measure(parser.parse_args().seconds), flush=True)
 
@@ -81,7 +85,9 @@ def measure(seconds: float) -> str:
     without, sending = [(late - early) / passed for early, late in zip(before, after, strict=True)]
     arrivals = setups[1].odometry
     measured = {number: at for number, at in enumerate(published, 1) if at > began}
-    delays = sorted(1e3 * (arrivals[number] - at) for number, at in measured.items() if number in arrivals)
+    delays = sorted(
+        1e3 * (arrivals[number] - at) for number, at in measured.items() if number in arrivals
+    )
     return (
         f"CPU of serve: {without:.1%} without position=, {sending:.1%} with it, ratio {sending / without:.2f};"
         f" {len(delays)} of {len(measured)} positions: delay p50 {delays[len(delays) // 2]:.1f} ms,"

@@ -22,7 +22,14 @@ from pathlib import Path
 from tests.flights.ulogs import LOGS
 from tests.peers.px4_log_stream import Px4LogStream
 
-from benchmarks.processes import HERE, Checkout, cpu_seconds, free_port, nedbus_process, wait_for_router
+from benchmarks.processes import (
+    HERE,
+    Checkout,
+    cpu_seconds,
+    free_port,
+    nedbus_process,
+    wait_for_router,
+)
 
 from .files import repeat_log
 from .stream import FLIGHT, NATURAL, RATE, read_flight
@@ -33,13 +40,21 @@ _HEADER = 4.0  # s in which the definitions are sent
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("logs", nargs="*", type=Path, help="default: the logs of the tests")
-    parser.add_argument("--vs", type=Path, help="a second checkout of nedbus, measured in the same run")
+    parser.add_argument(
+        "--vs", type=Path, help="a second checkout of nedbus, measured in the same run"
+    )
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--megabytes", type=int, default=30)
     parser.add_argument("--seconds", type=float, default=15.0, help="longest duration of a stream")
-    parser.add_argument("--stream", type=Path, help="a recording to play at its own speed, instead of one at 200 KB/s")
+    parser.add_argument(
+        "--stream",
+        type=Path,
+        help="a recording to play at its own speed, instead of one at 200 KB/s",
+    )
     parser.add_argument("--no-logs", action="store_true", help="measure only the stream")
     options = parser.parse_args()
     checkouts = (HERE, Checkout(options.vs)) if options.vs else (HERE,)
@@ -52,12 +67,18 @@ def main() -> None:
     compare(path.name, partial(receive, path, speed, options.seconds), checkouts, options.rounds)
 
 
-def compare(name: str, measure: Callable[[Checkout], float], checkouts: tuple[Checkout, ...], rounds: int) -> None:
+def compare(
+    name: str, measure: Callable[[Checkout], float], checkouts: tuple[Checkout, ...], rounds: int
+) -> None:
     """Measure each checkout in turn, and print the times and the median of their ratios."""
     times = [[measure(each) for each in checkouts] for _ in range(rounds)]
     costs = " vs. ".join(f"{statistics.median(each):.1f} us" for each in zip(*times, strict=True))
     ratios = [each[0] / each[1] for each in times if len(each) > 1]
-    ratio = f", ratio {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" if ratios else ""
+    ratio = (
+        f", ratio {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+        if ratios
+        else ""
+    )
     print(f"{name}: {costs} of CPU time per message{ratio}", flush=True)
 
 
@@ -66,7 +87,9 @@ def replay(log: Path, checkout: Checkout) -> float:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     source, listen = f"ulog:{log}?speed=max&topics=*", f"tcp/127.0.0.1:{free_port()}"
     command = "serve", "--until-done", "-l", listen, "-s", source
-    process = checkout.start("-c", "from nedbus.cli import main\nmain()", *command, errors=subprocess.PIPE)
+    process = checkout.start(
+        "-c", "from nedbus.cli import main\nmain()", *command, errors=subprocess.PIPE
+    )
     _, text = process.communicate(timeout=600)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -80,8 +103,15 @@ def receive(path: Path, speed: float, seconds: float, checkout: Checkout) -> flo
     """Play a recorded stream to a service; return its CPU time per message after the header [us]."""
     port, endpoint, http = free_port(), free_port(), free_port()
     recording = read_flight(path, speed)
-    arguments = ("--http", f"127.0.0.1:{http}", "-s", f"mavlink:udpin:127.0.0.1:{port}?log=1&topics=*")
-    with nedbus_process("serve", "-l", f"tcp/127.0.0.1:{endpoint}", *arguments, checkout=checkout) as service:
+    arguments = (
+        "--http",
+        f"127.0.0.1:{http}",
+        "-s",
+        f"mavlink:udpin:127.0.0.1:{port}?log=1&topics=*",
+    )
+    with nedbus_process(
+        "serve", "-l", f"tcp/127.0.0.1:{endpoint}", *arguments, checkout=checkout
+    ) as service:
         wait_for_router(endpoint, service)
         with Px4LogStream(recording, port, speed=speed, waits=True) as peer:
             time.sleep(_HEADER)

@@ -62,7 +62,9 @@ class Arrivals:
             for record in self._parser.feed(message.data):
                 if isinstance(record, Data):
                     stream = self._stream_of(record.subscription)
-                    self.times[str(stream.address), stream.decode(record.payload)["timestamp"]] = time.monotonic()
+                    self.times[str(stream.address), stream.decode(record.payload)["timestamp"]] = (
+                        time.monotonic()
+                    )
         elif number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             (boot_ms,) = struct.unpack_from("<I", payload)
             self.times["1/vehicle_local_position", boot_ms * 1000] = time.monotonic()
@@ -70,7 +72,9 @@ class Arrivals:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=25.0)
     seconds = parser.parse_args().seconds
     for form in ("", "?log=1"):
@@ -92,11 +96,15 @@ def measure(form: str, seconds: float) -> str:
     """Run one form of the source and return its line."""
     arrivals, port, endpoint = Arrivals(), free_port(), f"tcp/127.0.0.1:{free_port()}"
     recording, speed = read_flight(FLIGHT), RATE / NATURAL
-    with nedbus_process("serve", "-l", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}{form}") as service:
+    with nedbus_process(
+        "serve", "-l", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}{form}"
+    ) as service:
         reader = start("-c", READER, endpoint)
         try:
             expect(reader)
-            peer = Px4LogStream(recording, port, speed=speed, waits=bool(form), on_send=arrivals.add)
+            peer = Px4LogStream(
+                recording, port, speed=speed, waits=bool(form), on_send=arrivals.add
+            )
             with peer:
                 time.sleep(3.0)  # the header
                 (before,), began = cpu_seconds(service), time.monotonic()

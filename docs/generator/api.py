@@ -40,11 +40,19 @@ _SECTIONS: Final = {  # by title: the packages of the names
         "nedbus.monitoring.live_events",
     ),
     "External positions": ("nedbus.fusion",),
-    "A service in your program": ("nedbus.settings", "nedbus.daemon", "nedbus.transport.router_log"),
+    "A service in your program": (
+        "nedbus.settings",
+        "nedbus.daemon",
+        "nedbus.transport.router_log",
+    ),
     "Metrics and health": ("nedbus.monitoring",),
     "Certificates": ("nedbus.pki",),
     "Checks of settings and networks": ("nedbus.doctor",),
-    "ROS 2 over Zenoh": ("nedbus.transport.rmw_zenoh", "nedbus.transport.liveliness", "nedbus.transport.session"),
+    "ROS 2 over Zenoh": (
+        "nedbus.transport.rmw_zenoh",
+        "nedbus.transport.liveliness",
+        "nedbus.transport.session",
+    ),
     "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
     "Messages, arrays, frames and resets": ("nedbus_msgs",),
 }
@@ -62,14 +70,28 @@ def api_page() -> str:
     named = {name: getattr(nedbus, name) for name in nedbus.__all__}
     for module in map(import_module, PUBLIC_MODULES[1:]):
         short = module.__name__.removeprefix("nedbus.")
-        named |= {f"{short}.{name}": getattr(module, name) for name in module.__all__ if name not in named}
-    constants = {name: each for name, each in named.items() if not (inspect.isclass(each) or inspect.isroutine(each))}
+        named |= {
+            f"{short}.{name}": getattr(module, name) for name in module.__all__ if name not in named
+        }
+    constants = {
+        name: each
+        for name, each in named.items()
+        if not (inspect.isclass(each) or inspect.isroutine(each))
+    }
     constants["Session"] = named["Session"]
     parts = []
     for title, packages in _SECTIONS.items():
-        own = [name for name in named if name not in constants and _section_of(named[name]) == title]
+        own = [
+            name for name in named if name not in constants and _section_of(named[name]) == title
+        ]
         tree = docstring(nedbus.errors.__doc__) if title == "Errors" else ""
-        own.sort(key=lambda name: (name.startswith("Async"), inspect.isclass(named[name]), title == "Errors"))
+        own.sort(
+            key=lambda name: (
+                name.startswith("Async"),
+                inspect.isclass(named[name]),
+                title == "Errors",
+            )
+        )
         parts.append(section(title, tree, *(_entry(name, named[name]) for name in own)))
         assert own, packages
     return page(
@@ -82,14 +104,21 @@ def api_page() -> str:
         "Units are SI and the frame is NED unless stated otherwise.",
         "Message classes have [their own pages](../messages.md).",
         *parts,
-        section("Constants and types", table(["name", "value", "meaning"], map(_constant, constants.items()))),
+        section(
+            "Constants and types",
+            table(["name", "value", "meaning"], map(_constant, constants.items())),
+        ),
     )
 
 
 def _section_of(value: Any) -> str:
     module = f"{value.__module__}."
     return next(
-        (title for title, packages in _SECTIONS.items() if any(module.startswith(f"{each}.") for each in packages)),
+        (
+            title
+            for title, packages in _SECTIONS.items()
+            if any(module.startswith(f"{each}.") for each in packages)
+        ),
         next(iter(_SECTIONS)),
     )
 
@@ -97,9 +126,19 @@ def _section_of(value: Any) -> str:
 def _entry(name: str, value: Any) -> str:
     if inspect.isroutine(value):
         return section(f"`{name}`", _signature(name, value), docstring(value.__doc__), level=3)
-    shown = "" if re.search("get one from|from `connect|returns one|yields them", value.__doc__ or "") else name
-    signature = _signature(shown, value) if shown and not issubclass(value, (Exception, nedbus.Message)) else ""
-    return section(f"`{name}`", signature, docstring(value.__doc__), *map(str, _members(value)), level=3)
+    shown = (
+        ""
+        if re.search("get one from|from `connect|returns one|yields them", value.__doc__ or "")
+        else name
+    )
+    signature = (
+        _signature(shown, value)
+        if shown and not issubclass(value, (Exception, nedbus.Message))
+        else ""
+    )
+    return section(
+        f"`{name}`", signature, docstring(value.__doc__), *map(str, _members(value)), level=3
+    )
 
 
 def _members(cls: type) -> Iterator[str]:
@@ -129,8 +168,12 @@ def _signature(name: str, value: Any) -> str:
     shown = [each for each in signature.parameters.values() if each.name not in {"self", "cls"}]
     returned = signature.return_annotation if inspect.isroutine(value) else inspect.Signature.empty
     text = f"{name}{signature.replace(parameters=shown, return_annotation=returned)}"
-    text = re.sub(r"(: |-> )'((?:[^'\\]|\\.)*)'", r"\1\2", re.sub(r'(: |-> )"([^"]*)"', r"\1\2", text))
-    text = re.sub(r"ForwardRef\('(\w+)'\)|<class '(?:\w+\.)*(\w+)'>", lambda found: found[1] or found[2], text)
+    text = re.sub(
+        r"(: |-> )'((?:[^'\\]|\\.)*)'", r"\1\2", re.sub(r'(: |-> )"([^"]*)"', r"\1\2", text)
+    )
+    text = re.sub(
+        r"ForwardRef\('(\w+)'\)|<class '(?:\w+\.)*(\w+)'>", lambda found: found[1] or found[2], text
+    )
     if len(text) > 100:
         text = re.sub(r"\(", "(\n    ", text, count=1)
         text = re.sub(r", (?=\*?\*?\w+(?::|,|=|\)))", ",\n    ", text)
@@ -139,10 +182,18 @@ def _signature(name: str, value: Any) -> str:
 
 def _constant(item: tuple[str, Any]) -> list[str]:
     name, value = item
-    shown = {"TOPICS": "a mapping of names to `Topic`", "DTYPE": "`numpy.dtype`", "Session": "`zenoh.Session`"}
+    shown = {
+        "TOPICS": "a mapping of names to `Topic`",
+        "DTYPE": "`numpy.dtype`",
+        "Session": "`zenoh.Session`",
+    }
     shown["frames.DERIVED"] = "a mapping of names to `DerivedField`"
     shown["vehicle_events.KINDS"] = "a mapping of names to `Kind`"
-    return [code(name), shown.get(name) or code(str(value).replace("typing.", "")), cell(_meaning(name))]
+    return [
+        code(name),
+        shown.get(name) or code(str(value).replace("typing.", "")),
+        cell(_meaning(name)),
+    ]
 
 
 def _meaning(name: str) -> str:
@@ -161,7 +212,9 @@ def _meaning(name: str) -> str:
 def constants_of(tree: ast.Module) -> Iterator[tuple[str, str]]:
     """Yield each name assigned in a module with the string below it."""
     for statement, below in zip(tree.body, tree.body[1:], strict=False):
-        target = getattr(statement, "target", None) or next(iter(getattr(statement, "targets", ())), None)
+        target = getattr(statement, "target", None) or next(
+            iter(getattr(statement, "targets", ())), None
+        )
         is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
         if isinstance(target, ast.Name) and is_text:
             yield target.id, str(below.value.value)  # type: ignore[attr-defined]  # is_text ensures it

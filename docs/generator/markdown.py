@@ -42,7 +42,9 @@ def plain(text: str) -> str:
     """Escape HTML, emphasis and links outside of code."""
     parts = re.split(r"(`[^`\n]*`)", text)
     special = r"([<*\[\]]|(?<!\w)_|_(?!\w))"
-    return "".join(part if number % 2 else re.sub(special, r"\\\1", part) for number, part in enumerate(parts))
+    return "".join(
+        part if number % 2 else re.sub(special, r"\\\1", part) for number, part in enumerate(parts)
+    )
 
 
 def docstring(text: str | None) -> str:

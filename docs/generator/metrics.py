@@ -9,7 +9,9 @@ from .markdown import cell, code, page, table
 
 def metrics_page() -> str:
     """Return the page of all metrics: name, kind, labels and help text."""
-    kinds = {name: (kind(name, "-").type, labels, text) for name, (kind, labels, text) in METRICS.items()}
+    kinds = {
+        name: (kind(name, "-").type, labels, text) for name, (kind, labels, text) in METRICS.items()
+    }
     build = build_info("")
     kinds[f"{build.name}_info"] = (build.type, [*build.samples[0].labels], build.documentation)
     rows = [

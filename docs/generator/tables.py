@@ -5,11 +5,10 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from pathlib import Path
 from typing import Final
 
-import nedbus
-import nedbus_msgs
+import nedbus.limits
+import nedbus_msgs.limits
 from nedbus.log_event import EVENTS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS
@@ -20,16 +19,7 @@ from nedbus_msgs import MESSAGES, TOPICS, Address, codec_of, encoding_of
 from .api import constants_of
 from .markdown import cell, code, page, section, table
 
-_LIMIT_SECTIONS: Final = {  # by title: the packages of the constants
-    "Readers and publishers": ("client",),
-    "Services and sources": ("daemon", "sources", "mavlink"),
-    "Events": ("events",),
-    "Recordings": ("flights", "tables"),
-    "Metrics, the log and the page": ("monitoring", "cli", "web"),
-    "Zenoh, certificates and ROS 2": ("transport", "bridges"),
-    "Messages": ("nedbus_msgs",),
-    "Others": (),
-}
+_SECTION: Final = re.compile(r"^# --- (.+) ---$", re.MULTILINE)
 
 
 def settings_page() -> str:
@@ -39,7 +29,15 @@ def settings_page() -> str:
         default = field.get_default(call_default_factory=True)
         shown = "" if default in (None, (), "") else str(default).lower()
         flag = f"--{name.replace('_', '-')}"
-        rows.append([code(name), code(f"NEDBUS_{name.upper()}"), code(flag), code(shown), cell(field.description)])
+        rows.append(
+            [
+                code(name),
+                code(f"NEDBUS_{name.upper()}"),
+                code(flag),
+                code(shown),
+                cell(field.description),
+            ]
+        )
     sources = []
     for name, kind in SOURCE_KINDS.items():
         options = []
@@ -49,19 +47,28 @@ def settings_page() -> str:
             options.append([code(option), code(shown), cell(field.description)])
         needs = f"Needs the extra `{kind.extra}`." if kind.extra else ""
         title = f"`{name}:{kind.target or ''}`"
-        sources.append(section(title, needs, table(["option", "default", "meaning"], options), level=3))
+        sources.append(
+            section(title, needs, table(["option", "default", "meaning"], options), level=3)
+        )
     return page(
         "Settings",
         "Flags override environment variables, which override `nedbus.toml`, or the file given by `--config` or "
         "`NEDBUS_CONFIG`. An empty default means none.",
         table(["in `nedbus.toml`", "environment", "flag", "default", "meaning"], rows),
-        section("Sources", "A source is `KIND:TARGET?OPTION=VALUE&OPTION=VALUE`, or a TOML table.", *sources),
+        section(
+            "Sources",
+            "A source is `KIND:TARGET?OPTION=VALUE&OPTION=VALUE`, or a TOML table.",
+            *sources,
+        ),
     )
 
 
 def events_page() -> str:
     """Return the page of log events and vehicle events."""
-    rows = [[code(name), cell(each.doc), "yes" if each.limited else "no"] for name, each in EVENTS.items()]
+    rows = [
+        [code(name), cell(each.doc), "yes" if each.limited else "no"]
+        for name, each in EVENTS.items()
+    ]
     kinds = [[code(name), ", ".join(map(code, kind.causes))] for name, kind in KINDS.items()]
     return page(
         "Log events and vehicle events",
@@ -139,56 +146,28 @@ def keys_page() -> str:
     )
 
 
-_NOT_LIMITS = {
-    "ARMED",
-    "MIN_FIX_TYPE",
-    "EARTH_RADIUS",
-    "FOXGLOVE_PORT",
-    "NUMBERS",
-    "PALETTE",
-}
-
-
 def limits_page() -> str:
-    """Return the page of limits: all public numeric constants with a docstring."""
-    parts: dict[str, list[list[str]]] = {title: [] for title in _LIMIT_SECTIONS}
-    for package in (nedbus, nedbus_msgs):
-        root = Path(package.__path__[0])
-        for path in sorted(root.rglob("*.py")):
-            folder = "nedbus_msgs" if package is nedbus_msgs else path.relative_to(root).parts[0]
-            title = next((title for title, folders in _LIMIT_SECTIONS.items() if folder in folders), "Others")
-            tree = ast.parse(path.read_text())
-            numbers = dict(_numbers(tree))
-            for name, text in constants_of(tree):
-                if name in numbers and not name.startswith("_") and name not in _NOT_LIMITS:
-                    parts[title].append([cell(text), code(numbers[name]), code(name)])
+    """Return the page of limits: the tables of `nedbus.limits` and `nedbus_msgs.limits`, and the durations."""
+    sections = []
+    for module in (nedbus.limits, nedbus_msgs.limits):
+        _, *parts = _SECTION.split(inspect.getsource(module))
+        for title, source in zip(parts[::2], parts[1::2], strict=True):
+            rows = []
+            for name, text in constants_of(ast.parse(source)):
+                rows.append([cell(text), code(f"{getattr(module, name):,}"), code(name)])
+            sections.append(section(title, table(["limit", "value", "constant"], rows)))
     return page(
-        "Limits and constants",
-        "The limits in the code, with the names of their constants. A vehicle name has 1 to 64 characters of "
-        "`A-Z a-z 0-9 _ -`, and an instance is a number from 0 to 255.",
-        *(section(title, table(["limit", "value", "constant"], rows)) for title, rows in parts.items()),
-        section("Durations", table(["duration [s]", "value", "field of `nedbus.timings.TIMINGS`"], _durations())),
+        "Limits and durations",
+        "The limits in the code, with the names of their constants in `nedbus.limits` and `nedbus_msgs.limits`. "
+        "A vehicle name has 1 to 64 characters of `A-Z a-z 0-9 _ -`, and an instance is a number from 0 to 255.",
+        *sections,
+        section(
+            "Durations",
+            table(["duration [s]", "value", "field of `nedbus.timings.TIMINGS`"], _durations()),
+        ),
     )
 
 
 def _durations() -> list[list[str]]:
-    lines = re.findall(r"^    (\w+): .+ = .+?  # (.+)$", inspect.getsource(Timings), re.MULTILINE)
-    return [[cell(text), code(str(getattr(Timings(), name))), code(name)] for name, text in lines]
-
-
-def _numbers(tree: ast.Module) -> list[tuple[str, str]]:
-    found = []
-    for each in tree.body:
-        value, target = getattr(each, "value", None), getattr(each, "target", None)
-        if isinstance(target, ast.Name) and isinstance(value, (ast.Constant, ast.BinOp)):
-            number = eval(ast.unparse(value), {"__builtins__": {}}) if _is_number(value) else None  # noqa: S307 - numbers
-            if number is not None:
-                found.append((target.id, f"{number:,}"))
-    return found
-
-
-def _is_number(value: ast.expr) -> bool:
-    kinds = (ast.Constant, ast.BinOp, ast.operator)
-    return all(isinstance(each, kinds) for each in ast.walk(value)) and all(
-        isinstance(each.value, (int, float)) for each in ast.walk(value) if isinstance(each, ast.Constant)
-    )
+    lines = re.findall(r"^    # (.+)\n    (\w+): ", inspect.getsource(Timings), re.MULTILINE)
+    return [[cell(text), code(str(getattr(Timings(), name))), code(name)] for text, name in lines]

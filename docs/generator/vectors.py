@@ -28,16 +28,29 @@ def vectors_text() -> str:
         if title not in {each["name"] for each in vectors["exact"]}:
             message = definition.model.model_validate_json(json.dumps(golden["fields"]))
             values = to_json(message.__dict__, definition.types)
-            vectors["exact"].append({"name": title, "message": name, "layout": wire, "values": values})
+            vectors["exact"].append(
+                {"name": title, "message": name, "layout": wire, "values": values}
+            )
     for entry in vectors["exact"]:
         if "payload" not in entry:
-            definition, provided = definition_of(entry["message"], definitions), entry.pop("provided", None)
+            definition, provided = (
+                definition_of(entry["message"], definitions),
+                entry.pop("provided", None),
+            )
             model = definition.model(**from_json(entry["values"], definition.types))
-            entry["encoding"] = encoding_of(definition, "vectors", None if provided is None else frozenset(provided))
-            entry["missing"] = [] if provided is None else [each for each in definition.names if each not in provided]
+            entry["encoding"] = encoding_of(
+                definition, "vectors", None if provided is None else frozenset(provided)
+            )
+            entry["missing"] = (
+                []
+                if provided is None
+                else [each for each in definition.names if each not in provided]
+            )
             entry["payload"] = codec_of(definition).encode(model).hex()
     parts = ",\n".join(
-        f'"{key}": {_lines(value, "{}")}' if isinstance(value, dict) else f'"{key}": {_lines(value, "[]")}'
+        f'"{key}": {_lines(value, "{}")}'
+        if isinstance(value, dict)
+        else f'"{key}": {_lines(value, "[]")}'
         for key, value in vectors.items()
     )
     return f"{{\n{parts}\n}}\n"
@@ -45,7 +58,9 @@ def vectors_text() -> str:
 
 def definition_of(name: str, definitions: Mapping[str, Any]) -> Definition[Any]:
     """Return the definition of a message from nedbus, or from the file if nedbus does not have the message."""
-    return MESSAGES.get(name) or define(name, ((field, field_type(kind)) for field, kind in definitions[f"{name}/0"]))
+    return MESSAGES.get(name) or define(
+        name, ((field, field_type(kind)) for field, kind in definitions[f"{name}/0"])
+    )
 
 
 def to_json(fields: Mapping[str, Any], types: Mapping[str, FieldType]) -> list[Any]:
@@ -55,7 +70,10 @@ def to_json(fields: Mapping[str, Any], types: Mapping[str, FieldType]) -> list[A
 
 def from_json(values: Iterable[Any], types: Mapping[str, FieldType]) -> dict[str, Any]:
     """Return the fields of a message."""
-    return {name: _map(value, kind, _from_json) for value, (name, kind) in zip(values, types.items(), strict=True)}
+    return {
+        name: _map(value, kind, _from_json)
+        for value, (name, kind) in zip(values, types.items(), strict=True)
+    }
 
 
 def _map(value: Any, kind: FieldType, convert: Any) -> Any:
@@ -74,7 +92,10 @@ def _from_json(value: Any, kind: FieldType) -> Any:
 
 def _lines(value: Any, brackets: str) -> str:
     if isinstance(value, dict):
-        lines = [f"{json.dumps(key)}: {json.dumps(each, ensure_ascii=False)}" for key, each in value.items()]
+        lines = [
+            f"{json.dumps(key)}: {json.dumps(each, ensure_ascii=False)}"
+            for key, each in value.items()
+        ]
     else:
         lines = [json.dumps(each, ensure_ascii=False) for each in value]
     return brackets[0] + "\n" + ",\n".join(lines) + "\n" + brackets[1]

@@ -14,16 +14,46 @@ from .errors import (
     NedbusError,
     UnknownLayoutError,
 )
-from .messages.vehicle_local_position import DOUBT_FLAGS, VehicleLocalPosition, describe_flags, message_doubts
+from .messages.vehicle_local_position import (
+    DOUBT_FLAGS,
+    VehicleLocalPosition,
+    describe_flags,
+    message_doubts,
+)
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
-from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, FieldReader, Row, upgrade_fields, upgrade_with
+from .model.definition import (
+    BY_TOPIC,
+    MESSAGES,
+    TOPICS,
+    Definition,
+    FieldReader,
+    Row,
+    upgrade_fields,
+    upgrade_with,
+)
 from .model.message import Message
-from .model.px4_types import BASES, FIRST_UNIX_TIME, YEAR_2000, FieldType, decode_text, field_type, is_unix_time
+from .model.px4_types import (
+    BASES,
+    FIRST_UNIX_TIME,
+    YEAR_2000,
+    FieldType,
+    decode_text,
+    field_type,
+    is_unix_time,
+)
 from .model.rules import UnitQuaternion
 from .provenance import Provenance, encoding_of, identity_of, provenance_of, short_hash
 from .resets import JUMP_FIELDS, RESET_COUNTERS, Continuous, Quantity, ResetTracker, jump_of
 from .ros2.msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
-from .ros2.types import dds_type, definition_text, has_char_hash, hash_of, message_of_type_hash, ros2_type, ros2_types
+from .ros2.types import (
+    dds_type,
+    definition_text,
+    has_char_hash,
+    hash_of,
+    message_of_type_hash,
+    ros2_type,
+    ros2_types,
+)
 from .topics import (
     ANY,
     DEFAULT_PREFIX,

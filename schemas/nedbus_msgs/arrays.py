@@ -59,7 +59,9 @@ class Arrays(Generic[M]):
             self._from_wire = np.append(self._from_wire, bytes_of[::-1] if is_swapped else bytes_of)
         # The same by windows of the payload: the first byte of the window, and offsets from there.
         windows = groupby(self._from_wire.tolist(), lambda offset: offset - offset % _WINDOW)
-        self._gathers = [(start, bytes([offset - start for offset in offsets])) for start, offsets in windows]
+        self._gathers = [
+            (start, bytes([offset - start for offset in offsets])) for start, offsets in windows
+        ]
         self._to_wire = np.zeros(size, np.intp)
         self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
@@ -67,10 +69,15 @@ class Arrays(Generic[M]):
         self._value_mask = ~self._tag_mask
         checked = {name for rule in definition.rules for name in rule.fields}
         # A struct that unpacks only the fields with rules from an element, and an expression for each unpacked field.
-        forms = (kind.form if name in checked else f"{self.dtype[name].itemsize}x" for name, kind in types.items())
+        forms = (
+            kind.form if name in checked else f"{self.dtype[name].itemsize}x"
+            for name, kind in types.items()
+        )
         accessors = accessors_of({name: kind for name, kind in types.items() if name in checked})
         self._checked = struct.Struct("=" + "".join(forms))
-        self._passes_rules = compile_lambda(f"lambda values: {expression_of(definition.rules, accessors)}")
+        self._passes_rules = compile_lambda(
+            f"lambda values: {expression_of(definition.rules, accessors)}"
+        )
         self._column_checks = column_checks(
             definition.rules,
             isfinite=np.isfinite,
@@ -100,11 +107,17 @@ class Arrays(Generic[M]):
         tag_mask = self._codec.tag_mask
         elements = bytearray()
         for payload in payloads:
-            if len(payload) != size or (number := int.from_bytes(payload, "big")) & tag_mask != tags:
+            if (
+                len(payload) != size
+                or (number := int.from_bytes(payload, "big")) & tag_mask != tags
+            ):
                 return None
             wire = (number ^ tags).to_bytes(size, "big")
             # `translate` maps each offset to the byte of the window at this offset.
-            windows = [offsets.translate(wire[at : at + _WINDOW].ljust(_WINDOW)) for at, offsets in self._gathers]
+            windows = [
+                offsets.translate(wire[at : at + _WINDOW].ljust(_WINDOW))
+                for at, offsets in self._gathers
+            ]
             element = b"".join(windows)
             if not self._passes_rules(self._checked.unpack(element)):
                 return None
@@ -138,11 +151,16 @@ class Arrays(Generic[M]):
 
     def of(self, messages: Sequence[M]) -> MessageArray:
         """Convert messages to a structured array."""
-        return np.array([self.to_element(tuple(message.__dict__.values())) for message in messages], self.dtype)
+        return np.array(
+            [self.to_element(tuple(message.__dict__.values())) for message in messages], self.dtype
+        )
 
     def absent(self, count: int) -> MessageArray:
         """Return `count` messages with every field "not provided": NaN, false or 0."""
-        return np.repeat(np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype), count)
+        return np.repeat(
+            np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype),
+            count,
+        )
 
     def to_row(self, element: np.void) -> Values:
         """Return the values of one element in PX4's order, arrays as tuples."""
@@ -161,9 +179,12 @@ class Arrays(Generic[M]):
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
         """Encode messages as CDR payloads without validating them; the model must have all fields of the layout."""
-        cdr, formats = cdr_layout(layout), [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()]
+        cdr = cdr_layout(layout)
+        formats = [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()]
         names, offsets = zip(*cdr.offsets.items(), strict=True)
-        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": cdr.size})
+        dtype = np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": cdr.size}
+        )
         payloads = np.frombuffer(bytearray(cdr.zeros * len(array)), dtype)
         for name in layout.types:
             payloads[name] = array[name]
@@ -212,5 +233,7 @@ def derive_column(messages: MessageArray, name: str) -> npt.NDArray[np.float64]:
     is_valid = messages[derived.flag] if derived.flag else is_rotation(values[0])
     functions = Functions(np.sqrt, np.arctan2)
     with np.errstate(invalid="ignore", over="ignore"):  # of invalid values, which are replaced
-        found: npt.NDArray[np.float64] = np.where(is_valid, derived.compute(functions, *values), np.nan)
+        found: npt.NDArray[np.float64] = np.where(
+            is_valid, derived.compute(functions, *values), np.nan
+        )
     return found

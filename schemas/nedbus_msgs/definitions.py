@@ -33,7 +33,11 @@ DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
 
 
 def define(
-    name: str, fields: Iterable[tuple[str, FieldType]], *, meanings: Mapping[str, str] = {}, rules: Sequence[Rule] = ()
+    name: str,
+    fields: Iterable[tuple[str, FieldType]],
+    *,
+    meanings: Mapping[str, str] = {},
+    rules: Sequence[Rule] = (),
 ) -> Definition[Message]:
     """Define a message that is not built in, from a log, a .msg file or a publisher.
 
@@ -42,7 +46,9 @@ def define(
     Raises ValueError for an invalid name, a missing timestamp, too many fields, or a payload beyond the size limit.
     """
     if not _NAME.fullmatch(name):
-        raise ValueError(f"{name!r:.100} is not a message name; expected CamelCase of at most 64 characters")
+        raise ValueError(
+            f"{name!r:.100} is not a message name; expected CamelCase of at most 64 characters"
+        )
     types: dict[str, FieldType] = {}
     for field, kind in fields:
         check_field_name(field)
@@ -57,10 +63,15 @@ def define(
     if size > PAYLOAD_LIMIT:
         raise ValueError(f"a payload of {size} bytes, more than the limit of {PAYLOAD_LIMIT}")
     described = {name: Field(description=meanings.get(name)) for name in types}
-    annotated: dict[str, Any] = {name: (kind.annotation, described[name]) for name, kind in types.items()}
+    annotated: dict[str, Any] = {
+        name: (kind.annotation, described[name]) for name, kind in types.items()
+    }
     annotated["timestamp"] = Timestamp, described["timestamp"]  # required
-    model = create_model(name, __base__=Message, __doc__="A message defined at run time.", **annotated)
-    model.LAYOUTS, model.RULES = (Layout("PX4", " ".join(types)),), rules  # the model has timestamp first
+    model = create_model(
+        name, __base__=Message, __doc__="A message defined at run time.", **annotated
+    )
+    # the model has timestamp first
+    model.LAYOUTS, model.RULES = (Layout("PX4", " ".join(types)),), rules
     model.DEFINITION = Definition(model)
     return model.DEFINITION
 
@@ -70,4 +81,6 @@ def check_field_name(name: str) -> None:
     if not _FIELD.fullmatch(name):
         raise ValueError(f"invalid field name {name!r:.100}; expected lower_snake_case")
     if hasattr(Message, name):
-        raise ValueError(f"invalid field name {name!r}, which is a member of the Python class Message")
+        raise ValueError(
+            f"invalid field name {name!r}, which is a member of the Python class Message"
+        )

@@ -1,11 +1,9 @@
 """The root of the error tree, and the errors that nedbus_msgs raises; `nedbus.errors` shows the whole tree."""
 
 from collections.abc import Sequence
-from typing import Final
 
+from .limits import SHOWN_VALUE
 from .text import counted
-
-_MAX_SHOWN: Final = 200  # characters of a value; a peer's key may be 64 kB long
 
 
 class NedbusError(Exception):
@@ -16,14 +14,17 @@ class NedbusError(Exception):
 
 
 def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...]) -> NedbusError:
-    return kind.__new__(kind, *arguments)  # bypasses the constructor, which would format the text again
+    # bypasses the constructor, which would format the text again
+    return kind.__new__(kind, *arguments)
 
 
 class ArgumentError(NedbusError, ValueError):
     """Raised for an invalid argument of a call, such as `mode`, `max_rate` or `on`; `given` is its value."""
 
-    def __init__(self, what: str, given: object, expected: str, *, problem: str = "is not valid") -> None:
-        super().__init__(f"{what} {given!r:.{_MAX_SHOWN}} {problem}: expected {expected}")
+    def __init__(
+        self, what: str, given: object, expected: str, *, problem: str = "is not valid"
+    ) -> None:
+        super().__init__(f"{what} {given!r:.{SHOWN_VALUE}} {problem}: expected {expected}")
         self.given = given
 
 
@@ -52,7 +53,10 @@ class UnknownLayoutError(DecodeError):
     def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
         readable = ", ".join(map(str, known))
         fields = counted(count, "field")
-        super().__init__(f"unknown layout {layout} with {fields} (known: {readable}); update nedbus_msgs", message)
+        super().__init__(
+            f"unknown layout {layout} with {fields} (known: {readable}); update nedbus_msgs",
+            message,
+        )
         self.layout = layout
         self.count = count
         self.known = tuple(known)
@@ -66,7 +70,12 @@ class InvalidMessageError(NedbusError, ValueError):
     """
 
     def __init__(
-        self, reason: str, violations: Sequence[tuple[str, str]], *, message: str, index: int | None = None
+        self,
+        reason: str,
+        violations: Sequence[tuple[str, str]],
+        *,
+        message: str,
+        index: int | None = None,
     ) -> None:
         where = "" if index is None else f" at index {index}"
         super().__init__(f"not a valid {message}{where}: {reason}")
@@ -79,4 +88,6 @@ class EncodeError(NedbusError, ValueError):
     """Raised when unvalidated values cannot be encoded: a value does not fit its field, or their number is wrong."""
 
     def __init__(self, reason: str, message: str) -> None:
-        super().__init__(f"the message cannot be encoded ({reason}); create it with {message}(...), which validates it")
+        super().__init__(
+            f"the message cannot be encoded ({reason}); create it with {message}(...), which validates it"
+        )

@@ -67,7 +67,9 @@ def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
 
 
 # Each conversion swaps axes or is a half turn, and is therefore its own inverse.
-enu_to_ned, flu_to_frd, yaw_enu_to_ned = ned_to_enu, frd_to_flu, yaw_ned_to_enu
+enu_to_ned = ned_to_enu
+flu_to_frd = frd_to_flu
+yaw_enu_to_ned = yaw_ned_to_enu
 variances_enu_to_ned, quaternion_enu_to_ned = variances_ned_to_enu, quaternion_ned_to_enu
 
 
@@ -78,7 +80,9 @@ def wrap(angle: float) -> float:
 
 def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> _Quaternion:
     """Return the rotation from body FRD to NED (w, x, y, z) for roll, pitch and heading."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, yaw))
+    (cr, sr), (cp, sp), (cy, sy) = (
+        (math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, yaw)
+    )
     return (
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
@@ -109,7 +113,8 @@ _OF_NUMBERS: Final = Functions(math.sqrt, math.atan2)
 def _euler(functions: Functions, q: Any) -> tuple[Any, Any, Any]:
     """Return roll, pitch and yaw [rad] of the elements of q, numbers or arrays."""
     w, x, y, z = q
-    sine_roll, cosine_roll = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # both times the cosine of pitch
+    # both times the cosine of pitch
+    sine_roll, cosine_roll = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
     cosine_pitch = functions.sqrt(sine_roll * sine_roll + cosine_roll * cosine_roll)
     roll = functions.atan2(sine_roll, cosine_roll)
     pitch = functions.atan2(2 * (w * y - z * x), cosine_pitch)
@@ -135,7 +140,9 @@ def _angle(index: int, scale: float) -> Callable[..., Any]:
 
 
 _DEGREES: Final = 180.0 / math.pi
-_ROLL: Final = "roll about the forward axis, the last of the rotations yaw, pitch, roll from NED to body FRD"
+_ROLL: Final = (
+    "roll about the forward axis, the last of the rotations yaw, pitch, roll from NED to body FRD"
+)
 _PITCH: Final = "pitch, positive nose up, within a quarter turn; after yaw and before roll"
 _YAW: Final = "yaw, clockwise from north; the first of the rotations from NED to body FRD"
 
@@ -159,7 +166,9 @@ def derived_from(fields: Iterable[str]) -> list[str]:
     """Return the names in DERIVED of the quantities that a message with these fields has, except its own fields."""
     own = set(fields)
     return [
-        name for name, each in DERIVED.items() if name not in own and own.issuperset({*each.fields, each.flag} - {""})
+        name
+        for name, each in DERIVED.items()
+        if name not in own and own.issuperset({*each.fields, each.flag} - {""})
     ]
 
 
@@ -204,10 +213,13 @@ class MapProjection:
         sine, cosine = _sine_and_cosine(self.latitude)
         sine_angle, cosine_angle = math.sin(angle), math.cos(angle)
         axial = cosine_angle * sine + x * sine_angle * cosine / angle
-        radial, eastward = cosine_angle * cosine - x * sine_angle * sine / angle, y * sine_angle / angle
+        radial = cosine_angle * cosine - x * sine_angle * sine / angle
+        eastward = y * sine_angle / angle
         # PX4 uses an arc sine, which is inexact at the poles; elsewhere the result is the same.
         latitude = math.degrees(math.atan2(axial, math.hypot(radial, eastward)))
-        return latitude, math.remainder(self.longitude + math.degrees(math.atan2(eastward, radial)), 360.0)
+        return latitude, math.remainder(
+            self.longitude + math.degrees(math.atan2(eastward, radial)), 360.0
+        )
 
 
 @dataclass(slots=True)
@@ -228,7 +240,9 @@ class CommonOrigin:
         """Add a message with a global origin; return the projection."""
         projection = self.projection
         if projection is None or (not self._is_confirmed and vehicle == self._vehicle):
-            origin = (message.ref_lat, message.ref_lon, message.ref_alt)[: 3 if message.z_global else 2]
+            origin = (message.ref_lat, message.ref_lon, message.ref_alt)[
+                : 3 if message.z_global else 2
+            ]
             self._is_confirmed = origin == self._first
             if projection is None or not self._is_confirmed:
                 self._vehicle = vehicle
@@ -263,8 +277,12 @@ def to_global(message: Message) -> GlobalPosition | None:
     """
     if not message.xy_global or not math.isfinite(message.x + message.y):
         return None
-    latitude, longitude = MapProjection(message.ref_lat, message.ref_lon).reproject(message.x, message.y)
-    return GlobalPosition(latitude, longitude, message.ref_alt - message.z if message.z_global else math.nan)
+    latitude, longitude = MapProjection(message.ref_lat, message.ref_lon).reproject(
+        message.x, message.y
+    )
+    return GlobalPosition(
+        latitude, longitude, message.ref_alt - message.z if message.z_global else math.nan
+    )
 
 
 def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
@@ -274,7 +292,9 @@ def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
     """
     if not origin.xy_global:
         return None
-    x, y = MapProjection(origin.ref_lat, origin.ref_lon).project(position.latitude, position.longitude)
+    x, y = MapProjection(origin.ref_lat, origin.ref_lon).project(
+        position.latitude, position.longitude
+    )
     return x, y, origin.ref_alt - position.altitude if origin.z_global else math.nan
 
 

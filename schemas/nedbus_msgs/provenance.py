@@ -23,7 +23,9 @@ from .model.px4_types import FieldType
 from .ros2.types import PACKAGE, hash_of
 
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
-_IDENTITY = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?")
+_IDENTITY = re.compile(
+    r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?"
+)
 # Number of the newest layout that needs no hash, because the first version has it. Never add to this table: readers
 # find the fields of any other layout by its hash.
 _WITHOUT_HASH: Final[Mapping[str, int]] = {
@@ -52,13 +54,21 @@ class Provenance:
 
 
 @cached_on_owner
-def encoding_of(definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None) -> str:
+def encoding_of(
+    definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None
+) -> str:
     """Return the Zenoh encoding for a source that provides these fields; None means all fields."""
     names = definition.names
-    mask = 0 if provided is None else sum(1 << index for index, name in enumerate(names) if name not in provided)
+    mask = (
+        0
+        if provided is None
+        else sum(1 << index for index, name in enumerate(names) if name not in provided)
+    )
     parts = [f"application/msgpack;px4_msgs/{definition.name}"]
     is_built_in = MESSAGES.get(definition.name) is definition
-    if not is_built_in or cast("int", definition.current.wire) > _WITHOUT_HASH.get(definition.name, -1):
+    if not is_built_in or cast("int", definition.current.wire) > _WITHOUT_HASH.get(
+        definition.name, -1
+    ):
         parts.append(f"hash={short_hash(definition.name, definition.types)}")
     if source is not None:
         parts.append(f"source={source}")

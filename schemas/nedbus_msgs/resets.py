@@ -40,10 +40,13 @@ JUMP_FIELDS: Final = (
 )  # fmt: skip
 """The fields that `jump_of` needs besides `timestamp` and the reset counter."""
 
-_REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
-_MAX_INTERVAL: Final = 3.0  # s for which the rates at both ends determine the motion well enough to find a step
+# us; a larger step back in time is a reboot, a smaller one is reordering
+_REBOOT: Final = 1_000_000
+# s for which the rates at both ends determine the motion well enough to find a step
+_MAX_INTERVAL: Final = 3.0
 _MAX_UNKNOWN: Final = 0.5  # s, the same without rates
-_SURE_INTERVAL: Final = 0.15  # s; over longer intervals, a change of the rate makes the motion uncertain
+# s; over longer intervals, a change of the rate makes the motion uncertain
+_SURE_INTERVAL: Final = 0.15
 # Maximum difference between a delta and the step, in m, m/s or rad: for noise, for a jerk of 120 m/s^3 (the mean of two
 # rates is off by a twelfth of it times the interval cubed, but at most by _SPEED), and without rates.
 _NOISE: Final = 0.003
@@ -85,7 +88,9 @@ class ResetTracker:
 
     def __init__(self) -> None:
         self._last: Message | None = None
-        self._jumps: dict[Quantity, Point] = {name: (0.0,) * len(values) for name, values in _VALUES.items()}
+        self._jumps: dict[Quantity, Point] = {
+            name: (0.0,) * len(values) for name, values in _VALUES.items()
+        }
         self._resets: dict[Quantity, int] = dict.fromkeys(_VALUES, 0)
 
     def add(self, message: Message) -> Continuous:
@@ -128,7 +133,10 @@ class ResetTracker:
 
 def _by_name(message: Message) -> dict[str, Any]:
     """Return what `jump_of` needs of a model or a row."""
-    return {name: getattr(message, name) for name in ("timestamp", *RESET_COUNTERS.values(), *JUMP_FIELDS)}
+    return {
+        name: getattr(message, name)
+        for name in ("timestamp", *RESET_COUNTERS.values(), *JUMP_FIELDS)
+    }
 
 
 def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any]) -> Point | None:
@@ -144,14 +152,25 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     announced = []
     if (after[counter] - before[counter]) % 256 == 1:
         announced.append(delta if isinstance(delta, tuple) else (delta,))
-    if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str([after[each] for each in _ORIGIN]):
-        shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(before["ref_lat"], before["ref_lon"])
-        announced += [(0.0,) * len(values), shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],)]
+    if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str(
+        [after[each] for each in _ORIGIN]
+    ):
+        shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(
+            before["ref_lat"], before["ref_lon"]
+        )
+        announced += [
+            (0.0,) * len(values),
+            shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],),
+        ]
     announced = [jump for jump in announced if all(map(math.isfinite, jump))]
     motions = [_motion(value, before, after, seconds) for value in values]
     is_known = all(math.isfinite(moved) for moved, _ in motions)
-    motion, changes = zip(*(each if math.isfinite(each[0]) else (0.0, 0.0) for each in motions), strict=True)
-    step = tuple(after[value] - before[value] - moved for value, moved in zip(values, motion, strict=True))
+    motion, changes = zip(
+        *(each if math.isfinite(each[0]) else (0.0, 0.0) for each in motions), strict=True
+    )
+    step = tuple(
+        after[value] - before[value] - moved for value, moved in zip(values, motion, strict=True)
+    )
     if not all(map(math.isfinite, step)) or seconds <= 0:
         return announced[0] if announced else None
     if name == "heading":
@@ -169,7 +188,9 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     return step if is_measured else None
 
 
-def _motion(value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float) -> tuple[float, float]:
+def _motion(
+    value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float
+) -> tuple[float, float]:
     """Return how far a value moved by its rates at both messages, NaN if unknown, and by how much the rates differ."""
     if value == "heading":  # the gyroscopes' heading has no resets
         turned: float = after["unaided_heading"] - before["unaided_heading"]

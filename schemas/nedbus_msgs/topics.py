@@ -58,7 +58,9 @@ class Address(_Hashed):
     def __post_init__(self) -> None:
         check_vehicle(self.vehicle)
         _check_instance(self.topic, self.instance, required=get_topic(self.topic).instances is True)
-        object.__setattr__(self, "__hash__", hash((self.vehicle, self.topic, self.instance)).__int__)
+        object.__setattr__(
+            self, "__hash__", hash((self.vehicle, self.topic, self.instance)).__int__
+        )
 
     __hash__ = _Hashed.__hash__  # type: ignore[misc] # the slot, because a dataclass would define a method
 
@@ -120,7 +122,10 @@ class Selection:
     instance: int | None
 
     def __init__(
-        self, topic: str | Sequence[str] = ANY, vehicle: VehicleNames = ANY, instance: int | None = None
+        self,
+        topic: str | Sequence[str] = ANY,
+        vehicle: VehicleNames = ANY,
+        instance: int | None = None,
     ) -> None:
         topics = _distinct("topic", topic)
         vehicles = _distinct("vehicle", vehicle)
@@ -157,7 +162,11 @@ class Selection:
     def alive_key_exprs(self, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
         """Return the key expressions that match the liveliness tokens of these addresses."""
         streams = self._streams
-        return [f"{prefix}/{vehicle}/@alive/*/{stream}" for vehicle in self.vehicles for stream in streams]
+        return [
+            f"{prefix}/{vehicle}/@alive/*/{stream}"
+            for vehicle in self.vehicles
+            for stream in streams
+        ]
 
     def rate_key_exprs(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
         """Return the key expressions of these streams downsampled to `rate` messages/s; "*" matches any rate."""
@@ -201,7 +210,9 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     vehicle, alive, token = key.removeprefix(prefix + "/").partition("/@alive/")
     publisher, _, stream = token.partition("/")
     if not (alive and publisher):
-        raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<publisher>/<topic>[/<instance>]")
+        raise AddressError(
+            "key", key, f"{prefix}/<vehicle>/@alive/<publisher>/<topic>[/<instance>]"
+        )
     return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
 
 
@@ -241,7 +252,8 @@ def prefix_of(key: str) -> str:
     """Return the prefix of the key of a message or of a publisher's token; "" if it has none, as in plain ROS 2."""
     vehicle, alive, _ = key.partition("/@alive/")
     before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
-    is_ros2_domain = bool(before) and before[0].isdecimal()  # `<domain>/fmu/out/vehicle_local_position`
+    # `<domain>/fmu/out/vehicle_local_position`
+    is_ros2_domain = bool(before) and before[0].isdecimal()
     return "" if is_ros2_domain else "/".join(before)
 
 
@@ -265,12 +277,16 @@ def _other_topic(name: str) -> Topic:
     if not _TOPIC.fullmatch(name) or len(name) > _MAX_LENGTH:
         topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
         if re.search(r"(^|/)(in|out)/", name):
-            raise AddressError("topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix")
+            raise AddressError(
+                "topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix"
+            )
         base, _, instance = name.partition("/")
         expected = f"one of {', '.join(topics)}"
         if topics is TOPICS:
             expected += ", or another PX4 topic in lower_snake_case"
-        raise AddressError("topic", name, f"{base} with instance {instance}" if base in TOPICS else expected)
+        raise AddressError(
+            "topic", name, f"{base} with instance {instance}" if base in TOPICS else expected
+        )
     if meant := get_close_matches(name, TOPICS, 3, _TYPO_SIMILARITY):
         raise AddressError("topic", name, f"{' or '.join(meant)} (looks like a misspelling)")
     return Topic(name, 0.0, "another PX4 topic", instances=None)
@@ -301,7 +317,9 @@ def is_vehicle_input(topic: str) -> bool:
 
 def ros2_topic_of(address: Address, namespace: str) -> str:
     """Return the ROS 2 topic of an address, without a leading slash; an empty namespace means none."""
-    plain = address.instance is None or (address.instance == 0 and get_topic(address.topic).plain_first)
+    plain = address.instance is None or (
+        address.instance == 0 and get_topic(address.topic).plain_first
+    )
     topic = address.topic if plain else f"{address.topic}_{address.instance}"
     return "/".join(filter(None, (namespace.strip("/"), *_OUT, topic)))
 
@@ -329,7 +347,9 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 def check_vehicle(vehicle: object) -> str:
     """Return a valid vehicle name; raise AddressError for any other."""
     if not isinstance(vehicle, str):
-        raise AddressError("vehicle", vehicle, 'a name, such as "7", a list of names, or "*" for all')
+        raise AddressError(
+            "vehicle", vehicle, 'a name, such as "7", a list of names, or "*" for all'
+        )
     if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _MAX_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_MAX_LENGTH} of A-Z a-z 0-9 _ -")
     return vehicle
@@ -338,8 +358,12 @@ def check_vehicle(vehicle: object) -> str:
 def _check_instance(topic: str, instance: int | None, *, required: bool = False) -> None:
     if instance is not None and get_topic(topic).instances is False:
         raise AddressError("instance", instance, f"none ({topic} has no instances)")
-    if (required or instance is not None) and (type(instance) is not int or not 0 <= instance < _INSTANCES):
-        raise AddressError("instance", instance, f"an integer from 0 to {_INSTANCES - 1} for {topic}")
+    if (required or instance is not None) and (
+        type(instance) is not int or not 0 <= instance < _INSTANCES
+    ):
+        raise AddressError(
+            "instance", instance, f"an integer from 0 to {_INSTANCES - 1} for {topic}"
+        )
 
 
 def check_prefix(prefix: str) -> None:
@@ -350,5 +374,9 @@ def check_prefix(prefix: str) -> None:
 
 def check_max_rate(max_rate: object) -> None:
     """Raise ArgumentError unless `max_rate` is a finite number above 0."""
-    if isinstance(max_rate, bool) or not isinstance(max_rate, int | float) or not 0 < max_rate < math.inf:
+    if (
+        isinstance(max_rate, bool)
+        or not isinstance(max_rate, int | float)
+        or not 0 < max_rate < math.inf
+    ):
         raise ArgumentError("max_rate", max_rate, "messages per second, a finite number above 0")

@@ -162,14 +162,17 @@ _MODULES = {
     "nedbus_msgs.arrays": "DTYPE MessageArray dtype_of mask_invalid to_array to_message",
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
-_NAMES_AT_HOME = {"convert": "convert_files", "open": "open_flight"}  # that differ from the public name
+# that differ from the public name
+_NAMES_AT_HOME = {"convert": "convert_files", "open": "open_flight"}
 _SUBMODULES = "errors", "frames", "health"
 
 
 def __dir__() -> list[str]:
     """Return all public names, for tab completion, including names that are not imported yet."""
     messages = _import_module("nedbus_msgs").MESSAGES
-    return sorted({*__all__, *messages, *_SUBMODULES, *(name for name in globals() if name.startswith("__"))})
+    return sorted(
+        {*__all__, *messages, *_SUBMODULES, *(name for name in globals() if name.startswith("__"))}
+    )
 
 
 if not TYPE_CHECKING:  # otherwise type checkers would accept any name

@@ -50,4 +50,6 @@ def format_utc(utc: float) -> str:
 
 def format_since(since: float | None, now: float) -> str:
     """Format the start of a condition as a suffix for its text; "" if unknown."""
-    return "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"
+    return (
+        "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"
+    )

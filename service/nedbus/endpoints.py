@@ -9,7 +9,8 @@ from typing import Final
 
 from nedbus.errors import ConfigError
 
-DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"  # `nedbus serve` listens on it, and clients connect to it
+# `nedbus serve` listens on it, and clients connect to it
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+"
 )

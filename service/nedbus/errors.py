@@ -56,7 +56,9 @@ class AddressInUseError(NedbusError, ValueError):
     """Raised for a second publisher of the same address on one bus, or in one service."""
 
     def __init__(self, address: Address) -> None:
-        super().__init__(f"this process already publishes {address}: use another vehicle for one of the publishers")
+        super().__init__(
+            f"this process already publishes {address}: use another vehicle for one of the publishers"
+        )
         self.address = address
 
 
@@ -73,7 +75,9 @@ class ConfigError(NedbusError, ValueError):
         self.key = key
 
     @classmethod
-    def in_file(cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None) -> ConfigError:
+    def in_file(
+        cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None
+    ) -> ConfigError:
         """Return the error for a position in a file."""
         position = f", line {line}, column {column}" if line else ""
         return cls(f"{path}{position}", reason)
@@ -91,18 +95,24 @@ class ConfigError(NedbusError, ValueError):
 class ConnectError(NedbusError, ConnectionError):
     """Raised when no endpoint answers in time; `advice`: the remedy, if the cause is known."""
 
-    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "", *, advice: str = "") -> None:
+    def __init__(
+        self, endpoints: Sequence[str], seconds: float, reason: str = "", *, advice: str = ""
+    ) -> None:
         self.endpoints = tuple(endpoints)
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
         where = " or ".join(endpoints)
         if advice:
-            super().__init__(f"no Zenoh session at {where} ({tried}): {advice}; run 'nedbus doctor' to check it")
+            super().__init__(
+                f"no Zenoh session at {where} ({tried}): {advice}; run 'nedbus doctor' to check it"
+            )
         elif any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
             advice = reason or (
                 "check that tls_ca signed the router's certificate and tls_certificate, that none of them has expired,"
                 " and that the router's certificate names the host of the endpoint"
             )
-            super().__init__(f"no TLS connection to {where}: {advice}; run 'nedbus doctor' to find the cause")
+            super().__init__(
+                f"no TLS connection to {where}: {advice}; run 'nedbus doctor' to find the cause"
+            )
         else:
             super().__init__(
                 f"nothing answers at {where} ({tried}): start 'nedbus serve' or a Zenoh router there, or name another"
@@ -129,7 +139,9 @@ class NoDataError(NedbusError, TimeoutError):
     """Raised when no message arrives in time."""
 
     def __init__(self, what: str, seconds: float) -> None:
-        super().__init__(f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows the published streams")
+        super().__init__(
+            f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows the published streams"
+        )
 
 
 class PkiError(NedbusError):
@@ -145,8 +157,12 @@ class OutputError(NedbusError, OSError):
             errno.ENOSPC: "free some space, or write to another disk",
             errno.ESTALE: "the written data is lost; write to a folder that is not cleaned up",
         }
-        hint = hints.get(error.errno or 0, "check that its folder exists and is writable by this user")
-        super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")
+        hint = hints.get(
+            error.errno or 0, "check that its folder exists and is writable by this user"
+        )
+        super().__init__(
+            f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}"
+        )
         self.path = path
 
 
@@ -175,7 +191,9 @@ class ReceiveError(NedbusError, RuntimeError):
     """Raised when a subscription ends although neither it nor its bus was closed."""
 
     def __init__(self, what: str, reason: str) -> None:
-        super().__init__(f"{what}: the subscription failed ({reason}); close the bus, then connect and subscribe again")
+        super().__init__(
+            f"{what}: the subscription failed ({reason}); close the bus, then connect and subscribe again"
+        )
 
 
 class ForkError(NedbusError, RuntimeError):

@@ -57,9 +57,13 @@ class EventHistory:
             self._require(name)
         return replace(
             self,
-            events=tuple(each for each in self.events if each.vehicle in (ALL, *selection.vehicles)),
+            events=tuple(
+                each for each in self.events if each.vehicle in (ALL, *selection.vehicles)
+            ),
             reports={name: self.reports[name] for name in selection.vehicles},
-            from_start={name: text for name, text in self.from_start.items() if name in selection.vehicles},
+            from_start={
+                name: text for name, text in self.from_start.items() if name in selection.vehicles
+            },
         )
 
     def why(self, vehicle: str | int, *, at: str | None = None) -> Verdict:
@@ -113,5 +117,7 @@ class EventHistory:
 
 def history_of_services(reports: Collection[AccountReport]) -> EventHistory:
     """Return the history of all services as one; times are Unix times by the clocks of the hosts [s]."""
-    events = sorted((event for report in reports for event in report.events), key=lambda event: event.time)
+    events = sorted(
+        (event for report in reports for event in report.events), key=lambda event: event.time
+    )
     return EventHistory(tuple(events), by_vehicle(reports), Times(is_live=True))

@@ -20,7 +20,9 @@ _Recorded: TypeAlias = str | Path | Sequence[str | Path] | Flight | Iterable[Sam
 
 
 @overload
-def events(source: Bus, *, vehicle: VehicleNames = ..., within: float | None = ...) -> LiveEvents: ...
+def events(
+    source: Bus, *, vehicle: VehicleNames = ..., within: float | None = ...
+) -> LiveEvents: ...
 @overload
 def events(source: _Recorded, *, vehicle: VehicleNames = ...) -> EventHistory: ...
 def events(
@@ -43,11 +45,15 @@ def events(
 
         return LiveEvents(source, selection, within)
     if within is not None:
-        raise ArgumentError("within", within, "None with files and samples, which are read as a whole")
+        raise ArgumentError(
+            "within", within, "None with files and samples, which are read as a whole"
+        )
     return _detect(source).history().of(selection)
 
 
-def why(source: Bus | _Recorded, *, vehicle: VehicleNames = ANY, at: str | None = None) -> dict[str, Verdict]:
+def why(
+    source: Bus | _Recorded, *, vehicle: VehicleNames = ANY, at: str | None = None
+) -> dict[str, Verdict]:
     """Return the verdict on each vehicle, worst first, as `nedbus why` prints it: usable or not, since when, and why.
 
     `source`: as in `events`; from a bus, the services' history of the last day, as `bus.why` for all vehicles.

@@ -10,7 +10,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
 
 from nedbus.endpoints import check_endpoints, dial_endpoint, split_http
@@ -24,20 +32,29 @@ _log = logging.getLogger(__name__)
 __all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source"]
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-_MIN_PREFIX: Final = len("NEDBUS_TLS")  # minimum length of a variable's name to count as a truncated setting
+# minimum length of a variable's name to count as a truncated setting
+_MIN_PREFIX: Final = len("NEDBUS_TLS")
 
 
 def split_sources(value: object) -> object:
     """Split a string at semicolons and line breaks; without any, at commas followed by `KIND:`."""
     if not isinstance(value, str):
         return value
-    parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
+    parts = (
+        re.split(r"[;\n]", value)
+        if re.search(r"[;\n]", value)
+        else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
+    )
     return tuple(part.strip() for part in parts if part.strip())
 
 
 def split_values(value: object) -> object:
     """Split a string at commas."""
-    return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+    return (
+        tuple(part.strip() for part in value.split(",") if part.strip())
+        if isinstance(value, str)
+        else value
+    )
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
@@ -50,7 +67,9 @@ def _checked(check: Callable[[str], object]) -> AfterValidator:
     return AfterValidator(validate)
 
 
-_Endpoint = Annotated[str, _checked(lambda endpoint: check_endpoints((endpoint,), where="endpoint"))]
+_Endpoint = Annotated[
+    str, _checked(lambda endpoint: check_endpoints((endpoint,), where="endpoint"))
+]
 Endpoints = Annotated[tuple[_Endpoint, ...], BeforeValidator(split_values)]
 
 
@@ -63,13 +82,23 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
-    connect: Endpoints = Field((), description="Endpoints of Zenoh routers; the first that answers is used")
-    tls_ca: Path | None = Field(None, description="CA certificate for the routers of tls/ endpoints, PEM")
-    tls_certificate: Path | None = Field(None, description="Certificate that this client presents to routers, PEM")
+    connect: Endpoints = Field(
+        (), description="Endpoints of Zenoh routers; the first that answers is used"
+    )
+    tls_ca: Path | None = Field(
+        None, description="CA certificate for the routers of tls/ endpoints, PEM"
+    )
+    tls_certificate: Path | None = Field(
+        None, description="Certificate that this client presents to routers, PEM"
+    )
     tls_key: Path | None = Field(None, description="Private key of that certificate, PEM")
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
-    router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
-    prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="Prefix of every key expression")
+    router_config: Path | None = Field(
+        None, description="JSON5 configuration of the embedded router"
+    )
+    prefix: Annotated[str, _checked(check_prefix)] = Field(
+        DEFAULT_PREFIX, description="Prefix of every key expression"
+    )
     vehicle: Annotated[str, BeforeValidator(vehicle_name), _checked(check_vehicle)] = Field(
         "1", description="Default vehicle id of sources"
     )
@@ -77,7 +106,8 @@ class Settings(BaseModel):
         (), description="Sources to publish: strings, or TOML tables"
     )
     http: Annotated[str, _checked(split_http)] | None = Field(
-        None, description="HOST:PORT of the HTTP server for /metrics, /healthz, /readyz, /vehicles and /status"
+        None,
+        description="HOST:PORT of the HTTP server for /metrics, /healthz, /readyz, /vehicles and /status",
     )
     until_done: bool = Field(False, description="Exit when every finite source has ended")
 
@@ -114,7 +144,9 @@ class Settings(BaseModel):
         """TLS files for tls/ endpoints; raises ConfigError if some are missing."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
-                raise ConfigError("tls_ca", "a certificate is set, but not the CA to trust; set both")
+                raise ConfigError(
+                    "tls_ca", "a certificate is set, but not the CA to trust; set both"
+                )
             return None
         return Tls(self.tls_ca, self.tls_certificate, self.tls_key)
 
@@ -135,7 +167,11 @@ def load_settings(
 
 
 def load_client_settings(
-    file: str | Path | None, *, connect: str | Sequence[str] | None, prefix: str | None, tls: Tls | None
+    file: str | Path | None,
+    *,
+    connect: str | Sequence[str] | None,
+    prefix: str | None,
+    tls: Tls | None,
 ) -> Settings:
     """Return the settings of a client; with `connect`, settings that a client ignores may be invalid in the file."""
     needed: set[str] | None = None
@@ -156,7 +192,9 @@ def find_mistakes(
     try:
         path = _settings_file(file)
         content = _read_toml(path) if path and needed != set() else {}
-        content = {name: value for name, value in content.items() if needed is None or name in needed}
+        content = {
+            name: value for name, value in content.items() if needed is None or name in needed
+        }
     except ConfigError as exc:
         mistakes.append(exc)
     is_read, details = not mistakes, list[ErrorDetails]()
@@ -168,9 +206,13 @@ def find_mistakes(
         settings = Settings(**_without_mistakes(values, details))
     _warn_about_misspelled_variables()
     settings._file, wrong = path, {str(detail["loc"][0]) for detail in details}
-    settings._set_by.update({name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set})
+    settings._set_by.update(
+        {name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set}
+    )
     mistakes += [_setting_error(settings, detail) for detail in details]
-    settings._left_out = frozenset(wrong if is_read else wrong | (Settings.model_fields.keys() - settings._set_by))
+    settings._left_out = frozenset(
+        wrong if is_read else wrong | (Settings.model_fields.keys() - settings._set_by)
+    )
     return settings, mistakes
 
 
@@ -196,7 +238,9 @@ def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigE
     if settings._file is None or setter != str(settings._file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
     text = _read_text(settings._file)
-    return ConfigError.in_text(settings._file, str(error), text, _find_source(text, settings.source, index, error.key))
+    return ConfigError.in_text(
+        settings._file, str(error), text, _find_source(text, settings.source, index, error.key)
+    )
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
@@ -232,7 +276,9 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
         value = values.get(name)
         items = split_sources(value) if name == "source" else split_values(value)
         if wrong[name] and isinstance(items, list | tuple):
-            valid[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])
+            valid[name] = tuple(
+                item for index, item in enumerate(items) if index not in wrong[name]
+            )
         else:
             valid[name] = Settings.model_fields[name].default
     return valid
@@ -246,10 +292,19 @@ def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
 
 def _warn_about_misspelled_variables() -> None:
     known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
-    for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
-        longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)
+    for variable in sorted(
+        name for name in os.environ if name.startswith("NEDBUS_") and name not in known
+    ):
+        longer = sorted(
+            name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX
+        )
         if near := longer or difflib.get_close_matches(variable, known, 1, 0.85):
-            _log.warning("ignored variable %s: did you mean %s?", variable, " or ".join(near), extra=about("setting"))
+            _log.warning(
+                "ignored variable %s: did you mean %s?",
+                variable,
+                " or ".join(near),
+                extra=about("setting"),
+            )
 
 
 def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
@@ -269,7 +324,9 @@ def _read_text(path: Path) -> str:
     except UnicodeDecodeError as exc:
         raise ConfigError.in_file(path, "not UTF-8 text") from exc
     except OSError as exc:
-        raise ConfigError.in_file(path, f"cannot be read ({(exc.strerror or str(exc)).lower()})") from exc
+        raise ConfigError.in_file(
+            path, f"cannot be read ({(exc.strerror or str(exc)).lower()})"
+        ) from exc
 
 
 def _read_toml(path: Path) -> dict[str, object]:
@@ -298,10 +355,16 @@ def _find_source(text: str, sources: Sequence[object], index: int, key: str = ""
     if not isinstance(source, str) and index < len(headers):
         start = headers[index].start(1)
         end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
-        option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
+        option = (
+            re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE)
+            if key
+            else None
+        )
         return start + option.start(1) if option else start
     if isinstance(source, str):
-        found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
+        found = [
+            each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)
+        ]
         before = sources[:index].count(source)
         if before < len(found):
             return found[before]

@@ -14,7 +14,8 @@ from tests.waits import DEADLINE
 from .stack import ROOT, Stack
 
 FILES = ("docker-compose.yml", "docker-compose.secure.yml")
-USER = f"{os.getuid() or 1000}:{os.getgid() or 1000}"  # user of the containers, who must own the keys
+# user of the containers, who must own the keys
+USER = f"{os.getuid() or 1000}:{os.getgid() or 1000}"
 
 
 def make_certificates(folder: Path, *names: str) -> None:
@@ -28,15 +29,23 @@ def make_certificates(folder: Path, *names: str) -> None:
 
 def distribute(folder: Path) -> None:
     """Copy the files of each container to its folder with the documented loop; if run as root, chown to uid 1000."""
-    loop = re.search(r"^for name in .*?^done$", (ROOT / "docs" / "security.md").read_text(), re.DOTALL | re.MULTILINE)
+    loop = re.search(
+        r"^for name in .*?^done$",
+        (ROOT / "docs" / "security.md").read_text(),
+        re.DOTALL | re.MULTILINE,
+    )
     assert loop is not None
-    subprocess.run(["bash", "-e", "-c", loop[0].replace("pki/", f"{folder}/")], check=True, timeout=DEADLINE)
+    subprocess.run(
+        ["bash", "-e", "-c", loop[0].replace("pki/", f"{folder}/")], check=True, timeout=DEADLINE
+    )
     if os.getuid() == 0:
         for path in (folder, *folder.rglob("*")):
             os.chown(path, 1000, 1000)
 
 
-def join(stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeout: float = DEADLINE) -> nedbus.Bus:
+def join(
+    stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeout: float = DEADLINE
+) -> nedbus.Bus:
     """Connect from the host with the certificate `name`; None: without a certificate."""
     own, key = (None, None) if name is None else (pki / f"{name}.crt", pki / f"{name}.key")
     endpoint = f"tls/{stack.address}"

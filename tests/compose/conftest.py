@@ -26,7 +26,13 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker builds, the others use its images
         Stack("build", tmp_path_factory.mktemp("build")).compose("build")
         if ENVIRONMENT.get("NEDBUS_ROUTER_IMAGE") == SUBSTITUTE_ROUTER:
-            docker("build", "--quiet", "--tag", SUBSTITUTE_ROUTER, str(ROOT / "tests" / "compose" / "router"))
+            docker(
+                "build",
+                "--quiet",
+                "--tag",
+                SUBSTITUTE_ROUTER,
+                str(ROOT / "tests" / "compose" / "router"),
+            )
 
 
 @pytest.fixture

@@ -16,7 +16,12 @@ from .stack import DEADLINE, ENVIRONMENT, ROOT, docker
 IMAGE = "nedbus-systemd"
 # Privileges that systemd needs to create namespaces for services; devices and processes of the host stay hidden.
 PRIVILEGES = (
-    *("--cgroupns=private", "--cap-add=SYS_ADMIN", "--cap-add=SYS_PTRACE", "--security-opt=seccomp=unconfined"),
+    *(
+        "--cgroupns=private",
+        "--cap-add=SYS_ADMIN",
+        "--cap-add=SYS_PTRACE",
+        "--security-opt=seccomp=unconfined",
+    ),
     *("--security-opt=apparmor=unconfined", "--security-opt=systempaths=unconfined"),
     *("--tmpfs=/run", "--tmpfs=/run/lock", "--tmpfs=/tmp"),
 )
@@ -28,14 +33,24 @@ class Machine:
     def __init__(self) -> None:
         base = ENVIRONMENT.get("NEDBUS_BASE_IMAGE")
         build_arg = ("--build-arg", f"NEDBUS_BASE_IMAGE={base}") if base else ()
-        docker("build", "--quiet", "--tag", IMAGE, *build_arg, str(ROOT / "tests" / "compose" / "systemd"))
+        docker(
+            "build",
+            "--quiet",
+            "--tag",
+            IMAGE,
+            *build_arg,
+            str(ROOT / "tests" / "compose" / "systemd"),
+        )
         self.name = f"nedbus-test-{os.getpid()}-systemd"
         docker("run", "--detach", "--name", self.name, *PRIVILEGES, IMAGE)
 
     def wait_until_booted(self) -> None:
         """Wait for the end of the boot; skip the test if systemd cannot run here, or fail if Docker is required."""
         try:
-            wait_for(lambda: self.call("systemctl is-system-running").stdout.strip() == "running", what="the boot")
+            wait_for(
+                lambda: self.call("systemctl is-system-running").stdout.strip() == "running",
+                what="the boot",
+            )
         except AssertionError as exc:
             failed = self.call("systemctl list-units --failed --no-pager")
             reason = f"systemd does not run in a container here: {exc}: {failed.stdout}{failed.stderr}{self._logs()}"
@@ -46,12 +61,16 @@ class Machine:
     def call(self, command: str) -> subprocess.CompletedProcess[str]:
         """Run a shell command as root and return the completed process."""
         full = ["docker", "exec", self.name, "sh", "-c", command]
-        return subprocess.run(full, capture_output=True, text=True, timeout=DEADLINE, env=ENVIRONMENT, check=False)
+        return subprocess.run(
+            full, capture_output=True, text=True, timeout=DEADLINE, env=ENVIRONMENT, check=False
+        )
 
     def run(self, command: str) -> str:
         """Run a shell command as root and return its stdout; fail with its output and the journal."""
         done = self.call(command)
-        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}{self.call('journalctl -n 30').stdout}"
+        assert done.returncode == 0, (
+            f"{command}\n{done.stdout}{done.stderr}{self.call('journalctl -n 30').stdout}"
+        )
         return done.stdout
 
     def copy(self, file: Path, where: str) -> None:
@@ -84,6 +103,10 @@ class Machine:
 
     def _logs(self) -> str:
         done = subprocess.run(
-            ["docker", "logs", self.name], capture_output=True, text=True, env=ENVIRONMENT, check=False
+            ["docker", "logs", self.name],
+            capture_output=True,
+            text=True,
+            env=ENVIRONMENT,
+            check=False,
         )
         return done.stdout + done.stderr

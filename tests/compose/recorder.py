@@ -33,7 +33,11 @@ class Recorder:
     def wait_for_more(self, count: int, *, seconds: float = DEADLINE) -> float:
         """Wait for `count` new samples, and return the duration [s]."""
         start, before = time.monotonic(), len(self.samples)
-        wait_for(lambda: len(self.samples) >= before + count, what=f"{count} more samples", seconds=seconds)
+        wait_for(
+            lambda: len(self.samples) >= before + count,
+            what=f"{count} more samples",
+            seconds=seconds,
+        )
         return time.monotonic() - start
 
     def of(self, address: Address) -> list[nedbus.Sample[Any]]:

@@ -17,7 +17,8 @@ from tests.peers.processes import Process
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = dict(os.environ)  # before any test changes it: NEDBUS_BASE_IMAGE, NEDBUS_ROUTER_IMAGE
-SUBSTITUTE_ROUTER = "nedbus-router"  # router image built by the tests, if the official one cannot be pulled
+# router image built by the tests, if the official one cannot be pulled
+SUBSTITUTE_ROUTER = "nedbus-router"
 DEADLINE = 300.0  # timeout of one Docker command [s]
 
 
@@ -53,14 +54,22 @@ class Stack:
     `files`: relative to the repository; paths in them are relative to `directory`.
     """
 
-    def __init__(self, name: str, where: Path, *files: str, directory: Path = ROOT, **environment: str) -> None:
+    def __init__(
+        self, name: str, where: Path, *files: str, directory: Path = ROOT, **environment: str
+    ) -> None:
         self.name = f"nedbus-test-{os.getpid()}-{name}"
         self.address = free_endpoint().removeprefix("tcp/")
         self._where = where
         self._runs: list[Process] = []
         self._environment = ENVIRONMENT | {"NEDBUS_PUBLISH": self.address, **environment}
         chosen = files or ("docker-compose.yml",)
-        self._command = [*find_compose(), "--project-name", self.name, "--project-directory", str(directory)]
+        self._command = [
+            *find_compose(),
+            "--project-name",
+            self.name,
+            "--project-directory",
+            str(directory),
+        ]
         for file in chosen:
             self._command += ["--file", str(ROOT / file)]
 
@@ -82,7 +91,9 @@ class Stack:
         where = self._where / f"{self.name}-{len(self._runs)}"
         where.mkdir()
         flags = ("--rm", "--no-deps", "--no-TTY", *options)
-        self._runs.append(Process([*self._command, "run", *flags, service, *arguments], where, self._environment))
+        self._runs.append(
+            Process([*self._command, "run", *flags, service, *arguments], where, self._environment)
+        )
         return self._runs[-1]
 
     def container(self, service: str) -> str:
@@ -117,7 +128,13 @@ class Stack:
 
 def _run(command: list[str], environment: dict[str, str]) -> str:
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=DEADLINE, env=environment, cwd=ROOT, check=False
+        command,
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+        env=environment,
+        cwd=ROOT,
+        check=False,
     )
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}{done.stderr}"
     return done.stdout

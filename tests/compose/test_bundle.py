@@ -48,12 +48,20 @@ def restart_router(stack: Stack) -> None:
 def router_certificate(stack: Stack, pki: Path) -> str:
     """Return the certificate that the router presents, as PEM."""
     host, port = stack.address.split(":")
-    presented = ssl.get_server_certificate((host, int(port)), ca_certs=str(pki / "ca.crt"), timeout=DEADLINE)
+    presented = ssl.get_server_certificate(
+        (host, int(port)), ca_certs=str(pki / "ca.crt"), timeout=DEADLINE
+    )
     return presented.strip()
 
 
 def test_bundle_is_denied_until_access_rules_name_its_vehicle(
-    make_stack: StartStack, run_nedbus: Start, secure: Stack, pki: Path, tmp_path: Path, *, record: Record
+    make_stack: StartStack,
+    run_nedbus: Start,
+    secure: Stack,
+    pki: Path,
+    tmp_path: Path,
+    *,
+    record: Record,
 ) -> None:
     """A bundle started as in its README.txt is denied until the router's access rules name its vehicle."""
     rules = tmp_path / "config" / "router-secure.json5"
@@ -67,9 +75,13 @@ def test_bundle_is_denied_until_access_rules_name_its_vehicle(
     for vehicle in ("wing", "stranger"):
         folder = tmp_path / vehicle
         router = f"tls/{secure.address}"
-        pki_command("enroll", str(pki), vehicle, "--router", router, "-o", str(folder), "-s", "sim:")
+        pki_command(
+            "enroll", str(pki), vehicle, "--router", router, "-o", str(folder), "-s", "sim:"
+        )
         command = re.findall(
-            r"^ {7}(echo .* > \.env)\n {7}docker compose up -d$", (folder / "README.txt").read_text(), re.MULTILINE
+            r"^ {7}(echo .* > \.env)\n {7}docker compose up -d$",
+            (folder / "README.txt").read_text(),
+            re.MULTILINE,
         )
         subprocess.run(["bash", "-c", *command], cwd=folder, check=True, timeout=DEADLINE)
         status[vehicle] = free_endpoint().removeprefix("tcp/")
@@ -91,7 +103,10 @@ def test_bundle_is_denied_until_access_rules_name_its_vehicle(
 
     pki_command("rules", str(rules), "--add", "stranger")
     restart_router(secure)
-    wait_for(lambda: {sample.vehicle for sample in list(recorder.samples)} == {"wing", "stranger"}, what="both")
+    wait_for(
+        lambda: {sample.vehicle for sample in list(recorder.samples)} == {"wing", "stranger"},
+        what="both",
+    )
     recorder.wait_for_more(100)
     assert recorder.subscription.counts.lost == 0
 
@@ -108,11 +123,15 @@ def published(address: str) -> float:
             text = page.read().decode()
     except OSError:
         return 0.0
-    counts = re.findall(rf'^nedbus_messages_published_total{{.*topic="{VLP}".*}} (\S+)$', text, re.MULTILINE)
+    counts = re.findall(
+        rf'^nedbus_messages_published_total{{.*topic="{VLP}".*}} (\S+)$', text, re.MULTILINE
+    )
     return sum(map(float, counts))
 
 
-def test_renewed_certificates_are_used(run_nedbus: Start, secure: Stack, pki: Path, record: Record) -> None:
+def test_renewed_certificates_are_used(
+    run_nedbus: Start, secure: Stack, pki: Path, record: Record
+) -> None:
     """Renewed certificates, copied as documented, reach the containers; the restarted router presents the new one."""
     secure.up()
     recorder = record(join(secure, pki, "reader").subscribe(VLP, mode="every"))

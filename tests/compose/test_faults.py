@@ -18,7 +18,8 @@ from .stack import docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-RECOVERY = 10.0  # limit from the return of the network to new data [s]; measured: 0.5 to 2, and 3.4 on a busy machine
+# limit from the return of the network to new data [s]; measured: 0.5 to 2, and 3.4 on a busy machine
+RECOVERY = 10.0
 OUTAGE = 10.0  # duration of a link outage [s]
 LEASE = 5.0  # silence after which Zenoh closes a link [s]
 MINE = Address("1", VLP)
@@ -57,7 +58,9 @@ def test_clients_recover_from_router_restart(make_stack: StartStack, record: Rec
         every.wait_for_more(1000)  # about 400 of them sent during the outage
         latest.wait_for_more(100)
         stack.compose("stop", "service")
-        wait_for(lambda: every.samples[-1].message == latest.samples[-1].message, what="the last message")
+        wait_for(
+            lambda: every.samples[-1].message == latest.samples[-1].message, what="the last message"
+        )
         for recorder in (every, latest):
             assert first_after(recorder.samples, restart).received - back < RECOVERY * 1e9
         flight = Flight()
@@ -75,25 +78,38 @@ def test_clients_recover_from_router_restart(make_stack: StartStack, record: Rec
 
 def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Record) -> None:
     """An outage of 10 s loses nothing at 100 Hz; at 400 Hz the cache is too small, and the loss is counted exactly."""
-    stack = make_stack("link", "docker-compose.hosts.yml", NEDBUS_SOURCE="sim:,sim:?vehicle=2&speed=4")
+    stack = make_stack(
+        "link", "docker-compose.hosts.yml", NEDBUS_SOURCE="sim:,sim:?vehicle=2&speed=4"
+    )
     stack.up()
     fast = Address("2", VLP)
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
         every = record(bus.subscribe(VLP, mode="every"))
         latest = record(bus.subscribe(VLP))
-        wait_for(lambda: every.of(MINE) and every.of(fast) and latest.of(MINE), what="both vehicles")
+        wait_for(
+            lambda: every.of(MINE) and every.of(fast) and latest.of(MINE), what="both vehicles"
+        )
         every.wait_for_more(500)
         link, router = stack.network("link"), stack.container("vehicle-router")
         docker("network", "disconnect", link, router)
         time.sleep(OUTAGE)
-        wait_for(lambda: bus.vehicles() == {}, what="the end of the lease, after which the remote vehicles are gone")
+        wait_for(
+            lambda: bus.vehicles() == {},
+            what="the end of the lease, after which the remote vehicles are gone",
+        )
         restored = time.time_ns()
         docker("network", "connect", link, router)
         latest.wait_for_more(500)
         every.wait_for_more(10_000)  # about 5,000 of them sent during the outage
         stack.compose("stop", "service")
-        wait_for(lambda: every.of(MINE)[-1].message == latest.of(MINE)[-1].message, what="the last message")
-        wait_for(lambda: every.of(fast)[-1].message == latest.of(fast)[-1].message, what="the last message")
+        wait_for(
+            lambda: every.of(MINE)[-1].message == latest.of(MINE)[-1].message,
+            what="the last message",
+        )
+        wait_for(
+            lambda: every.of(fast)[-1].message == latest.of(fast)[-1].message,
+            what="the last message",
+        )
         assert first_after(latest.samples, restored).received - restored < RECOVERY * 1e9
         assert first_after(every.samples, restored).received - restored < RECOVERY * 1e9
         assert sent(first_after(latest.of(MINE), restored)) > restored
@@ -181,8 +197,15 @@ def test_stuck_reader_does_not_affect_others(make_stack: StartStack, record: Rec
         assert publisher.wait(180.0) == 0, publisher.err
         result = json.loads(publisher.out)
         assert result["count"] > 10_000
-        assert result["blocked"] < 1.0, "a subscriber that delays the publisher would do so for most of the 60 s"
-        wait_for(lambda: healthy.samples[-1].message.timestamp == result["count"], what="the last message")
+        assert result["blocked"] < 1.0, (
+            "a subscriber that delays the publisher would do so for most of the 60 s"
+        )
+        wait_for(
+            lambda: healthy.samples[-1].message.timestamp == result["count"],
+            what="the last message",
+        )
         assert healthy.subscription.counts == nedbus.Counts(received=result["count"])
-        assert [sample.message.timestamp for sample in healthy.samples] == list(range(1, result["count"] + 1))
+        assert [sample.message.timestamp for sample in healthy.samples] == list(
+            range(1, result["count"] + 1)
+        )
     assert stuck.popen.poll() is None

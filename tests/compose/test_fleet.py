@@ -41,11 +41,14 @@ class Fleet:
         self.endpoints = endpoints
         stack.up(*endpoints)
         buses = {
-            name: closing.enter_context(nedbus.connect(where, timeout=DEADLINE)) for name, where in endpoints.items()
+            name: closing.enter_context(nedbus.connect(where, timeout=DEADLINE))
+            for name, where in endpoints.items()
         }
         stack.up(*VEHICLES)
         self.cloud = buses["cloud"]
-        self.readers = {name: Recorder(bus.subscribe(VLP, mode="every")) for name, bus in buses.items()}
+        self.readers = {
+            name: Recorder(bus.subscribe(VLP, mode="every")) for name, bus in buses.items()
+        }
         self.thin = Recorder(self.cloud.subscribe(VLP, mode="every", max_rate=5))
         for reader in (*self.readers.values(), self.thin):
             closing.callback(reader.close)
@@ -68,7 +71,10 @@ class Fleet:
         now = time.time_ns()
         for router in routers:
             samples = self.readers[router].samples
-            wait_for(partial(_have_new_messages, samples, len(samples), now), what=f"all vehicles at {router}")
+            wait_for(
+                partial(_have_new_messages, samples, len(samples), now),
+                what=f"all vehicles at {router}",
+            )
 
     def end(self) -> None:
         """Stop the vehicles, and wait until all recorders have their last messages."""
@@ -81,7 +87,9 @@ class Fleet:
 
 
 def _have_new_messages(samples: list[nedbus.Sample], start: int, moment: int) -> bool:
-    counts = Counter(each.address for each in samples[start:] if each.sent is not None and each.sent > moment)
+    counts = Counter(
+        each.address for each in samples[start:] if each.sent is not None and each.sent > moment
+    )
     return all(counts[address] >= 100 for address in ALL)
 
 
@@ -94,8 +102,13 @@ def flight_of(address: Address) -> Flight:
 def fleet(make_stack: StartStack) -> Iterator[Fleet]:
     """Start the fleet of docker-compose.fleet.yml."""
     ports = {"base-a": free_endpoint(), "base-b": free_endpoint()}
-    published = {f"NEDBUS_PUBLISH_{name[-1].upper()}": where.removeprefix("tcp/") for name, where in ports.items()}
-    stack = make_stack("fleet", "docker-compose.fleet.yml", "tests/compose/fleet-ports.yml", **published)
+    published = {
+        f"NEDBUS_PUBLISH_{name[-1].upper()}": where.removeprefix("tcp/")
+        for name, where in ports.items()
+    }
+    stack = make_stack(
+        "fleet", "docker-compose.fleet.yml", "tests/compose/fleet-ports.yml", **published
+    )
     with ExitStack() as closing:
         yield Fleet(stack, {"cloud": stack.endpoint, **ports}, closing)
 
@@ -131,10 +144,18 @@ def test_router_and_radio_failures_lose_no_messages(fleet: Fleet) -> None:
             arrived = indices(samples, flight_of(address))
             assert arrived == sorted({*arrived}), f"{address} at {name}"
             lost += missing(arrived)
-            pause = max(pause, *(after.received - before.received for before, after in itertools.pairwise(samples)))
+            pause = max(
+                pause,
+                *(
+                    after.received - before.received
+                    for before, after in itertools.pairwise(samples)
+                ),
+            )
         assert lost == reader.subscription.counts.lost, name
         # On a busy machine a change of routers may take longer than publishers cache their messages.
-        assert lost == 0 or pause > 1e9 * TIMINGS.retransmit_timeout / 2, f"{lost} at {name}, {pause / 1e9} s"
+        assert lost == 0 or pause > 1e9 * TIMINGS.retransmit_timeout / 2, (
+            f"{lost} at {name}, {pause / 1e9} s"
+        )
     for address, samples in thinned.items():
         kept = indices(samples, flight_of(address))
         assert statistics.median(after - before for before, after in itertools.pairwise(kept)) == 20

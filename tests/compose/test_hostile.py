@@ -60,19 +60,31 @@ def test_invalid_input_is_counted_and_dropped(make_stack: StartStack, record: Re
             session = hostile._session
             for payload in malformed(1000):
                 session.put(f"nedbus/1/{VLP}", payload, congestion_control=BLOCK)
-            for key in (f"nedbus/*/{VLP}", "nedbus/1/*", "nedbus/**", "nedbus/1/no_such_topic", f"nedbus/1/{VLP}/0"):
+            for key in (
+                f"nedbus/*/{VLP}",
+                "nedbus/1/*",
+                "nedbus/**",
+                "nedbus/1/no_such_topic",
+                f"nedbus/1/{VLP}/0",
+            ):
                 session.put(key, encode(message(1)), congestion_control=BLOCK)
             session.delete(f"nedbus/1/{VLP}", congestion_control=BLOCK)
             token = session.liveliness().declare_token("nedbus/no vehicle/@alive/1a/nothing")
-            wait_for(lambda: reader.subscription.counts.invalid == 1006, what="1,006 invalid messages")
+            wait_for(
+                lambda: reader.subscription.counts.invalid == 1006, what="1,006 invalid messages"
+            )
             assert list(bus.vehicles()) == ["1"]
             token.undeclare()
         with nedbus.connect(stack.endpoint, timeout=DEADLINE) as hostile:
             hostile._session.put(f"nedbus/1/{VLP}", b"\xc0" * 10_000_000, congestion_control=BLOCK)
             reader.wait_for_more(500)
-        assert reader.subscription.counts == nedbus.Counts(received=len(reader.samples), invalid=1006)
+        assert reader.subscription.counts == nedbus.Counts(
+            received=len(reader.samples), invalid=1006
+        )
         assert is_complete(indices(reader.of(Address("1", VLP)), Flight()))
-        assert 500 < latest.subscription.counts.invalid <= 1006, "superseded messages are not validated"
+        assert 500 < latest.subscription.counts.invalid <= 1006, (
+            "superseded messages are not validated"
+        )
         assert {sample.vehicle for sample in reader.samples + latest.samples} == {"1"}
     for service in ("router", "service"):
         container = stack.inspect(service)

@@ -22,7 +22,9 @@ def test_sbom_lists_installed_packages(images: None) -> None:
     """The SBOM lists exactly the packages installed in the image, with versions, and no build tools."""
     sbom = json.loads(run_in_image("cat", "/opt/nedbus/sbom.cdx.json"))
     root = sbom["metadata"]["component"]
-    listed = {each["purl"].removeprefix("pkg:pypi/").partition("?")[0] for each in [*sbom["components"]]}
+    listed = {
+        each["purl"].removeprefix("pkg:pypi/").partition("?")[0] for each in [*sbom["components"]]
+    }
     code = (
         "import importlib.metadata as m, re;"
         "print(*(f\"{re.sub('[-_.]+', '-', each.name).lower()}@{each.version}\" for each in m.distributions()))"

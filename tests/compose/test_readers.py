@@ -18,7 +18,9 @@ from .recorder import Flight, is_complete
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-STREAMS = {Address("1", name, 0 if topic.instances else None) for name, topic in DEFAULT.topics.items()}
+STREAMS = {
+    Address("1", name, 0 if topic.instances else None) for name, topic in DEFAULT.topics.items()
+}
 COUNT = 2000  # samples: about 7 s of all streams
 
 
@@ -38,7 +40,10 @@ def parse(output: str) -> list[tuple[Address, Message]]:
     ("file", "networks"),
     [
         ("docker-compose.yml", {}),
-        ("docker-compose.hosts.yml", {"service": ["vehicle"], "vehicle-router": ["link", "vehicle"]}),
+        (
+            "docker-compose.hosts.yml",
+            {"service": ["vehicle"], "vehicle-router": ["link", "vehicle"]},
+        ),
     ],
 )
 def test_host_and_container_receive_all_messages(
@@ -50,8 +55,13 @@ def test_host_and_container_receive_all_messages(
     """
     stack = make_stack("readers", file)
     stack.up()
-    echo = stack.run("subscriber", "echo", "*", "--every", "--wait", "--json", "--count", str(COUNT))
-    with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus, bus.subscribe("*", mode="every") as subscription:
+    echo = stack.run(
+        "subscriber", "echo", "*", "--every", "--wait", "--json", "--count", str(COUNT)
+    )
+    with (
+        nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus,
+        bus.subscribe("*", mode="every") as subscription,
+    ):
         samples = [subscription.receive(DEADLINE) for _ in range(COUNT)]
         assert subscription.counts == nedbus.Counts(received=COUNT)
     assert echo.wait() == 0, echo.err
@@ -63,7 +73,9 @@ def test_host_and_container_receive_all_messages(
         assert set(indices) >= STREAMS
         assert all(map(is_complete, indices.values()))
     for service, names in networks.items():
-        assert sorted(stack.inspect(service)["NetworkSettings"]["Networks"]) == sorted(map(stack.network, names))
+        assert sorted(stack.inspect(service)["NetworkSettings"]["Networks"]) == sorted(
+            map(stack.network, names)
+        )
     stack.compose("stop", "service")
     assert stack.inspect("service")["State"]["ExitCode"] == 0
 
@@ -95,16 +107,27 @@ def read_page(address: str) -> bytes:
 
 def test_compose_up_shows_data(make_stack: StartStack) -> None:
     """The service logs its progress and the demo prints messages; the service runs unprivileged and is healthy."""
-    stack = make_stack("up", "docker-compose.yml", "tests/compose/quick-health.yml", NEDBUS_WEB="127.0.0.1:0")
+    stack = make_stack(
+        "up", "docker-compose.yml", "tests/compose/quick-health.yml", NEDBUS_WEB="127.0.0.1:0"
+    )
     stack.compose("--profile", "demo", "up", "--detach", "--no-build")
-    wait_for(lambda: " messages, " in stack.compose("logs", "service"), what="a count in the service's log", seconds=60)
-    wait_for(lambda: stack.compose("logs", "subscriber").count(" ned ") > 5, what="messages in the subscriber's log")
+    wait_for(
+        lambda: " messages, " in stack.compose("logs", "service"),
+        what="a count in the service's log",
+        seconds=60,
+    )
+    wait_for(
+        lambda: stack.compose("logs", "subscriber").count(" ned ") > 5,
+        what="messages in the subscriber's log",
+    )
     wait_for(lambda: stack.health("service") == "healthy", what="health", seconds=60)
     assert stack.compose("exec", "--no-TTY", "service", "id", "-un").strip() == "nedbus"
     page = stack.compose("port", "web", "8420").strip()
     wait_for(lambda: b"static/js/bokeh" in read_page(page), what="the page", seconds=60)
     stack.compose("kill", "router")
-    wait_for(lambda: stack.health("service") == "unhealthy", what="the failed health check", seconds=120)
+    wait_for(
+        lambda: stack.health("service") == "unhealthy", what="the failed health check", seconds=120
+    )
 
 
 def test_router_options_exist_in_zenohd(make_stack: StartStack) -> None:

@@ -70,7 +70,8 @@ def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, n
         for vehicle in ("1", "3"):
             with pytest.raises(nedbus.errors.RefusedError, match=f"vehicle {vehicle}"):
                 intruder.publisher(VLP, vehicle=vehicle)
-            publisher = intruder._publishers.publisher(Address(vehicle, VLP))  # without asking the router
+            # without asking the router
+            publisher = intruder._publishers.publisher(Address(vehicle, VLP))
             for timestamp in range(1, 100):
                 publisher.publish(message(timestamp))
         intruder._session.put("nedbus/@rejected/1/vehicle_local_position", b"{}")
@@ -91,20 +92,31 @@ def test_certificate_cannot_publish_another_vehicle(secure: Stack, reader: Recor
 
 @pytest.mark.parametrize(
     ("ca", "certificate"),
-    [("ca.crt", None), ("ca.crt", "foreign/vehicle-1"), ("foreign/ca.crt", "vehicle-1"), ("ca.crt", "expired")],
+    [
+        ("ca.crt", None),
+        ("ca.crt", "foreign/vehicle-1"),
+        ("foreign/ca.crt", "vehicle-1"),
+        ("ca.crt", "expired"),
+    ],
     ids=["no certificate", "foreign certificate", "foreign authority", "expired certificate"],
 )
 def test_invalid_certificates_are_refused(
     secure: Stack, pki: Path, reader: Recorder, ca: str, certificate: str | None
 ) -> None:
     """Without a valid certificate no session opens, on the host and in a container, and the error names the reason."""
-    with pytest.raises(nedbus.ConnectError, match=r"^no TLS connection to tls/.*(no certificate|signed|expired)"):
+    with pytest.raises(
+        nedbus.ConnectError, match=r"^no TLS connection to tls/.*(no certificate|signed|expired)"
+    ):
         join(secure, pki, certificate, ca=ca, timeout=1.0)
-    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]  # mounted over a file of the container's folder
+    # mounted over a file of the container's folder
+    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]
     if certificate is None:
         volumes += ["--env=NEDBUS_TLS_CERTIFICATE=", "--env=NEDBUS_TLS_KEY="]
     else:
-        volumes += [f"--volume={pki / certificate}.{kind}:/etc/nedbus/pki/reader.{kind}:ro" for kind in ("crt", "key")]
+        volumes += [
+            f"--volume={pki / certificate}.{kind}:/etc/nedbus/pki/reader.{kind}:ro"
+            for kind in ("crt", "key")
+        ]
     echo = secure.run("subscriber", "echo", "--count", "1", options=tuple(volumes))
     assert echo.wait(60.0) == 1, echo.out
     assert "no TLS connection to tls/" in echo.err
@@ -162,7 +174,10 @@ def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Record
     listener = secure.run("subscriber", "-c", PEER, "reader", "0", options=run)
     wait_for(lambda: "ready" in listener.out, what=f"the listening peer {listener.err}")
     for name in ("vehicle-2", "nobody"):
-        own = tuple(f"--volume={pki}/vehicle-2.{kind}:/etc/nedbus/pki/reader.{kind}:ro" for kind in ("crt", "key"))
+        own = tuple(
+            f"--volume={pki}/vehicle-2.{kind}:/etc/nedbus/pki/reader.{kind}:ro"
+            for kind in ("crt", "key")
+        )
         peer = secure.run("subscriber", "-c", PEER, name, "300", options=(*run, *own))
         assert peer.wait(60.0) == 0, peer.err
         assert '{"genuine": 0, "forged": 300}' in peer.out, "it receives only its own puts"
@@ -175,7 +190,9 @@ def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Record
 def test_only_operators_can_query_the_admin_space(secure: Stack, pki: Path) -> None:
     """The router's admin space answers operators, but not readers."""
     with join(secure, pki, "operator") as operator, join(secure, pki, "reader") as other:
-        wait_for(lambda: [reply.ok for reply in operator._session.get("@/*/router")], what="an answer")
+        wait_for(
+            lambda: [reply.ok for reply in operator._session.get("@/*/router")], what="an answer"
+        )
         assert [reply.ok for reply in other._session.get("@/*/router")] == []
 
 

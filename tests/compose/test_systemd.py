@@ -77,7 +77,9 @@ def installed(images: None) -> Iterator[Machine]:
 def machine(installed: Machine) -> Iterator[Machine]:
     """Return the machine with the service stopped, and restore its installation after the test."""
     yield installed
-    installed.run("systemctl stop 'nedbus*' 'vehicle*'; rm -rf /etc/systemd/system/nedbus.service.d; true")
+    installed.run(
+        "systemctl stop 'nedbus*' 'vehicle*'; rm -rf /etc/systemd/system/nedbus.service.d; true"
+    )
     installed.run("systemctl daemon-reload; systemctl reset-failed")
     installed.run(f"install -g nedbus -m 640 /root/nedbus.toml {CONFIG}")
 
@@ -103,7 +105,10 @@ def assert_receives(machine: Machine, vehicle: str = "1", options: str = "") -> 
 def wait_for_restart(machine: Machine, process: str) -> None:
     """Wait until the service is active again in a new process."""
     wait_for(
-        lambda: machine.property("MainPID") not in {"0", process} and machine.property("ActiveState") == "active",
+        lambda: (
+            machine.property("MainPID") not in {"0", process}
+            and machine.property("ActiveState") == "active"
+        ),
         what="a new process",
     )
 
@@ -114,7 +119,10 @@ def test_start_returns_when_ready(machine: Machine) -> None:
         machine.run(f"systemctl stop nedbus && systemctl start nedbus && {DIAL}")
     assert_receives(machine)
     assert "1 source, " in machine.property("StatusText")
-    assert machine.run("ps -o user= -p $(systemctl show --value -p MainPID nedbus)").strip() == "nedbus"
+    assert (
+        machine.run("ps -o user= -p $(systemctl show --value -p MainPID nedbus)").strip()
+        == "nedbus"
+    )
 
 
 def test_enabled_service_starts_at_boot(machine: Machine) -> None:
@@ -165,7 +173,10 @@ def test_reload_starts_and_stops_sources(machine: Machine) -> None:
     assert machine.call("systemctl reload nedbus").returncode != 0
     assert f"{CONFIG}, line 1, column " in machine.journal()
     machine.run("systemctl kill --kill-who=main --signal=HUP nedbus")
-    wait_for(lambda: "configuration rejected" in machine.property("StatusText"), what="the reason in the status")
+    wait_for(
+        lambda: "configuration rejected" in machine.property("StatusText"),
+        what="the reason in the status",
+    )
     assert CONFIG in machine.property("StatusText")
     assert machine.property("ActiveState") == "active"
     assert_receives(machine, "wing")
@@ -214,7 +225,9 @@ def test_mavlink_over_udp_works_in_hardened_unit(machine: Machine) -> None:
 
 def test_mavlink_over_serial_port_works_with_drop_in(machine: Machine) -> None:
     """With the documented drop-in the service reads a serial port, here a pseudo-terminal."""
-    addition = (ROOT / "docs" / "systemd.md").read_text().split("```ini\n[Service]\n")[1].split("```")[0]
+    addition = (
+        (ROOT / "docs" / "systemd.md").read_text().split("```ini\n[Service]\n")[1].split("```")[0]
+    )
     configure(machine, 'source = ["mavlink:serial:/dev/ttyACM0"]\n')
     extend(machine, addition)
     machine.run("systemctl start nedbus")
@@ -234,24 +247,33 @@ def test_bundle_is_installed_with_readme_commands(machine: Machine, tmp_path: Pa
     make_bundle(tmp_path, "wing", tmp_path / "bundle", routers=[ROUTER], sources=["sim:"])
     machine.run("rm -rf /root/pki")
     machine.copy(tmp_path, "/root/pki")
-    machine.run("cd /root/pki && install -g nedbus -m 640 ca.crt router.crt router.key /etc/nedbus/")
+    machine.run(
+        "cd /root/pki && install -g nedbus -m 640 ca.crt router.crt router.key /etc/nedbus/"
+    )
     machine.write(ROUTER_FILE, "/etc/nedbus/router.json5")
     configure(machine, SIMULATION + 'router_config = "router.json5"\n', "router")
     machine.run("systemctl start nedbus@router")
     readme = (tmp_path / "bundle" / "README.txt").read_text()
-    commands = re.findall(r"^ {7}sudo (.*)$", readme.split("With systemd")[1].split("\n3. ")[0], re.MULTILINE)
+    commands = re.findall(
+        r"^ {7}sudo (.*)$", readme.split("With systemd")[1].split("\n3. ")[0], re.MULTILINE
+    )
     assert len(commands) == 5
     for command in commands:
         machine.run(f"cd /root/pki/bundle && {command}")
     assert_receives(machine, "wing", READER)
     for key in ("router.key", "pki/vehicle-wing.key"):
-        assert machine.call(f"setpriv --reuid=65534 --clear-groups cat /etc/nedbus/{key}").returncode != 0
+        assert (
+            machine.call(f"setpriv --reuid=65534 --clear-groups cat /etc/nedbus/{key}").returncode
+            != 0
+        )
 
 
 def test_service_cannot_write_files_or_see_devices(machine: Machine) -> None:
     """The service can write only to its own /tmp, and sees neither home directories nor devices."""
     machine.run("systemctl start nedbus")
     inside = "nsenter --mount --target $(systemctl show --value -p MainPID nedbus)"
-    assert machine.call(f"{inside} touch /etc/nedbus/new /opt/nedbus/new /var/lib/new").returncode != 0
+    assert (
+        machine.call(f"{inside} touch /etc/nedbus/new /opt/nedbus/new /var/lib/new").returncode != 0
+    )
     assert machine.run(f"{inside} ls /root") == ""
     assert not {"mem", "kmsg", "ttyACM0"} & set(machine.run(f"{inside} ls /dev").split())

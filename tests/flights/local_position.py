@@ -93,7 +93,9 @@ def encode_row(values: Sequence[object] | Message, message: type[M] = _DEFAULT) 
     return codec_of(definition_of(message)).encode_row(cast("Sequence[object]", values))
 
 
-def decode_row(payload: bytes, message: type[M] = _DEFAULT, *, newer: NewerLayouts | None = None) -> M:
+def decode_row(
+    payload: bytes, message: type[M] = _DEFAULT, *, newer: NewerLayouts | None = None
+) -> M:
     """Return the message of a payload as a Row, validated as by `decode`."""
     return codec_of(definition_of(message)).decode_row(payload, newer=newer)
 
@@ -118,19 +120,25 @@ def find_layout(names: Iterable[str], message: type[Message] | str = _DEFAULT) -
     return definition_of(message).find_layout(names)
 
 
-def decode_cdr(payload: bytes, *, layout: str, message: type[Message] | str = _DEFAULT) -> dict[str, object]:
+def decode_cdr(
+    payload: bytes, *, layout: str, message: type[Message] | str = _DEFAULT
+) -> dict[str, object]:
     """Decode a CDR payload to fields, in layout order; `layout`: a layout name, or the RIHS01 hash of a ROS 2 type."""
     definition, found = _layout(layout, message)
     return decode_with(definition, payload, found)
 
 
-def encode_cdr(fields: Mapping[str, object], *, layout: str, message: type[Message] | str = _DEFAULT) -> bytes:
+def encode_cdr(
+    fields: Mapping[str, object], *, layout: str, message: type[Message] | str = _DEFAULT
+) -> bytes:
     """Encode the fields of a layout, as returned by `downgrade`, as CDR; `layout`: as in `decode_cdr`."""
     definition, found = _layout(layout, message)
     return encode_with(definition, fields, found)
 
 
-def type_hash(layout: str, *, message: type[Message] | str = _DEFAULT, name: str | None = None) -> str:
+def type_hash(
+    layout: str, *, message: type[Message] | str = _DEFAULT, name: str | None = None
+) -> str:
     """Return the RIHS01 hash of a ROS 2 type with the fields of a layout; `name`: the type, if not that of px4_msgs."""
     definition = definition_of(message)
     return hash_of(definition.layouts[layout], name or ros2_type(definition))
@@ -157,9 +165,15 @@ def layout_table(message: type[Message] | str = _DEFAULT) -> list[dict[str, obje
 def next_release() -> Definition[Any]:
     """Return VehicleLocalPosition of a newer release: with another field at the end, and so with layout number 2."""
     new: Any = (Float32, field("A field that this release does not have"))
-    model = cast("Any", create_model("VehicleLocalPosition", __base__=VehicleLocalPosition, brand_new=new))
+    model = cast(
+        "Any", create_model("VehicleLocalPosition", __base__=VehicleLocalPosition, brand_new=new)
+    )
     *older, last = VehicleLocalPosition.LAYOUTS
-    model.LAYOUTS = (*older, replace(last, text="2.0, without brand_new"), Layout("2.0", "*", wire=2))
+    model.LAYOUTS = (
+        *older,
+        replace(last, text="2.0, without brand_new"),
+        Layout("2.0", "*", wire=2),
+    )
     model.DEFINITION = definition = Definition[Any](model)
     return definition
 
@@ -172,7 +186,9 @@ def _layout(text: str, message: type[Message] | str) -> tuple[Definition[Any], L
     return found
 
 
-def valid_mask(array: MessageArray, message: type[Message] | str = DEFAULT.model) -> npt.NDArray[np.bool_]:
+def valid_mask(
+    array: MessageArray, message: type[Message] | str = DEFAULT.model
+) -> npt.NDArray[np.bool_]:
     """Return a mask of the messages that pass the rules."""
     return arrays_of(definition_of(message)).valid_mask(array)
 

@@ -29,7 +29,11 @@ class Receiver(LogReceiver):
     """The receiver of a link without its thread."""
 
     def __init__(self, options: MavlinkOptions) -> None:
-        self._reader, self._options, self._send = cast("Any", SimpleNamespace(name="udp")), options, self._answer
+        self._reader, self._options, self._send = (
+            cast("Any", SimpleNamespace(name="udp")),
+            options,
+            self._answer,
+        )
         self._sent: list[int] = []  # times in TIMESYNC requests, which the vehicle answers at once
         self.vehicles = {}
 
@@ -48,10 +52,14 @@ class Receiver(LogReceiver):
         return self._process(received)
 
 
-def play(path: Path, options: MavlinkOptions) -> Iterator[tuple[float, SourceMessage | Rejection | None]]:
+def play(
+    path: Path, options: MavlinkOptions
+) -> Iterator[tuple[float, SourceMessage | Rejection | None]]:
     """Yield the items of the source and their times of arrival [s]."""
     session = _LinkSession(
-        cast("Any", SimpleNamespace(send=lambda *_: None, peer=None, baud=None)), options, name="udp"
+        cast("Any", SimpleNamespace(send=lambda *_: None, peer=None, baud=None)),
+        options,
+        name="udp",
     )
     session._receiver = receiver = Receiver(options)
     checked = math.nan
@@ -82,10 +90,16 @@ class Service:
         self.now = self.start = 0.0
         self.event_log = EventLog()
         self.rejected: list[object] = []
-        registry = SimpleNamespace(publisher=self._open, reject=lambda _, report: self.rejected.append(report))
-        self.output = SourceOutput("udp", "mavlink:udp", cast("PublisherRegistry", registry), self._now, self.event_log)
+        registry = SimpleNamespace(
+            publisher=self._open, reject=lambda _, report: self.rejected.append(report)
+        )
+        self.output = SourceOutput(
+            "udp", "mavlink:udp", cast("PublisherRegistry", registry), self._now, self.event_log
+        )
         monkeypatch.setattr(clock, "steady", self._now)
-        self._items = play(path, MavlinkOptions.model_validate({"log": "armed", "state": "0"} | options))
+        self._items = play(
+            path, MavlinkOptions.model_validate({"log": "armed", "state": "0"} | options)
+        )
 
     def run(self, until: float = 1e9) -> Service:
         """Play the recording up to this time [s since its start]."""
@@ -99,7 +113,10 @@ class Service:
                 self.output.expire_stale()
                 alive, healths = {*self.output.addresses}, self.healths
                 mains = [each.main for each in self.event_log.vehicles.values() if each.main]
-                states = {each: stream_state(healths[each], publishers=each in alive).name for each in mains}
+                states = {
+                    each: stream_state(healths[each], publishers=each in alive).name
+                    for each in mains
+                }
                 self.event_log.update(self.now, states, present={each.vehicle for each in alive})
             if self.now - self.start >= until:
                 break

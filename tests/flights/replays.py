@@ -21,7 +21,9 @@ def convert_replay(text: str, path: Path) -> str:
     """Convert a replay source to a recording, as `nedbus convert` does; return its summary."""
     run = open_replay(text)
     source = text.partition(":")[0]
-    return convert(run.messages, path, source=source, boot_utc=run.boot_utc, on_progress=lambda _: None)
+    return convert(
+        run.messages, path, source=source, boot_utc=run.boot_utc, on_progress=lambda _: None
+    )
 
 
 def open_recording(path: str | Path, **options: Any) -> McapReader:

@@ -14,7 +14,13 @@ from tests.flights.local_position import FIELD_TYPES, LAYOUTS, downgrade
 
 LOGS = Path(__file__).parents[3] / "shared" / "data" / "ulog"
 """Real flight logs, for tests marked `logs`."""
-_NAMES = {"uint64": "uint64_t", "uint8": "uint8_t", "bool": "bool", "float32": "float", "float64": "double"}
+_NAMES = {
+    "uint64": "uint64_t",
+    "uint8": "uint8_t",
+    "bool": "bool",
+    "float32": "float",
+    "float64": "double",
+}
 _CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": "d"}
 
 
@@ -28,12 +34,16 @@ def cached_events(log: Path) -> FileEvents:
     return read_file_events(log)
 
 
-def log_messages_in(log: Path | bytes, texts: LogMessageBuilder | None = None) -> list[tuple[int, int, str]]:
+def log_messages_in(
+    log: Path | bytes, texts: LogMessageBuilder | None = None
+) -> list[tuple[int, int, str]]:
     """Return timestamp, severity and text of each log message in a log."""
     parser = UlogParser(verify=True)
     records = [*parser.feed(log if isinstance(log, bytes) else log.read_bytes()), *parser.close()]
     messages = (texts or LogMessageBuilder()).merge(records)
-    found = (each for each in messages if isinstance(each, Data) and each.subscription is LOG_MESSAGE)
+    found = (
+        each for each in messages if isinstance(each, Data) and each.subscription is LOG_MESSAGE
+    )
     return [tuple(LOG_MESSAGE.layout.decode(each.payload).values()) for each in found]
 
 
@@ -42,7 +52,9 @@ class UlogWriter:
 
     def __init__(self, *, layout: str = "1.16", system_id: int | None = 1) -> None:
         fields = LAYOUTS[layout].fields
-        self._fields = sorted(fields, key=lambda name: -struct.calcsize(_CODES[_NAMES[_type(name, FIELD_TYPES)]]))
+        self._fields = sorted(
+            fields, key=lambda name: -struct.calcsize(_CODES[_NAMES[_type(name, FIELD_TYPES)]])
+        )
         self._layout = layout
         self._ids: dict[tuple[str, int], int] = {}
         self.data = bytearray(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0))
@@ -56,11 +68,16 @@ class UlogWriter:
         """Write the format of these topics, omitting the fields in `without`."""
         self._fields = [name for name in self._fields if name not in without]
         for topic in topics:
-            text = "".join(f"{self._field_type(name)} {name};" for name in self._fields) + "uint8_t[3] _padding0;"
+            text = (
+                "".join(f"{self._field_type(name)} {name};" for name in self._fields)
+                + "uint8_t[3] _padding0;"
+            )
             self.put("F", f"{topic}:{text}".encode())
             self._defined.add(topic)
 
-    def add(self, topic: str, message: VehicleLocalPosition, *, instance: int = 0, **raw: object) -> None:
+    def add(
+        self, topic: str, message: VehicleLocalPosition, *, instance: int = 0, **raw: object
+    ) -> None:
         """Write one message; `raw` overrides fields, even with invalid values."""
         if (topic, instance) not in self._ids:
             self._ids[topic, instance] = len(self._ids)
@@ -90,19 +107,27 @@ class UlogWriter:
 
 
 def write_log(
-    path: Path, timestamps: Sequence[int], *, topic: str = "vehicle_local_position", **fields: object
+    path: Path,
+    timestamps: Sequence[int],
+    *,
+    topic: str = "vehicle_local_position",
+    **fields: object,
 ) -> Path:
     """Write a log of one topic with messages at these times [us]; x is their index."""
     writer = UlogWriter()
     writer.define([topic])
     for number, timestamp in enumerate(timestamps):
-        message = VehicleLocalPosition.model_validate({"timestamp": timestamp, "x": float(number), **fields})
+        message = VehicleLocalPosition.model_validate(
+            {"timestamp": timestamp, "x": float(number), **fields}
+        )
         writer.add(topic, message)
     return writer.write(path)
 
 
 def write_raw_log(
-    path: Path, topics: Mapping[str, tuple[str, str]], messages: Iterable[tuple[str, Sequence[object]]]
+    path: Path,
+    topics: Mapping[str, tuple[str, str]],
+    messages: Iterable[tuple[str, Sequence[object]]],
 ) -> Path:
     """Write a log with any topics; `topics`: ULog field list and struct format of each."""
     writer, names = UlogWriter(), list(topics)

@@ -23,7 +23,9 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
 
     def record(descriptor: int) -> None:
         path = Path(f"/proc/self/fd/{descriptor}").readlink()
-        calls.append((path.name, sorted(each.name for each in path.iterdir()) if path.is_dir() else []))
+        calls.append(
+            (path.name, sorted(each.name for each in path.iterdir()) if path.is_dir() else [])
+        )
         fsync(descriptor)
 
     monkeypatch.setattr("os.fsync", record)
@@ -31,7 +33,9 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
 
 
 @pytest.mark.parametrize("replace", [False, True])
-def test_folder_is_synced_after_its_file_is_renamed(tmp_path: Path, synced: Synced, replace: bool) -> None:
+def test_folder_is_synced_after_its_file_is_renamed(
+    tmp_path: Path, synced: Synced, replace: bool
+) -> None:
     with atomic_write(tmp_path / "a.crt", replace=replace) as part:
         part.write_text("a")
     assert [name for name, _ in synced] == [part.name, tmp_path.name]
@@ -47,7 +51,9 @@ def test_replaced_file_is_synced_with_its_folder(tmp_path: Path, synced: Synced)
     assert (tmp_path / "a.crt").read_text() == "new"
 
 
-def test_folder_of_a_new_recording_is_synced_before_the_first_message(tmp_path: Path, synced: Synced) -> None:
+def test_folder_of_a_new_recording_is_synced_before_the_first_message(
+    tmp_path: Path, synced: Synced
+) -> None:
     with RecordingWriter(tmp_path / "a.mcap") as writer:
         assert synced == [("a.mcap", []), (tmp_path.name, ["a.mcap"])]
         write(writer, message(1))

@@ -37,7 +37,13 @@ def log(tmp_path: Path) -> Path:
 def facts_of(events: Iterable[Event]) -> list[tuple[object, ...]]:
     """Return what identifies events and their evidence."""
     return [
-        (event.boot, event.change, event.severity, event.text, [cause.text for cause in event.evidence])
+        (
+            event.boot,
+            event.change,
+            event.severity,
+            event.text,
+            [cause.text for cause in event.evidence],
+        )
         for event in events
     ]
 
@@ -55,13 +61,17 @@ def test_no_public_name_is_that_of_a_module() -> None:
 
 def test_each_source_of_a_flight_has_the_same_events(log: Path) -> None:
     """A path, a list of paths, an open flight and its samples yield the events that `nedbus events` prints."""
-    printed = [json.loads(line) for line in run_command("events", str(log), "--json").out.splitlines()]
+    printed = [
+        json.loads(line) for line in run_command("events", str(log), "--json").out.splitlines()
+    ]
     history = nedbus.events(log)
     events = facts_of(history)
     assert [event[:4] for event in events] == [
         (each["boot"], each["change"], each["severity"], each["text"]) for each in printed
     ]
-    assert [event[4] for event in events] == [[cause["text"] for cause in each["evidence"]] for each in printed]
+    assert [event[4] for event in events] == [
+        [cause["text"] for cause in each["evidence"]] for each in printed
+    ]
     assert facts_of(nedbus.events(str(log))) == events
     assert facts_of(nedbus.events([log])) == events
     with nedbus.open(log) as flight:
@@ -79,7 +89,10 @@ def test_why_is_what_the_command_prints(log: Path) -> None:
     verdict = nedbus.why(log)["1"]
     assert (verdict.vehicle, verdict.text, verdict.usable) == ("1", SHOWN, False)
     (story,) = verdict.stories
-    assert (story.what, verdict.period(story)) == ("xy and vxy not valid", "from 8.000 to 12.000 s since boot (4.0 s)")
+    assert (story.what, verdict.period(story)) == (
+        "xy and vxy not valid",
+        "from 8.000 to 12.000 s since boot (4.0 s)",
+    )
     assert [event.kind for event in verdict.cause] == ["dead_reckoning"]
     assert (verdict.begin and verdict.begin.boot, verdict.end and verdict.end.boot) == (8.0, 12.0)
     with nedbus.open(log) as flight:
@@ -96,12 +109,15 @@ def test_why_is_what_the_command_prints(log: Path) -> None:
 def test_why_of_a_real_flight() -> None:
     """A log of PX4 1.17, its open flight and its samples have one verdict; times are the vehicle's UTC."""
     verdict = nedbus.why(REAL)["1"]
-    assert verdict.text.startswith("not usable: xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s).")
+    assert verdict.text.startswith(
+        "not usable: xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)."
+    )
     with nedbus.open(REAL) as flight:
         assert nedbus.why(flight)["1"].text == verdict.text
         of_samples = nedbus.why(flight("*"))["1"]
     assert (of_samples.usable, of_samples.stories[0].what) == (False, verdict.stories[0].what)
-    assert re.search(r"from 23:09:04\.\d to 23:09:20\.\d UTC \(15.9 s\)", of_samples.text)  # by the log's own UTC
+    # by the log's own UTC
+    assert re.search(r"from 23:09:04\.\d to 23:09:20\.\d UTC \(15.9 s\)", of_samples.text)
 
 
 def test_vehicles_are_selected(tmp_path: Path) -> None:
@@ -129,15 +145,22 @@ def test_invalid_source_raises(log: Path, tmp_path: Path, bus: nedbus.Bus) -> No
         nedbus.events([])
     with pytest.raises(nedbus.SourceError, match="no such file"):
         nedbus.why(tmp_path / "none.ulg")
-    with pytest.raises(nedbus.AddressError, match="vehicle '7' is not in this history: expected one of 1"):
+    with pytest.raises(
+        nedbus.AddressError, match="vehicle '7' is not in this history: expected one of 1"
+    ):
         nedbus.events(log, vehicle="7")
     with pytest.raises(nedbus.AddressError, match="vehicle '7' is not in this history"):
         nedbus.why(log, vehicle="7")
     recorded: Any = log
-    with pytest.raises(nedbus.ArgumentError, match=r"within 5 is not valid: expected None with files"):
+    with pytest.raises(
+        nedbus.ArgumentError, match=r"within 5 is not valid: expected None with files"
+    ):
         nedbus.events(recorded, within=5)
     for at, reason in (("noon", "not a time"), ("12:00", "no message of this vehicle has UTC")):
-        with pytest.raises(nedbus.ArgumentError, match=rf"at '{at}' is not in this data \({reason}\): expected 14:05"):
+        with pytest.raises(
+            nedbus.ArgumentError,
+            match=rf"at '{at}' is not in this data \({reason}\): expected 14:05",
+        ):
             nedbus.why(log, at=at)
     with nedbus.open(log) as flight:
         pass
@@ -202,7 +225,9 @@ def test_live_events_have_their_reason(bus: nedbus.Bus, zenoh_session: Session) 
     assert list(events) == []  # closed
 
 
-def test_verdict_of_a_live_vehicle(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+def test_verdict_of_a_live_vehicle(
+    run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path
+) -> None:
     """`bus.why`, `nedbus.why(bus)` and AsyncBus return the services' verdict; `within` begins with past events."""
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
     printed = run_command("why", "-c", endpoint).out.strip()
@@ -210,7 +235,9 @@ def test_verdict_of_a_live_vehicle(run_nedbus: Start, bus: nedbus.Bus, endpoint:
     assert (f"1: {verdict.text}", verdict.usable) == (printed, True)
     assert verdict.text.startswith("was not usable: xy and vxy not valid from ")
     assert nedbus.why(bus)["1"].text == verdict.text
-    assert [event.text for event in bus.history()] == [event.text for event in bus.history(within=1e6)]
+    assert [event.text for event in bus.history()] == [
+        event.text for event in bus.history(within=1e6)
+    ]
     with nedbus.events(bus, vehicle="1", within=600) as events:
         assert [event.kind for event in events.poll()][:2] == ["dead_reckoning", "xy_invalid"]
 
@@ -225,7 +252,9 @@ def test_documented_alarm_gives_the_reason(
     start: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
 ) -> None:
     """The alarm script of docs/events.md prints a fault of vehicle 7 with its reason."""
-    (script,) = re.findall(r"test_event_sources.py -->\n```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    (script,) = re.findall(
+        r"test_event_sources.py -->\n```python\n(.*?)```", PAGE.read_text(), re.DOTALL
+    )
     assert len([line for line in script.splitlines() if line]) <= 10
     fields: dict[str, object] = VALID | {"dead_reckoning": False}
     with bus.publisher(VLP, vehicle="7") as publisher:

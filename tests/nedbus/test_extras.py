@@ -12,7 +12,10 @@ from nedbus.extras import import_optional
 
 @pytest.mark.parametrize(
     ("extra", "command"),
-    [("mcap", "in a nedbus clone, run pip install -e '.[mcap]'"), ("polars", "run pip install polars")],
+    [
+        ("mcap", "in a nedbus clone, run pip install -e '.[mcap]'"),
+        ("polars", "run pip install polars"),
+    ],
 )
 def test_missing_package_raises_with_install_command(extra: str, command: str) -> None:
     """The error suggests installing from a clone, because another project owns the name nedbus on PyPI."""

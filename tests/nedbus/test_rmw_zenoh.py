@@ -26,7 +26,10 @@ def test_publisher_of_a_program_is_found_by_its_token(bus: nedbus.Bus) -> None:
     with bus.open_session() as session, bus.open_session() as observer, translate_zenoh_errors():
         zid = str(session.info.zid())
         text = key.token("MP", zid, "my_node", 1)
-        tokens = [session.liveliness().declare_token(each) for each in (node_token(0, zid, "my_node"), text)]
+        tokens = [
+            session.liveliness().declare_token(each)
+            for each in (node_token(0, zid, "my_node"), text)
+        ]
         (found,) = token_keys(observer, px4_publishers_key_expr(0), timeout=5.0)
         token = PublisherToken.parse(found)
         assert (token.node, token.key, len(gid_of_token(found))) == ("my_node", key, 16)

@@ -21,28 +21,41 @@ from tests.peers.ports import free_endpoint
 from tests.waits import wait_for
 
 
-def test_flag_overrides_environment_overrides_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flag_overrides_environment_overrides_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A flag overrides an environment variable, which overrides the file; a flag of None is ignored.
 
     Without any setting a client connects to loopback. The error for an invalid variable names the variable.
     """
     settings = load_settings()
     assert settings.routers == ("tcp/127.0.0.1:7447",)
-    assert (settings.prefix, settings.vehicle, settings.source, settings.until_done) == ("nedbus", "1", (), False)
+    assert (settings.prefix, settings.vehicle, settings.source, settings.until_done) == (
+        "nedbus",
+        "1",
+        (),
+        False,
+    )
     file = tmp_path / "other.toml"
     file.write_text('connect = "tcp/file:1"\nprefix = "file"\nvehicle = 5\n')
     assert load_settings(file).connect == ("tcp/file:1",)
     monkeypatch.setenv("NEDBUS_CONNECT", "tcp/env:1, tcp/env:2")
     monkeypatch.setenv("NEDBUS_PREFIX", "env")
     settings = load_settings(file, prefix="flag", connect=None)
-    assert (settings.connect, settings.prefix, settings.vehicle) == (("tcp/env:1", "tcp/env:2"), "flag", "5")
+    assert (settings.connect, settings.prefix, settings.vehicle) == (
+        ("tcp/env:1", "tcp/env:2"),
+        "flag",
+        "5",
+    )
     monkeypatch.setenv("NEDBUS_LISTEN", "here")
     with pytest.raises(ConfigError, match=r"^NEDBUS_LISTEN: 'here' is not an endpoint"):
         load_settings()
 
 
 @pytest.mark.parametrize("is_async", [False, True])
-def test_connect_with_endpoint_ignores_unrelated_settings(tmp_path: Path, endpoint: str, *, is_async: bool) -> None:
+def test_connect_with_endpoint_ignores_unrelated_settings(
+    tmp_path: Path, endpoint: str, *, is_async: bool
+) -> None:
     """With an endpoint, `connect` reads only `prefix` and, for tls/, the TLS files from ./nedbus.toml."""
 
     async def connect_async(where: str | None, prefix: str | None) -> str:
@@ -68,7 +81,9 @@ def test_connect_with_endpoint_ignores_unrelated_settings(tmp_path: Path, endpoi
     assert connect(prefix="other") == "other"
 
 
-def test_settings_file_is_found_by_flag_variable_or_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_file_is_found_by_flag_variable_or_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The settings file is --config, otherwise NEDBUS_CONFIG, otherwise ./nedbus.toml."""
     for name in ("a", "b", "nedbus"):
         (tmp_path / f"{name}.toml").write_text(f'prefix = "{name}"\n')
@@ -83,17 +98,35 @@ def test_settings_file_is_found_by_flag_variable_or_default(tmp_path: Path, monk
     [
         ('connect = ["tcp/a:1"', "line 1, column 21", "Unclosed array"),
         ("vehicle = 1\nx y", "line 2, column 3", "Expected '=' after a key"),
-        ("vehicle = 1\n\n  conect = 3", "line 3, column 3", "unknown setting 'conect': choose from connect,"),
+        (
+            "vehicle = 1\n\n  conect = 3",
+            "line 3, column 3",
+            "unknown setting 'conect': choose from connect,",
+        ),
         ('until_done = "maybe"', "line 1, column 1", "until_done: "),
         ("[source]\na = 1", "line 1, column 2", "source: "),
-        ('{\n  mode: "router",\n  acess_control: {}\n}', "line 3, column 3", "unknown field 'acess_control'"),
-        ('{\n  mode: "routr",\n}', "line 2, column 9", "unknown variant 'routr', expected one of 'router'"),
+        (
+            '{\n  mode: "router",\n  acess_control: {}\n}',
+            "line 3, column 3",
+            "unknown field 'acess_control'",
+        ),
+        (
+            '{\n  mode: "routr",\n}',
+            "line 2, column 9",
+            "unknown variant 'routr', expected one of 'router'",
+        ),
         ('{\n  mode: "router"\n listen: 5}', "line 2, column 9", "expected"),
-        ('{\n  listen: {endpoints: ["foo"]}}', "line 2, column 23", "Endpoints must be of the form"),
+        (
+            '{\n  listen: {endpoints: ["foo"]}}',
+            "line 2, column 23",
+            "Endpoints must be of the form",
+        ),
         ("{ transport: {link: {tls: {bad: 3}}}}", "line 1, column 28", "unknown field 'bad'"),
     ],
 )
-def test_error_in_a_file_has_line_and_column(tmp_path: Path, text: str, position: str, reason: str) -> None:
+def test_error_in_a_file_has_line_and_column(
+    tmp_path: Path, text: str, position: str, reason: str
+) -> None:
     """The error states file, line, column and remedy; for a router file it omits Zenoh's source paths."""
     file = tmp_path / ("router.json5" if text.startswith("{") else "nedbus.toml")
     file.write_text(text)
@@ -103,7 +136,9 @@ def test_error_in_a_file_has_line_and_column(tmp_path: Path, text: str, position
     assert not re.search(r"/root/|\.rs", str(info.value))
 
 
-def test_missing_or_unreadable_settings_file_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_or_unreadable_settings_file_raises(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A missing file, a folder and an unreadable file raise ConfigError with the reason."""
     (tmp_path / "folder.toml").mkdir()
     for name in ("no.toml", "folder.toml"):
@@ -123,7 +158,9 @@ def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     file.write_bytes(b'\xef\xbb\xbfprefix = "own"\n')
     assert load_settings().prefix == "own"
     file.write_bytes(b"\xef\xbb\xbfconect = 3\n")
-    with pytest.raises(ConfigError, match=r"^nedbus\.toml, line 1, column 1: unknown setting 'conect'"):
+    with pytest.raises(
+        ConfigError, match=r"^nedbus\.toml, line 1, column 1: unknown setting 'conect'"
+    ):
         load_settings()
     file.write_text('prefix = "own"\n', encoding="utf-16")
     with pytest.raises(ConfigError, match="not UTF-8 text"):
@@ -139,7 +176,8 @@ def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
         ("NEDBUS_TLS_CERT", "NEDBUS_TLS_CERTIFICATE"),
         ("NEDBUS_TLS_K", "NEDBUS_TLS_KEY"),
         ("NEDBUS_TLS", "NEDBUS_TLS_CA or NEDBUS_TLS_CERTIFICATE or NEDBUS_TLS_KEY"),
-        *((f"NEDBUS_{name}", None) for name in ("PUBLISH", "ROUTER_IMAGE", "PKI")),  # variables of the compose files
+        # variables of the compose files
+        *((f"NEDBUS_{name}", None) for name in ("PUBLISH", "ROUTER_IMAGE", "PKI")),
     ],
 )
 def test_misspelled_variable_is_reported(
@@ -148,7 +186,9 @@ def test_misspelled_variable_is_reported(
     """A NEDBUS_ variable similar to a setting, or a truncated setting, causes a warning; other variables do not."""
     monkeypatch.setenv(name, "x")
     load_settings()
-    assert caplog.messages == [f"ignored variable {name}: did you mean {meant}?"] * (meant is not None)
+    assert caplog.messages == [f"ignored variable {name}: did you mean {meant}?"] * (
+        meant is not None
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,14 +196,28 @@ def test_misspelled_variable_is_reported(
     [
         ("sim:", ["sim:"]),
         ("sim:, ulog:/a.ulg?speed=2,px4-zenoh:", ["sim:", "ulog:/a.ulg?speed=2", "px4-zenoh:"]),
-        ("mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail", ["mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail"]),
-        ("px4-zenoh:?vehicles=5:a,6:b,sim:?vehicle=c", ["px4-zenoh:?vehicles=5:a,6:b", "sim:?vehicle=c"]),
-        ("px4-zenoh:?vehicles=left:a,right:b; sim:", ["px4-zenoh:?vehicles=left:a,right:b", "sim:"]),
+        (
+            "mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail",
+            ["mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail"],
+        ),
+        (
+            "px4-zenoh:?vehicles=5:a,6:b,sim:?vehicle=c",
+            ["px4-zenoh:?vehicles=5:a,6:b", "sim:?vehicle=c"],
+        ),
+        (
+            "px4-zenoh:?vehicles=left:a,right:b; sim:",
+            ["px4-zenoh:?vehicles=left:a,right:b", "sim:"],
+        ),
         ("px4-zenoh:?vehicles=left:a,right:b;", ["px4-zenoh:?vehicles=left:a,right:b"]),
-        ("px4-zenoh:?vehicles=left:a,right:b\nsim:\n", ["px4-zenoh:?vehicles=left:a,right:b", "sim:"]),
+        (
+            "px4-zenoh:?vehicles=left:a,right:b\nsim:\n",
+            ["px4-zenoh:?vehicles=left:a,right:b", "sim:"],
+        ),
     ],
 )
-def test_sources_variable_is_split(monkeypatch: pytest.MonkeyPatch, text: str, sources: list[str]) -> None:
+def test_sources_variable_is_split(
+    monkeypatch: pytest.MonkeyPatch, text: str, sources: list[str]
+) -> None:
     """A comma separates sources only before `KIND:`; semicolons and line breaks always separate sources."""
     monkeypatch.setenv("NEDBUS_SOURCE", text)
     assert load_settings().source == tuple(sources)
@@ -193,21 +247,45 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("ca", "certificate", "key", "reason"),
     [
-        ("wing.key", "wing.crt", "wing.key", "wing.key contains a private key, but a certificate is required: check"),
-        ("ca.crt", "wing.key", "wing.crt", "wing.key contains a private key, but a certificate is required: check"),
-        ("ca.crt", "wing.crt", "ca.crt", "ca.crt contains a certificate, but a private key is required: check"),
+        (
+            "wing.key",
+            "wing.crt",
+            "wing.key",
+            "wing.key contains a private key, but a certificate is required: check",
+        ),
+        (
+            "ca.crt",
+            "wing.key",
+            "wing.crt",
+            "wing.key contains a private key, but a certificate is required: check",
+        ),
+        (
+            "ca.crt",
+            "wing.crt",
+            "ca.crt",
+            "ca.crt contains a certificate, but a private key is required: check",
+        ),
         ("ca.crt", "wing.crt", "tail.key", "tail.key is not the key of "),
-        ("ca.crt", "empty", "wing.key", "empty is empty, but a certificate is required: create one with 'nedbus pki'"),
+        (
+            "ca.crt",
+            "empty",
+            "wing.key",
+            "empty is empty, but a certificate is required: create one with 'nedbus pki'",
+        ),
         ("text", "wing.crt", "wing.key", "text is not PEM, but a certificate is required"),
         ("ca.crt", "cut", "wing.key", "is damaged, or the key has a password"),
         ("gone", "wing.crt", "wing.key", "gone cannot be read"),
         ("ca.crt", ".", "wing.key", "cannot be read"),
     ],
 )
-def test_invalid_tls_file_raises_without_a_router(keys: Path, ca: str, certificate: str, key: str, reason: str) -> None:
+def test_invalid_tls_file_raises_without_a_router(
+    keys: Path, ca: str, certificate: str, key: str, reason: str
+) -> None:
     """Swapped, empty, damaged or mismatched TLS files raise ConfigError, even without a router."""
     with pytest.raises(ConfigError) as info:
-        nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=Tls(keys / ca, keys / certificate, keys / key))
+        nedbus.connect(
+            "tls/127.0.0.1:1", timeout=0.1, tls=Tls(keys / ca, keys / certificate, keys / key)
+        )
     assert reason in str(info.value)
 
 
@@ -240,15 +318,21 @@ def test_missing_router_file_or_unknown_suffix_raises(tmp_path: Path) -> None:
             open_router(config_file=tmp_path / name)
 
 
-def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_plugins_of_a_router_file_are_not_loaded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Ignored plugins are logged, because Zenoh's Python library ignores them silently; a required plugin raises."""
     file = tmp_path / "router.json5"
-    file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
+    file.write_text(
+        '{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }'
+    )
     open_router(listen=(free_endpoint(),), config_file=file).close()
     ignored = "plugin rest and plugin storage_manager not loaded, because this router, unlike zenohd, loads no plugins"
     assert caplog.messages == [f"{file}: {ignored}"]
     file.write_text("{ plugins: { rest: { __required__: true } } }")
-    with pytest.raises(ConfigError, match="it requires plugin rest, but this router loads no plugins: run it with"):
+    with pytest.raises(
+        ConfigError, match="it requires plugin rest, but this router loads no plugins: run it with"
+    ):
         open_router(config_file=file)
     for name in ("storage.json5", "rest-reader.json5"):  # as shipped, for zenohd alone
         with pytest.raises(ConfigError, match="this router loads no plugins"):
@@ -264,7 +348,10 @@ def test_serve_help_lists_every_source() -> None:
 
 def test_listen_error_includes_the_system_error(endpoint: str) -> None:
     """ListenError is an OSError with the reason: the port is in use, or the address belongs to another host."""
-    for where, reason in ((endpoint, "address already in use"), ("tcp/192.0.2.1:7447", "cannot assign requested")):
+    for where, reason in (
+        (endpoint, "address already in use"),
+        ("tcp/192.0.2.1:7447", "cannot assign requested"),
+    ):
         with pytest.raises(ListenError, match=rf"cannot listen on {where} \({reason}") as info:
             open_router(listen=(where,))
         assert isinstance(info.value, OSError)

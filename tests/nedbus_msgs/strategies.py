@@ -15,7 +15,10 @@ from nedbus_msgs import VehicleLocalPosition
 from tests.flights.local_position import FIELD_TYPES, encode
 
 DATA = Path(__file__).parents[1] / "data"
-FLIGHTS = [VehicleLocalPosition(**each["fields"]) for each in json.loads((DATA / "flights.json").read_text()).values()]
+FLIGHTS = [
+    VehicleLocalPosition(**each["fields"])
+    for each in json.loads((DATA / "flights.json").read_text()).values()
+]
 """One message from each of four real flights: with all fields, without an origin, and with fields missing."""
 REAL = [encode(message) for message in FLIGHTS]
 
@@ -30,7 +33,11 @@ FLAG_FIELDS: Mapping[str, tuple[str, ...]] = {
     "dist_bottom_valid": ("dist_bottom",),
 }
 NOT_NEGATIVE = ("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv")
-WITHIN = {"heading": struct.unpack("<f", struct.pack("<f", math.pi))[0], "ref_lat": 90.0, "ref_lon": 360.0}
+WITHIN = {
+    "heading": struct.unpack("<f", struct.pack("<f", math.pi))[0],
+    "ref_lat": 90.0,
+    "ref_lon": 360.0,
+}
 BEYOND = {"heading": float(np.nextafter(np.float32(math.pi), np.float32(4)))} | {
     name: math.nextafter(bound, math.inf) for name, bound in WITHIN.items() if name != "heading"
 }
@@ -71,7 +78,14 @@ SAME_TYPE = {
     "float64": st.floats() | st.sampled_from([90.0, 90.5, -360.0, 361.0]),
 }
 FIELDS_WITH_FLAGS = [name for names in FLAG_FIELDS.values() for name in names]
-FIELDS_WITH_RULES = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FIELDS_WITH_FLAGS, *NOT_NEGATIVE, *WITHIN]
+FIELDS_WITH_RULES = [
+    "timestamp",
+    "timestamp_sample",
+    *FLAG_FIELDS,
+    *FIELDS_WITH_FLAGS,
+    *NOT_NEGATIVE,
+    *WITHIN,
+]
 POSSIBLE_VIOLATIONS = st.sampled_from(FIELDS_WITH_RULES).flatmap(
     lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]])
 )
@@ -91,7 +105,9 @@ def make_valid(fields: dict[str, object]) -> dict[str, object]:
         if abs(value) > bound:
             fields[name] = math.copysign(bound, value)
     for flag, names in FLAG_FIELDS.items():
-        if not all(math.isfinite(value) for name in names if isinstance(value := fields[name], float)):
+        if not all(
+            math.isfinite(value) for name in names if isinstance(value := fields[name], float)
+        ):
             fields[flag] = False
     first, second = fields["timestamp_sample"], fields["timestamp"]
     assert isinstance(first, int)
@@ -102,7 +118,9 @@ def make_valid(fields: dict[str, object]) -> dict[str, object]:
 
 def fields() -> st.SearchStrategy[dict[str, object]]:
     """Return a strategy for the fields of any valid VehicleLocalPosition."""
-    return st.fixed_dictionaries({name: TYPES[kind] for name, kind in FIELD_TYPES.items()}).map(make_valid)
+    return st.fixed_dictionaries({name: TYPES[kind] for name, kind in FIELD_TYPES.items()}).map(
+        make_valid
+    )
 
 
 def messages() -> st.SearchStrategy[VehicleLocalPosition]:

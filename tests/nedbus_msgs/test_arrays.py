@@ -35,8 +35,11 @@ from tests.nedbus_msgs.strategies import (
 # Lengths around those at which the algorithm changes.
 SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
 ARRAYS = arrays_of(DEFAULT)
-Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and values that may break its rules
-CASES = st.lists(st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=2)), min_size=1, max_size=4)
+# a message, and values that may break its rules
+Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]
+CASES = st.lists(
+    st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=2)), min_size=1, max_size=4
+)
 
 
 def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
@@ -49,13 +52,19 @@ def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
 @given(st.sampled_from(SIZES), CASES, st.randoms(use_true_random=False))
 def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
     """An array of valid and invalid messages is decoded exactly like each message alone, at any length."""
-    choices = [*REAL, *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases)]
+    choices = [
+        *REAL,
+        *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases),
+    ]
     payloads = order.choices(choices, k=size)
     rows = {payload: row_or_none(payload) for payload in choices}
     array, valid = decode_array(b"".join(payloads))
     assert array.dtype == DTYPE
     assert valid.tolist() == [rows[payload] is not None for payload in payloads]
-    assert array[valid].tobytes() == np.array([row for payload in payloads if (row := rows[payload])], DTYPE).tobytes()
+    assert (
+        array[valid].tobytes()
+        == np.array([row for payload in payloads if (row := rows[payload])], DTYPE).tobytes()
+    )
     assert encode_array(array) == b"".join(payloads)
     assert valid_mask(array).tolist() == valid.tolist()
     few = ARRAYS.decode_few(payloads)
@@ -64,8 +73,12 @@ def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Rando
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize(("changes", "expected"), [(VIOLATIONS, False), (EXTREMES, True)], ids=["violation", "extreme"])
-def test_each_rule_is_checked_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
+@pytest.mark.parametrize(
+    ("changes", "expected"), [(VIOLATIONS, False), (EXTREMES, True)], ids=["violation", "extreme"]
+)
+def test_each_rule_is_checked_at_any_length(
+    size: int, changes: list[Mapping[str, object]], expected: bool
+) -> None:
     """A message that breaks a rule is invalid, one on its bound is valid, and neither affects other messages."""
     for change in changes:
         payload = pack_full_width({**FLIGHTS[0].model_dump(), **change})
@@ -77,8 +90,15 @@ def test_each_rule_is_checked_at_any_length(size: int, changes: list[Mapping[str
         assert np.count_nonzero(~valid) == (not expected), change
 
 
-@given(st.sampled_from(SIZES), st.integers(0, PAYLOAD_SIZE - 1), st.integers(0, 255), st.sampled_from(REAL))
-def test_corrupt_payload_does_not_affect_others(size: int, offset: int, byte: int, flight: bytes) -> None:
+@given(
+    st.sampled_from(SIZES),
+    st.integers(0, PAYLOAD_SIZE - 1),
+    st.integers(0, 255),
+    st.sampled_from(REAL),
+)
+def test_corrupt_payload_does_not_affect_others(
+    size: int, offset: int, byte: int, flight: bytes
+) -> None:
     """A payload with one changed byte is valid only if it decodes; all other messages are unchanged."""
     corrupt = bytearray(flight)
     corrupt[offset] = byte
@@ -159,7 +179,11 @@ def test_mask_invalid_sets_nan_where_the_flag_is_false(sent: list[VehicleLocalPo
 
 def test_mask_invalid_supports_any_message() -> None:
     """The array's own flags are used; a message without flags is copied unchanged."""
-    home = mask_invalid(to_array([HomePosition(timestamp=1, lat=0.0, lon=0.0, x=1.0, y=2.0, z=3.0, valid_lpos=True)]))
+    home = mask_invalid(
+        to_array(
+            [HomePosition(timestamp=1, lat=0.0, lon=0.0, x=1.0, y=2.0, z=3.0, valid_lpos=True)]
+        )
+    )
     assert np.isnan([home["lat"], home["lon"]]).all()
     assert [home[name].tolist() for name in "xyz"] == [[1.0], [2.0], [3.0]]
     attitudes = to_array([VehicleAttitude(timestamp=1, q=(1.0, 0.0, 0.0, 0.0))])

@@ -64,10 +64,14 @@ def test_flag_shares_are_described_in_words(shares: dict[str, float], text: str)
 
 
 @given(messages(), st.booleans())
-def test_doubts_of_one_message_have_no_percentage(message: VehicleLocalPosition, as_row: bool) -> None:
+def test_doubts_of_one_message_have_no_percentage(
+    message: VehicleLocalPosition, as_row: bool
+) -> None:
     """A single message or row is described by its own flags, without percentages."""
     either = row_of(message) if as_row else message
-    assert message_doubts(either) == describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})
+    assert message_doubts(either) == describe_flags(
+        {name: float(getattr(message, name)) for name in DOUBT_FLAGS}
+    )
     assert "%" not in message_doubts(either)
 
 
@@ -76,10 +80,14 @@ def model_and_row(message: Message) -> tuple[Any, Any]:
 
 
 @EACH_PROPERTY
-def test_property_is_none_unless_all_flags_are_true(definition: Definition[Any], name: str, flags: list[str]) -> None:
+def test_property_is_none_unless_all_flags_are_true(
+    definition: Definition[Any], name: str, flags: list[str]
+) -> None:
     """A flag that is false or not provided makes the property None; if all flags are true, zeros are returned."""
     fields = {field: 0.0 for flag in flags for field in definition.flags[flag]}
-    for each in model_and_row(definition.model(timestamp=1, **fields, **dict.fromkeys(flags, True))):
+    for each in model_and_row(
+        definition.model(timestamp=1, **fields, **dict.fromkeys(flags, True))
+    ):
         assert getattr(each, name) is not None
     for unset in flags:
         others = dict.fromkeys(set(flags) - {unset}, True)
@@ -89,7 +97,9 @@ def test_property_is_none_unless_all_flags_are_true(definition: Definition[Any],
 
 
 @EACH_PROPERTY
-def test_property_names_differ_from_field_names(definition: Definition[Any], name: str, flags: list[str]) -> None:
+def test_property_names_differ_from_field_names(
+    definition: Definition[Any], name: str, flags: list[str]
+) -> None:
     """No PX4 layout has a current or renamed field with the name of a property."""
     assert name not in definition.known_types.keys() | definition.older.keys()
     assert name not in definition.row._fields
@@ -98,7 +108,9 @@ def test_property_names_differ_from_field_names(definition: Definition[Any], nam
 def test_every_flag_guards_a_property() -> None:
     """For every flag of a FiniteWhile rule there is a property that checks it."""
     guarded = {(definition.name, flag) for definition, _, flags in GUARDED for flag in flags}
-    flags = {(definition.name, flag) for definition in MESSAGES.values() for flag in definition.flags}
+    flags = {
+        (definition.name, flag) for definition in MESSAGES.values() for flag in definition.flags
+    }
     assert flags - guarded == {("SensorGps", "vel_ned_valid")}  # its velocity also requires a fix
     assert VehicleLocalPosition.DEFINITION.flags == FLAG_FIELDS
 
@@ -107,23 +119,43 @@ def test_every_flag_guards_a_property() -> None:
 def test_properties_return_the_fields(message: VehicleLocalPosition, as_row: bool) -> None:
     """Each property returns its fields in order, bit for bit; height is positive up, longitudes are wrapped."""
     either = row_of(message) if as_row else message
-    has_position, has_origin = message.xy_valid and message.z_valid, message.xy_global and message.z_global
+    has_position, has_origin = (
+        message.xy_valid and message.z_valid,
+        message.xy_global and message.z_global,
+    )
     assert either.position == (Ned(message.x, message.y, message.z) if has_position else None)
-    velocity = Ned(message.vx, message.vy, message.vz) if message.v_xy_valid and message.v_z_valid else None
+    velocity = (
+        Ned(message.vx, message.vy, message.vz)
+        if message.v_xy_valid and message.v_z_valid
+        else None
+    )
     assert either.velocity == velocity
     assert either.height == (-message.z if message.z_valid else None)
     assert either.good_heading == (message.heading if message.heading_good_for_control else None)
-    assert either.height_above_ground == (message.dist_bottom if message.dist_bottom_valid else None)
-    origin = GlobalPosition.wrapped(message.ref_lat, message.ref_lon, message.ref_alt) if has_origin else None
+    assert either.height_above_ground == (
+        message.dist_bottom if message.dist_bottom_valid else None
+    )
+    origin = (
+        GlobalPosition.wrapped(message.ref_lat, message.ref_lon, message.ref_alt)
+        if has_origin
+        else None
+    )
     assert either.origin == origin
     assert either.global_position == (to_global(message) if has_position and has_origin else None)
 
 
 def test_global_and_home_position_properties_follow_their_flags() -> None:
     """A property whose flags are not all true is None; the others return the fields."""
-    estimate = VehicleGlobalPosition(timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True)
-    assert (estimate.global_position, estimate.ground_altitude) == (GlobalPosition(47.0, 8.0, 400.0), None)
-    home = HomePosition(timestamp=1, x=1.0, y=2.0, z=-3.0, lat=0.0, lon=0.0, alt=0.0, valid_lpos=True)
+    estimate = VehicleGlobalPosition(
+        timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True
+    )
+    assert (estimate.global_position, estimate.ground_altitude) == (
+        GlobalPosition(47.0, 8.0, 400.0),
+        None,
+    )
+    home = HomePosition(
+        timestamp=1, x=1.0, y=2.0, z=-3.0, lat=0.0, lon=0.0, alt=0.0, valid_lpos=True
+    )
     assert (home.position, home.global_position) == (Ned(1.0, 2.0, -3.0), None)
 
 
@@ -132,7 +164,9 @@ def test_global_and_home_position_properties_follow_their_flags() -> None:
     [(0, True, False, False), (1, True, False, False), (2, True, False, True), (3, True, True, True),
      (6, False, True, False)],
 )  # fmt: skip
-def test_gnss_position_requires_a_fix(fix_type: int, flag: bool, has_position: bool, has_velocity: bool) -> None:
+def test_gnss_position_requires_a_fix(
+    fix_type: int, flag: bool, has_position: bool, has_velocity: bool
+) -> None:
     """The position requires a 3D fix, the velocity a fix and vel_ned_valid: without a fix, values are zero or old."""
     position = {"latitude_deg": 47.0, "longitude_deg": 8.0, "altitude_msl_m": 400.0}
     velocity = {"vel_n_m_s": 1.0, "vel_e_m_s": 2.0, "vel_d_m_s": 3.0}

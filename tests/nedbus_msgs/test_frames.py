@@ -48,7 +48,13 @@ angles = st.floats(-math.pi, math.pi)
 
 def with_origin(**fields: object) -> VehicleLocalPosition:
     """Return a message with PX4's test origin."""
-    origin = {"xy_global": True, "z_global": True, "ref_lat": 47.3566094, "ref_lon": 8.5190237, "ref_alt": 151.3}
+    origin = {
+        "xy_global": True,
+        "z_global": True,
+        "ref_lat": 47.3566094,
+        "ref_lon": 8.5190237,
+        "ref_alt": 151.3,
+    }
     return VehicleLocalPosition.model_validate({"timestamp": 1, **origin, **fields})
 
 
@@ -76,7 +82,9 @@ def test_to_global_accepts_a_row() -> None:
     assert to_global(row_of(message)) == to_global(message)
 
 
-@pytest.mark.parametrize("fields", [{"x": 1.0, "y": 2.0}, {"xy_global": True, "ref_lat": 1.0, "ref_lon": 2.0}])
+@pytest.mark.parametrize(
+    "fields", [{"x": 1.0, "y": 2.0}, {"xy_global": True, "ref_lat": 1.0, "ref_lon": 2.0}]
+)
 def test_position_without_origin_is_none(fields: dict[str, object]) -> None:
     """Without a global origin, to_global and to_local return None, and so does to_global without x and y."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
@@ -110,8 +118,12 @@ def test_to_global_matches_px4_in_real_logs(name: str) -> None:
     for i, j in zip(local_rows.tolist(), global_rows.tolist(), strict=True):
         if not local["xy_global"][i] or not local["z_global"][i] or not local["xy_valid"][i]:
             continue
-        fields = {name: local[name][i].item() for name in ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")}
-        position = to_global(VehicleLocalPosition(timestamp=1, xy_global=True, z_global=True, **fields))
+        fields = {
+            name: local[name][i].item() for name in ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")
+        }
+        position = to_global(
+            VehicleLocalPosition(timestamp=1, xy_global=True, z_global=True, **fields)
+        )
         assert position
         assert position.latitude == pytest.approx(px4_global["lat"][j], abs=1e-10)
         assert position.longitude == pytest.approx(px4_global["lon"][j], abs=1e-10)
@@ -124,7 +136,9 @@ def test_to_global_matches_px4_in_real_logs(name: str) -> None:
 @example(10.0, 179.9, 100_000.0, math.pi / 2)
 @example(10.0, -179.9, 100_000.0, -math.pi / 2)
 @example(90.0, 0.0, 100_000.0, 1.0)
-def test_projection_round_trip(latitude: float, longitude: float, distance: float, bearing: float) -> None:
+def test_projection_round_trip(
+    latitude: float, longitude: float, distance: float, bearing: float
+) -> None:
     """The round trip is exact to 1 mm within 100 km of any origin, including poles and antimeridian."""
     origin = MapProjection(latitude, longitude)
     north, east = distance * math.cos(bearing), distance * math.sin(bearing)
@@ -135,16 +149,24 @@ def test_projection_round_trip(latitude: float, longitude: float, distance: floa
 
 
 @given(st.floats(-89, 89), st.floats(-180, 180), st.floats(1, 100_000), angles)
-def test_projection_is_equidistant(latitude: float, longitude: float, distance: float, bearing: float) -> None:
+def test_projection_is_equidistant(
+    latitude: float, longitude: float, distance: float, bearing: float
+) -> None:
     """The great-circle distance from the origin equals the distance in the plane."""
-    other = MapProjection(latitude, longitude).reproject(distance * math.cos(bearing), distance * math.sin(bearing))
+    other = MapProjection(latitude, longitude).reproject(
+        distance * math.cos(bearing), distance * math.sin(bearing)
+    )
     one, two = (unit(*map(math.radians, each)) for each in ((latitude, longitude), other))
     # The chord is well conditioned where an arc cosine is not.
     assert 2 * RADIUS * math.asin(math.dist(one, two) / 2) == pytest.approx(distance, abs=1e-3)
 
 
 def unit(latitude: float, longitude: float) -> tuple[float, float, float]:
-    return (math.cos(latitude) * math.cos(longitude), math.cos(latitude) * math.sin(longitude), math.sin(latitude))
+    return (
+        math.cos(latitude) * math.cos(longitude),
+        math.cos(latitude) * math.sin(longitude),
+        math.sin(latitude),
+    )
 
 
 def test_frame_conversions_match_hand_computed_values() -> None:
@@ -189,18 +211,24 @@ def rotate(q: Sequence[float], vector: tuple[float, float, float]) -> tuple[floa
 
 
 @given(angles, angles, angles)
-def test_converted_attitude_rotates_vectors_the_same_way(roll: float, pitch: float, yaw: float) -> None:
+def test_converted_attitude_rotates_vectors_the_same_way(
+    roll: float, pitch: float, yaw: float
+) -> None:
     """The converted attitude rotates an FLU vector as the original rotates the same vector in FRD."""
     q = euler_to_quaternion(roll, pitch, yaw)
     enu = quaternion_ned_to_enu(q)
     for vector in ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.5, -1.0, 3.0)):
         north, east, down = rotate(q, vector)
-        assert rotate(enu, frd_to_flu(vector)) == pytest.approx(ned_to_enu((north, east, down)), abs=1e-9)
+        assert rotate(enu, frd_to_flu(vector)) == pytest.approx(
+            ned_to_enu((north, east, down)), abs=1e-9
+        )
     assert quaternion_enu_to_ned(enu) == pytest.approx(q)
 
 
 @given(angles, angles, angles)
-def test_angles_of_a_quaternion_do_not_depend_on_its_norm(roll: float, pitch: float, yaw: float) -> None:
+def test_angles_of_a_quaternion_do_not_depend_on_its_norm(
+    roll: float, pitch: float, yaw: float
+) -> None:
     """A quaternion that vision did not normalise has the same angles; zeros, which are no rotation, have none."""
     q = euler_to_quaternion(roll, pitch, yaw)
     expected = quaternion_to_euler(q)
@@ -209,7 +237,9 @@ def test_angles_of_a_quaternion_do_not_depend_on_its_norm(roll: float, pitch: fl
     assert all(map(math.isnan, quaternion_to_euler([0.0] * 4)))
 
 
-@pytest.mark.parametrize(("east", "expected"), [(0.0, -179.5), (100.0, -179.4991), (-60_000.0, 179.96)])
+@pytest.mark.parametrize(
+    ("east", "expected"), [(0.0, -179.5), (100.0, -179.4991), (-60_000.0, 179.96)]
+)
 def test_reprojected_longitude_is_wrapped(east: float, expected: float) -> None:
     """An origin east of 180 degrees, as PX4 up to 1.15 sends it, gives longitudes within 180 degrees."""
     projection = MapProjection(0.0, 180.5)
@@ -243,7 +273,9 @@ def test_derived_values_of_invalid_fields_are_nan() -> None:
         VehicleLocalPosition(timestamp=1, z=-5.0, vx=3.0, vy=4.0),
     ]
     for name, value in (("height", 5.0), ("speed", 5.0)):
-        assert [derive(each, name) for each in local] == pytest.approx([value, math.nan], nan_ok=True)
+        assert [derive(each, name) for each in local] == pytest.approx(
+            [value, math.nan], nan_ok=True
+        )
         assert derive_column(to_array(local), name) == pytest.approx([value, math.nan], nan_ok=True)
     unknown = to_array([VehicleAttitude(timestamp=1, q=(math.nan, 0.0, 0.0, 0.0))] * 2)
     unknown["q"][1] = 0.0

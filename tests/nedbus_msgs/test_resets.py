@@ -26,7 +26,9 @@ PLAIN: dict[str, object] = {
 
 
 def at(seconds: float, **fields: object) -> VehicleLocalPosition:
-    return VehicleLocalPosition.model_validate({"timestamp": round(seconds * 1e6), **PLAIN, **fields})
+    return VehicleLocalPosition.model_validate(
+        {"timestamp": round(seconds * 1e6), **PLAIN, **fields}
+    )
 
 
 def track(*messages: VehicleLocalPosition) -> list[Continuous]:
@@ -65,7 +67,9 @@ def test_every_quantity_has_its_own_delta(
 ) -> None:
     """Each counter applies to its own delta only."""
     steps = jump if isinstance(jump, tuple) else (jump,)
-    jumped = {name: cast("float", PLAIN[name]) + step for name, step in zip(values, steps, strict=True)}
+    jumped = {
+        name: cast("float", PLAIN[name]) + step for name, step in zip(values, steps, strict=True)
+    }
     first, second = track(at(1), at(2, **jumped, **{delta: jump, counter: 1}))
     for name in PLAIN:
         if not name.startswith("delta"):
@@ -94,7 +98,9 @@ def test_incomplete_delta_is_not_used() -> None:
 def test_incomplete_delta_after_a_long_pause_restarts_the_track() -> None:
     """After two resets and a pause, neither the delta nor the step is the jump, so the track restarts."""
     _, second, third = track(
-        at(1, z=1.0), at(6, z=50.0, z_reset_counter=2, delta_z=3.0), at(7, z=51.0, z_reset_counter=2, delta_z=3.0)
+        at(1, z=1.0),
+        at(6, z=50.0, z_reset_counter=2, delta_z=3.0),
+        at(7, z=51.0, z_reset_counter=2, delta_z=3.0),
     )
     assert second.discontinued == {"z"}
     assert (second.z, third.z) == (50.0, 51.0)
@@ -124,9 +130,13 @@ def test_announced_reset_of_zero_leaves_noise_in_the_track() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "kept"), [(0.1, 9.6), (0.02, 10.1)])
-def test_acceleration_between_distant_messages_is_no_contradiction(seconds: float, kept: float) -> None:
+def test_acceleration_between_distant_messages_is_no_contradiction(
+    seconds: float, kept: float
+) -> None:
     """A difference of 7 mm from the delta is unknown motion after 100 ms, but not after 20 ms."""
-    _, second = track(at(1), at(1 + seconds, x=kept + 0.007, xy_reset_counter=1, delta_xy=(kept, 0.0)))
+    _, second = track(
+        at(1), at(1 + seconds, x=kept + 0.007, xy_reset_counter=1, delta_xy=(kept, 0.0))
+    )
     assert second.x == pytest.approx(0.007 if seconds == 0.1 else 0.0, abs=1e-6)
 
 
@@ -141,7 +151,10 @@ def test_turn_during_a_heading_reset_stays_in_the_track() -> None:
 
 def test_height_rate_is_preferred_to_the_vertical_velocity() -> None:
     """The motion of z is z_deriv, the rate of the published z, and not vz, the velocity of the filter."""
-    _, second = track(at(1, vz=5.0, z_deriv=1.0), at(1.1, z=20.1, vz=5.0, z_deriv=1.0, z_reset_counter=1, delta_z=0.0))
+    _, second = track(
+        at(1, vz=5.0, z_deriv=1.0),
+        at(1.1, z=20.1, vz=5.0, z_deriv=1.0, z_reset_counter=1, delta_z=0.0),
+    )
     assert second.z == pytest.approx(0.1)
 
 
@@ -153,14 +166,18 @@ def test_reset_without_delta_restarts_the_track() -> None:
 
 def test_reordered_message_is_no_reboot() -> None:
     """A message that arrives late by less than a second continues the track."""
-    _, _, late = track(at(10, x=1.0), at(10.1, x=4.0, xy_reset_counter=1, delta_xy=(3.0, 0.0)), at(10.05, x=1.0))
+    _, _, late = track(
+        at(10, x=1.0), at(10.1, x=4.0, xy_reset_counter=1, delta_xy=(3.0, 0.0)), at(10.05, x=1.0)
+    )
     assert not late.discontinued & {"z", "heading"}
 
 
 def test_backward_timestamp_restarts_the_track() -> None:
     """A timestamp that steps back, as after a reboot, starts a new track."""
     _, second, third = track(
-        at(100, x=5.0), at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)), at(1, x=0.5, xy_reset_counter=0)
+        at(100, x=5.0),
+        at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)),
+        at(1, x=0.5, xy_reset_counter=0),
     )
     assert second.x == 5.0
     assert third.discontinued == {"xy", "z", "vxy", "vz", "heading", "dist_bottom"}
@@ -170,7 +187,8 @@ def test_backward_timestamp_restarts_the_track() -> None:
 def test_delta_without_a_jump_at_a_new_origin_is_ignored() -> None:
     """A delta without a jump is ignored: as in a real log, delta_z is -179.5 m at a new origin, but z moves by 2 mm."""
     first, second = track(
-        at(21.574, z=-0.2), at(21.674, z=-0.198, z_reset_counter=1, delta_z=-179.5362, z_global=True, ref_alt=179.5362)
+        at(21.574, z=-0.2),
+        at(21.674, z=-0.198, z_reset_counter=1, delta_z=-179.5362, z_global=True, ref_alt=179.5362),
     )
     assert second.origin_changed
     assert second.reset == {"z"}
@@ -193,7 +211,8 @@ def test_moved_origin_is_compensated(counted: int) -> None:
 
     moved = {"xy_reset_counter": counted, "z_reset_counter": counted, **origin(*new)}
     first, second = track(
-        at(1.0, x=3.0, vx=1.0, **origin(*old)), at(1.1, x=3.1 + north, y=east, z=10.0, vx=1.0, **moved)
+        at(1.0, x=3.0, vx=1.0, **origin(*old)),
+        at(1.1, x=3.1 + north, y=east, z=10.0, vx=1.0, **moved),
     )
     assert second.origin_changed
     assert not second.discontinued
@@ -248,7 +267,8 @@ def test_track_is_closer_than_with_deltas_or_steps_alone(thinned: bool) -> None:
 
 @pytest.mark.logs
 @pytest.mark.parametrize(
-    ("name", "raw", "smooth"), [("fmuv6c_1.17_selector_whipsaw.ulg", 130.0, 3.0), ("nxp_v0_ekf_failure.ulg", 25.0, 6.0)]
+    ("name", "raw", "smooth"),
+    [("fmuv6c_1.17_selector_whipsaw.ulg", 130.0, 3.0), ("nxp_v0_ekf_failure.ulg", 25.0, 6.0)],
 )
 def test_resets_in_real_logs_are_removed(name: str, raw: float, smooth: float) -> None:
     """Steps that velocity does not explain are large in the messages and small in the track."""
@@ -268,7 +288,11 @@ def test_resets_in_real_logs_are_removed(name: str, raw: float, smooth: float) -
             seconds = (message.timestamp - before.timestamp) / 1e6
             expected = (before.vx * seconds, before.vy * seconds, before.vz * seconds)
             step = (message.x - before.x, message.y - before.y, message.z - before.z)
-            smooth_step = (track.x - smooth_before.x, track.y - smooth_before.y, track.z - smooth_before.z)
+            smooth_step = (
+                track.x - smooth_before.x,
+                track.y - smooth_before.y,
+                track.z - smooth_before.z,
+            )
             worst["raw"] = max(worst["raw"], math.dist(step, expected))
             worst["smooth"] = max(worst["smooth"], math.dist(smooth_step, expected))
         last = message, track

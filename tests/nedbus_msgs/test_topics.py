@@ -40,7 +40,11 @@ def addresses(draw: st.DrawFn) -> Address:
 def test_vehicle_local_position_has_four_topics() -> None:
     """Only estimator_local_position has instances, and vehicle_local_position is the default."""
     assert DEFAULT_TOPIC == "vehicle_local_position"
-    alone = ("vehicle_local_position", "vehicle_local_position_groundtruth", "external_ins_local_position")
+    alone = (
+        "vehicle_local_position",
+        "vehicle_local_position_groundtruth",
+        "external_ins_local_position",
+    )
     instances = {**dict.fromkeys(alone, False), "estimator_local_position": True}
     assert {name: topic.instances for name, topic in DEFAULT.topics.items()} == instances
     assert list(TOPICS)[:4] == list(instances)
@@ -54,12 +58,21 @@ def test_keys_match_the_documentation() -> None:
     assert estimator.key(prefix="fleet/a") == "fleet/a/7/estimator_local_position/2"
     assert estimator.alive_key("1a") == "nedbus/7/@alive/1a/estimator_local_position/2"
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
-    assert Selection("estimator_local_position", instance=1).key_exprs()[0] == "nedbus/*/estimator_local_position/1"
-    assert Selection("estimator_local_position", vehicle="7").key_exprs()[0] == "nedbus/7/estimator_local_position/*"
+    assert (
+        Selection("estimator_local_position", instance=1).key_exprs()[0]
+        == "nedbus/*/estimator_local_position/1"
+    )
+    assert (
+        Selection("estimator_local_position", vehicle="7").key_exprs()[0]
+        == "nedbus/7/estimator_local_position/*"
+    )
     assert schema_key("VehicleLocalPosition") == "nedbus/@schema/*/VehicleLocalPosition"
     assert schema_key("VehicleStatus", vehicle="7", prefix="a/b") == "a/b/@schema/7/VehicleStatus"
     assert status_key("a-1", vehicle="7") == "nedbus/@service/7/a-1/status"
-    assert ack_key(Selection("vehicle_local_position").key_exprs()[0]) == "nedbus/*/vehicle_local_position/@ack"
+    assert (
+        ack_key(Selection("vehicle_local_position").key_exprs()[0])
+        == "nedbus/*/vehicle_local_position/@ack"
+    )
 
 
 def test_selection_of_an_unknown_topic_matches_all_instances() -> None:
@@ -101,23 +114,33 @@ def selections(draw: st.DrawFn, near: Address) -> Selection:
     topic = draw(st.sampled_from([ANY, near.topic, *TOPICS]))
     vehicle = draw(st.sampled_from([ANY, near.vehicle, near.vehicle[:-1] + "Q"]))
     instances = topic != ANY and TOPICS[topic].instances
-    return Selection(topic, vehicle, draw(st.sampled_from([None, near.instance, 0, 255])) if instances else None)
+    return Selection(
+        topic, vehicle, draw(st.sampled_from([None, near.instance, 0, 255])) if instances else None
+    )
 
 
 @given(addresses(), PREFIXES, st.data())
-def test_selection_matches_what_its_key_expression_includes(address: Address, prefix: str, data: st.DataObject) -> None:
+def test_selection_matches_what_its_key_expression_includes(
+    address: Address, prefix: str, data: st.DataObject
+) -> None:
     """A selection matches exactly the addresses whose keys are included in its key expression, as Zenoh decides."""
     selection = data.draw(selections(address))
     key_expr = zenoh.KeyExpr(selection.key_exprs(prefix=prefix)[0])
     assert selection.matches(address) == key_expr.includes(address.key(prefix=prefix))
     acknowledgements = zenoh.KeyExpr(ack_key(str(key_expr)))
-    assert acknowledgements.includes(ack_key(address.key(prefix=prefix))) == selection.matches(address)
+    assert acknowledgements.includes(ack_key(address.key(prefix=prefix))) == selection.matches(
+        address
+    )
 
 
 @given(addresses(), PREFIXES)
-def test_selection_excludes_tokens_rejections_and_acknowledgements(address: Address, prefix: str) -> None:
+def test_selection_excludes_tokens_rejections_and_acknowledgements(
+    address: Address, prefix: str
+) -> None:
     """A subscription to all messages does not receive liveliness tokens, rejections or acknowledgements."""
-    assert zenoh.KeyExpr(Selection().alive_key_exprs(prefix=prefix)[0]).includes(address.alive_key("1a", prefix=prefix))
+    assert zenoh.KeyExpr(Selection().alive_key_exprs(prefix=prefix)[0]).includes(
+        address.alive_key("1a", prefix=prefix)
+    )
     key_expr = zenoh.KeyExpr(Selection().key_exprs(prefix=prefix)[0])
     assert not key_expr.intersects(address.alive_key("1a", prefix=prefix))
     assert not key_expr.intersects(address.rejected_key(prefix=prefix))
@@ -127,7 +150,10 @@ def test_selection_excludes_tokens_rejections_and_acknowledgements(address: Addr
 @pytest.mark.parametrize(
     ("vehicle", "topic", "instance", "what"),
     [
-        *((vehicle, "vehicle_local_position", None, "vehicle") for vehicle in ("", "a/b", "@alive", "*", "x" * 65)),
+        *(
+            (vehicle, "vehicle_local_position", None, "vehicle")
+            for vehicle in ("", "a/b", "@alive", "*", "x" * 65)
+        ),
         ("7", "vehicle_attitud", None, "topic"),
         ("7", "Attitude", None, "topic"),
         ("7", "a" * 65, None, "topic"),
@@ -147,7 +173,12 @@ def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, 
     ("topic", "vehicle", "instance", "what"),
     [
         ("vehicle_local_positon", "*", None, "topic"),
-        ("/fmu/out/vehicle_status_v1", "*", None, "expected vehicle_status, without the ROS 2 prefix"),
+        (
+            "/fmu/out/vehicle_status_v1",
+            "*",
+            None,
+            "expected vehicle_status, without the ROS 2 prefix",
+        ),
         ("in/wheel_encoders", "*", None, "expected wheel_encoders, without the ROS 2 prefix"),
         ("vehicle_local_position", "*", 0, "instance"),
         ("*", "*", 1, "instance"),
@@ -158,7 +189,9 @@ def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, 
         ),
     ],
 )
-def test_invalid_selection_raises(topic: str, vehicle: str, instance: int | None, what: str) -> None:
+def test_invalid_selection_raises(
+    topic: str, vehicle: str, instance: int | None, what: str
+) -> None:
     """A misspelled topic or an impossible instance raises, because a subscription to it would receive nothing."""
     with pytest.raises(AddressError, match=what):
         Selection(topic, vehicle, instance)
@@ -190,7 +223,11 @@ def test_address_of_another_process_is_found() -> None:
 
 def test_address_without_instance_sorts_first() -> None:
     """The first instance of a topic that is not built in has no number, and sorts before numbered ones."""
-    plain, second, other = Address("1", "logger_status"), Address("1", "logger_status", 1), Address("1", "event")
+    plain, second, other = (
+        Address("1", "logger_status"),
+        Address("1", "logger_status", 1),
+        Address("1", "event"),
+    )
     assert sorted([second, plain, other]) == [other, plain, second]
 
 

@@ -13,7 +13,8 @@ import pytest
 
 HERE: Final = Path(__file__).parent
 _CARGO: Final = (
-    '[package]\nname = "program"\nversion = "0.0.0"\nedition = "2021"\n[[bin]]\nname = "program"\npath = "{}"\n'
+    '[package]\nname = "program"\nversion = "0.0.0"\nedition = "2021"\n'
+    '[[bin]]\nname = "program"\npath = "{}"\n'
 )
 _OFFLINE: Final = (
     "network",
@@ -36,22 +37,34 @@ class _Toolchain(NamedTuple):
 
 _TOOLCHAINS: Final = {
     ".cpp": _Toolchain(["g++"], 'g++ -std=c++17 -O0 "$source" -o program', "./program"),
-    ".go": _Toolchain(["go"], 'go mod init example && go get "$@" && go build -o program .', "./program"),
+    ".go": _Toolchain(
+        ["go"], 'go mod init example && go get "$@" && go build -o program .', "./program"
+    ),
     ".java": _Toolchain(
         ["mvn", "javac"],
         'mvn -B -q dependency:copy -Dartifact="$1" -DoutputDirectory=. && javac -cp "*" *.java',
         "java -cp '*:.' $stem",
     ),
     ".mjs": _Toolchain(["node", "npm"], 'npm install --no-audit --no-fund "$@"', "node $source"),
-    ".py": _Toolchain([], f'{sys.executable} -m pip install -q --target packages "$@"', f"{sys.executable} $source"),
+    ".py": _Toolchain(
+        [],
+        f'{sys.executable} -m pip install -q --target packages "$@"',
+        f"{sys.executable} $source",
+    ),
     ".rs": _Toolchain(
-        ["cargo"], 'printf "%s\\n" "[dependencies]" "$@" >>Cargo.toml && cargo build -q', "cargo run -q --"
+        ["cargo"],
+        'printf "%s\\n" "[dependencies]" "$@" >>Cargo.toml && cargo build -q',
+        "cargo run -q --",
     ),
 }
 
 
 def run_program(
-    source: str, packages: Sequence[str], arguments: Sequence[str], folder: Path, files: Mapping[str, str] | None = None
+    source: str,
+    packages: Sequence[str],
+    arguments: Sequence[str],
+    folder: Path,
+    files: Mapping[str, str] | None = None,
 ) -> str:
     """Return the output of a program of this folder; skip the test if its tools or packages cannot be had here.
 
@@ -77,7 +90,9 @@ def run_program(
     return done.stdout
 
 
-def _run(command: str, arguments: Sequence[str], folder: Path, seconds: float) -> subprocess.CompletedProcess[str]:
+def _run(
+    command: str, arguments: Sequence[str], folder: Path, seconds: float
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         ["sh", "-c", command, "sh", *arguments],
         cwd=folder,

@@ -26,7 +26,9 @@ def compile_with(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the compiler; skip the test without it."""
     if shutil.which("g++") is None:
         pytest.skip("no g++")
-    return subprocess.run(["g++", *_FLAGS, *arguments], capture_output=True, text=True, timeout=110, check=False)
+    return subprocess.run(
+        ["g++", *_FLAGS, *arguments], capture_output=True, text=True, timeout=110, check=False
+    )
 
 
 def has_header(name: str) -> bool:
@@ -43,7 +45,11 @@ def example(tmp_path: Path) -> Path:
     """Return the file with the example."""
     if shutil.which("g++") is None or not has_header("nlohmann/json.hpp"):
         pytest.skip("no g++, or no nlohmann/json.hpp")
-    [text] = [block.text for block in blocks_of(ROOT / "docs/other-languages.md") if block.language == "cpp"]
+    [text] = [
+        block.text
+        for block in blocks_of(ROOT / "docs/other-languages.md")
+        if block.language == "cpp"
+    ]
     file = tmp_path / "example.cpp"
     file.write_text(text)
     return file
@@ -59,14 +65,20 @@ def test_example_prints_the_valid_positions(example: Path) -> None:
     assert built.returncode == 0, built.stderr
     codec = codec_of(VehicleLocalPosition.DEFINITION)
     valid, invalid = (
-        codec.encode(VehicleLocalPosition(**{**VALID, "timestamp": 1, "x": 2.5, "y": -1.5, "xy_valid": is_valid}))
+        codec.encode(
+            VehicleLocalPosition(
+                **{**VALID, "timestamp": 1, "x": 2.5, "y": -1.5, "xy_valid": is_valid}
+            )
+        )
         for is_valid in (True, False)
     )
     other_layout = b"\x92\x00\x01"
     keys = [f"nedbus/{name}/vehicle_local_position" for name in "abc"]
     samples = zip(keys, (valid, invalid, other_layout), strict=True)
     text = "".join(f"{key} {payload.hex()}\n" for key, payload in samples)
-    output = subprocess.run([str(program)], input=text, capture_output=True, text=True, timeout=60, check=True).stdout
+    output = subprocess.run(
+        [str(program)], input=text, capture_output=True, text=True, timeout=60, check=True
+    ).stdout
     assert output.splitlines() == [f"{keys[0]} x 2.5 y -1.5", f"{keys[1]} has no valid position"]
 
 

@@ -39,20 +39,30 @@ def parse(text: str, kind: FieldType) -> Any:
 def test_decoder_of_documentation_returns_every_value(language: str, tmp_path: Path) -> None:
     """The decoder in the documentation returns every value of the vectors that it claims to read."""
     source, name, packages = PROGRAMS[language]
-    blocks = [each.text for each in blocks_of(ROOT / "docs/other-languages.md") if each.language == language]
+    blocks = [
+        each.text
+        for each in blocks_of(ROOT / "docs/other-languages.md")
+        if each.language == language
+    ]
     [snippet] = [each for each in blocks if "decode" in each.lower() and "readPosition" not in each]
     payloads = [case["payload"] for case in CASES]
     lines = run_program(source, packages, payloads, tmp_path, {name: snippet}).splitlines()
     if language == "go":
-        assert lines.pop() == "<nil> 44"  # a uint16 of 300 in a uint8: truncated without an error, as documented
+        # a uint16 of 300 in a uint8: truncated without an error, as documented
+        assert lines.pop() == "<nil> 44"
     assert len(lines) == len(CASES)
     for case, line in zip(CASES, lines, strict=True):
-        types = {each: field_type(kind) for each, kind in FILE["definitions"][f"{case['message']}/{case['layout']}"]}
+        types = {
+            each: field_type(kind)
+            for each, kind in FILE["definitions"][f"{case['message']}/{case['layout']}"]
+        }
         layout, *texts = line.split(" ")[1:]
         assert int(layout) == case["layout"]
         found = dict[str, Any]()
         for field, kind in types.items():
-            values = tuple(parse(texts.pop(0), kind) for _ in range(1 if kind.is_text else kind.values))
+            values = tuple(
+                parse(texts.pop(0), kind) for _ in range(1 if kind.is_text else kind.values)
+            )
             found[field] = values if kind.is_array else values[0]
         assert not texts
         assert repr(found) == repr(from_json(case["values"], types)), case["name"]

@@ -30,7 +30,12 @@ from .test_vectors import FILE
 MCAP_READERS: Final = {
     "@mcap/core": (
         "read_mcap.mjs",
-        ["@mcap/core@2.2.2", "@foxglove/rosmsg@5.0.5", "@foxglove/rosmsg2-serialization@3.1.0", "fzstd"],
+        [
+            "@mcap/core@2.2.2",
+            "@foxglove/rosmsg@5.0.5",
+            "@foxglove/rosmsg2-serialization@3.1.0",
+            "fzstd",
+        ],
     ),
     "mcap-ros2-support": ("read_mcap.py", ["mcap-ros2-support==0.6.0"]),
     "mcap in Rust": ("read_mcap.rs", ['mcap = "0.26"']),
@@ -46,17 +51,24 @@ TYPES: Final = {
     "uint64_t": "Q", "float": "f", "double": "d", "bool": "?",
 }  # fmt: skip
 """Basic types of ULog, and their codes."""
-EXTREMES: Final = {"f": (math.nan, math.inf, -math.inf, -0.0), "d": (math.nan, -0.0, 1e300), "?": (True, False)}
-Texts = Mapping[tuple[str, str], list[str]]  # by stream and field; the elements of arrays one after the other
+EXTREMES: Final = {
+    "f": (math.nan, math.inf, -math.inf, -0.0),
+    "d": (math.nan, -0.0, 1e300),
+    "?": (True, False),
+}
+# by stream and field; the elements of arrays one after the other
+Texts = Mapping[tuple[str, str], list[str]]
 Values = Mapping[tuple[str, str], list[Any]]
 
-pytestmark = [pytest.mark.slow, pytest.mark.process, pytest.mark.timeout(420)]  # packages may be downloaded, compiled
+# packages may be downloaded, compiled
+pytestmark = [pytest.mark.slow, pytest.mark.process, pytest.mark.timeout(420)]
 
 
 def parse(output: str) -> Texts:
     """Return the values in the output of a reader."""
     found = defaultdict[tuple[str, str], list[str]](list)
-    columns = defaultdict[tuple[str, str], dict[str, list[str]]](dict)  # of readers that print each element of arrays
+    # of readers that print each element of arrays
+    columns = defaultdict[tuple[str, str], dict[str, list[str]]](dict)
     for line in output.splitlines():
         stream, field, values = line.split("\t")
         name, is_element, index = field.partition("[")
@@ -77,7 +89,10 @@ def assert_equal(found: Texts, expected: Values) -> None:
         texts = found[key]
         assert len(texts) == len(values), key
         kind = type(values[0])
-        read = [{"true": True, "false": False}[each.lower()] if kind is bool else kind(each) for each in texts]
+        read = [
+            {"true": True, "false": False}[each.lower()] if kind is bool else kind(each)
+            for each in texts
+        ]
         if key[1] == "text":  # mcap-ros2-support reads ROS 2's char as signed
             read = [each % 256 for each in read]
         assert repr(read) == repr(values), key
@@ -123,7 +138,13 @@ def decode(output: str) -> Texts:
         lines.append(f"{topic}\t@times\t{times}")
         for field in decoded.__dataclass_fields__:
             value = getattr(decoded, field)
-            values = value.tolist() if hasattr(value, "tolist") else value if isinstance(value, list) else [value]
+            values = (
+                value.tolist()
+                if hasattr(value, "tolist")
+                else value
+                if isinstance(value, list)
+                else [value]
+            )
             lines.append(f"{topic}\t{field}\t{' '.join(map(str, values))}")
     return parse("\n".join(line for line in lines if "__msgtype__" not in line))
 
@@ -134,15 +155,25 @@ def test_every_value_of_a_recording_is_read(reader: str, tmp_path: Path) -> None
     expected = write_recording(tmp_path / "a.mcap")
     source, packages = MCAP_READERS[reader]
     output = run_program(source, packages, [str(tmp_path / "a.mcap")], tmp_path)
-    assert_equal(decode(output) if reader in ("mcap in Rust", "mcap in Go") else parse(output), expected)
+    assert_equal(
+        decode(output) if reader in ("mcap in Rust", "mcap in Go") else parse(output), expected
+    )
 
 
 def save_stream(folder: Path) -> tuple[Path, Values]:
     """Return the file that `save=` writes of a stream with all types, arrays, a text and two instances; its values."""
-    fields = {name.removesuffix("_t"): name for name in TYPES} | {f"{each}s": f"{each}[2]" for each in TYPES}
+    fields = {name.removesuffix("_t"): name for name in TYPES} | {
+        f"{each}s": f"{each}[2]" for each in TYPES
+    }
     fields = {"timestamp": "uint64_t", "text": "char[4]", **fields}
-    definition = "".join(f"{kind} {name};" for name, kind in fields.items()) + "uint8_t[5] _padding0;"
-    writer, values, rng = UlogWriter(), defaultdict[tuple[str, str], list[Any]](list), random.Random(1)
+    definition = (
+        "".join(f"{kind} {name};" for name, kind in fields.items()) + "uint8_t[5] _padding0;"
+    )
+    writer, values, rng = (
+        UlogWriter(),
+        defaultdict[tuple[str, str], list[Any]](list),
+        random.Random(1),
+    )
     writer.put("F", f"types:{definition}".encode())
     for instance in (0, 1):
         writer.put("A", struct.pack("<BH", instance, instance) + b"types")
@@ -164,10 +195,18 @@ def save_stream(folder: Path) -> tuple[Path, Values]:
             payload += data
             values[f"types/{time % 2}", name] += struct.unpack(code, data)
         writer.put("D", payload)
-    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=1.0))
-    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"}), save=str(folder / "saved")), client)
+    client = cast(
+        "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=1.0)
+    )
+    stream = LogStream(
+        "1", MavlinkOptions(log=frozenset({"1"}), save=str(folder / "saved")), client
+    )
     for start in range(0, len(writer.data), 249):
-        list(stream.add(Chunk("delivered", bytes(writer.data[start : start + 249]), begins=not start), 0.0))
+        list(
+            stream.add(
+                Chunk("delivered", bytes(writer.data[start : start + 249]), begins=not start), 0.0
+            )
+        )
     stream.end()
     [path] = (folder / "saved").iterdir()
     return path, values

@@ -71,7 +71,13 @@ print(get_type_hash("px4_msgs/msg/LogMessage", msg_definition=sys.stdin.read(), 
 def install(folder: Path, *packages: str) -> Path:
     """Install packages in a new environment; return its folder of programs. Skips without a package index."""
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, timeout=60)
-    command = [str(folder / "bin" / "pip"), "install", "--quiet", "--disable-pip-version-check", *packages]
+    command = [
+        str(folder / "bin" / "pip"),
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        *packages,
+    ]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
     except subprocess.TimeoutExpired:
@@ -86,12 +92,19 @@ def definitions() -> Iterator[dict[str, str]]:
     files = {"Basic": BASIC}
     for name, definition in MESSAGES.items():
         layouts = definition.layouts.values()
-        files |= {f"{name}L{number}": definition_text(definition, each) for number, each in enumerate(layouts)}
+        files |= {
+            f"{name}L{number}": definition_text(definition, each)
+            for number, each in enumerate(layouts)
+        }
     yield files
     others = [json.loads(line) for line in (DATA / "msg_releases.jsonl").read_text().splitlines()]
     assert len({each["message"] for each in others}) >= 10
     for release in ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main"):
-        yield {each["message"]: "\n".join(each["fields"]) for each in others if release in each["releases"]}
+        yield {
+            each["message"]: "\n".join(each["fields"])
+            for each in others
+            if release in each["releases"]
+        }
 
 
 @pytest.mark.slow
@@ -104,16 +117,34 @@ def test_hash_equals_that_of_ros_2(tmp_path: Path) -> None:
         (folder := tmp_path / str(number) / "msg").mkdir(parents=True)
         for name, text in files.items():
             (folder / f"{name}.msg").write_text(text)
-        command = [str(programs / "rosidl"), "hash", "-o", "out", "-I", f"px4_msgs:{folder.parent}", "px4_msgs"]
+        command = [
+            str(programs / "rosidl"),
+            "hash",
+            "-o",
+            "out",
+            "-I",
+            f"px4_msgs:{folder.parent}",
+            "px4_msgs",
+        ]
         command += [f"msg/{name}.msg" for name in files]
         environment = os.environ | {"AMENT_PREFIX_PATH": str(programs.parent)}
         done = subprocess.run(
-            command, cwd=folder.parent, env=environment, capture_output=True, text=True, timeout=120, check=False
+            command,
+            cwd=folder.parent,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
         )
         assert done.returncode == 0, done.stderr[-2000:]
         for name, text in files.items():
-            hashes = json.loads((folder.parent / "out" / "msg" / f"{name}.json").read_text())["type_hashes"]
-            expected = {each["type_name"]: each["hash_string"] for each in hashes}[f"px4_msgs/msg/{name}"]
+            hashes = json.loads((folder.parent / "out" / "msg" / f"{name}.json").read_text())[
+                "type_hashes"
+            ]
+            expected = {each["type_name"]: each["hash_string"] for each in hashes}[
+                f"px4_msgs/msg/{name}"
+            ]
             used = [each for each in files if re.search(rf"^{each}[ \[]", text, re.MULTILINE)]
             nested = "".join(f"{NESTED}{each}\n{files[each]}" for each in used)
             assert hash_of_msg(name, text + nested) == expected, (number, name)
@@ -129,9 +160,15 @@ def test_literal_hash_equals_that_of_libraries(package: str, tmp_path: Path) -> 
     (layout,) = definition.layouts.values()
     text = definition_text(definition, layout)
     command = [str(install(tmp_path / "venv", package) / "python"), "-c", LITERAL[package]]
-    done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, input=text, capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
     found = done.stdout.split()[-1]
-    assert found == hash_of_msg("LogMessage", text, literal_char=True) != hash_of(layout, ros2_type(definition))
+    assert (
+        found
+        == hash_of_msg("LogMessage", text, literal_char=True)
+        != hash_of(layout, ros2_type(definition))
+    )
     assert has_char_hash(found)
     assert message_of_type_hash(found) == (definition, layout)

@@ -9,7 +9,15 @@ from typing import Any, Final
 import pytest
 
 from docs.generator.vectors import VECTORS, definition_of, from_json, to_json
-from nedbus_msgs import BASES, MESSAGES, DecodeError, codec_of, field_type, provenance_of, upgrade_with
+from nedbus_msgs import (
+    BASES,
+    MESSAGES,
+    DecodeError,
+    codec_of,
+    field_type,
+    provenance_of,
+    upgrade_with,
+)
 from tests.nedbus_msgs.strategies import DATA
 
 from .programs import run_program
@@ -18,7 +26,10 @@ FILE: Final[dict[str, Any]] = json.loads(VECTORS.read_text())
 PROGRAMS: Final = {
     "node": ("vectors.mjs", ["@msgpack/msgpack"]),
     "g++": ("vectors.cpp", []),
-    "cargo": ("vectors.rs", ['rmpv = "1"', 'serde_json = { version = "1", features = ["float_roundtrip"] }']),
+    "cargo": (
+        "vectors.rs",
+        ['rmpv = "1"', 'serde_json = { version = "1", features = ["float_roundtrip"] }'],
+    ),
 }
 
 
@@ -41,7 +52,10 @@ def test_vector_is_encoded_and_decoded(vector: dict[str, Any]) -> None:
 def test_payload_not_written_by_nedbus_is_decoded(vector: dict[str, Any]) -> None:
     """Payloads in layouts or msgpack types that nedbus never writes are decoded to the same values."""
     definition = definition_of(vector["message"], FILE["definitions"])
-    types = {name: field_type(kind) for name, kind in FILE["definitions"][f"{vector['message']}/{vector['layout']}"]}
+    types = {
+        name: field_type(kind)
+        for name, kind in FILE["definitions"][f"{vector['message']}/{vector['layout']}"]
+    }
     expected = upgrade_with(definition, from_json(vector["values"], types))
     assert repr(codec_of(definition).decode(bytes.fromhex(vector["payload"]))) == repr(expected)
 
@@ -49,7 +63,9 @@ def test_payload_not_written_by_nedbus_is_decoded(vector: dict[str, Any]) -> Non
 @pytest.mark.parametrize("vector", cases("reject"))
 def test_invalid_vector_is_rejected(vector: dict[str, Any]) -> None:
     with pytest.raises(DecodeError):
-        codec_of(definition_of(vector["message"], FILE["definitions"])).decode(bytes.fromhex(vector["payload"]))
+        codec_of(definition_of(vector["message"], FILE["definitions"])).decode(
+            bytes.fromhex(vector["payload"])
+        )
 
 
 def test_vectors_cover_each_message_and_type() -> None:
@@ -63,7 +79,9 @@ def test_golden_payloads_remain_among_the_vectors() -> None:
     """The golden payloads of the first version are still among the test vectors."""
     payloads = {each["payload"] for each in FILE["exact"]}
     for name in ("golden.json", "golden_messages.json"):
-        assert {each["payload"] for each in json.loads((DATA / name).read_text()).values()} <= payloads
+        assert {
+            each["payload"] for each in json.loads((DATA / name).read_text()).values()
+        } <= payloads
 
 
 @pytest.mark.slow

@@ -126,7 +126,9 @@ def browser() -> Iterator[Browser]:
     if path is None:
         pytest.skip(f"not installed: {' or '.join(_NAMES)}")
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
+        started = playwright.chromium.launch(
+            executable_path=path, args=["--no-sandbox", "--disable-gpu"]
+        )
         yield started
         started.close()
 
@@ -150,7 +152,10 @@ class Tab:
         page.on("request", lambda request: self.requested.append(request.url))
         page.on("websocket", lambda socket: self.requested.append(socket.url))
         page.on("pageerror", lambda error: self.console_errors.append(str(error)))
-        page.on("console", lambda line: self.console_errors.append(line.text) if line.type == "error" else None)
+        page.on(
+            "console",
+            lambda line: self.console_errors.append(line.text) if line.type == "error" else None,
+        )
 
     def open(self, url: str) -> None:
         """Load the page and wait until it is drawn."""
@@ -165,7 +170,10 @@ class Tab:
     def rows(self, name: str) -> list[dict[str, Any]]:
         """Return the data of `source` as rows."""
         columns = self.source(name)
-        return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+        return [
+            dict(zip(columns, values, strict=True))
+            for values in zip(*columns.values(), strict=True)
+        ]
 
     @property
     def listed(self) -> list[dict[str, Any]]:
@@ -217,11 +225,16 @@ class Tab:
 
     def contrasts(self, *names: str) -> list[tuple[str, str, float]]:
         """Return each text of these parts with its contrast ratio to the background."""
-        return [(name, text, value) for name, text, value in self.page.evaluate(_CONTRAST, list(names))]
+        return [
+            (name, text, value) for name, text, value in self.page.evaluate(_CONTRAST, list(names))
+        ]
 
     def labels(self) -> list[tuple[str, float, float, float, float]]:
         """Return the labels on the map: text, left, top, right and bottom [pixels]."""
-        return [(text, left, top, right, low) for text, left, top, right, low in self.page.evaluate(_LABELS)]
+        return [
+            (text, left, top, right, low)
+            for text, left, top, right, low in self.page.evaluate(_LABELS)
+        ]
 
     def tap(self, east: float, north: float) -> None:
         """Click on the map at this position [m]."""
@@ -256,7 +269,11 @@ def open_tabs(browser: Browser, *, allow_console_errors: bool = False) -> Iterat
     try:
         yield make
         for tab in tabs:
-            hosts = {urlsplit(url).hostname for url in tab.requested if not url.startswith(("data:", "blob:"))}
+            hosts = {
+                urlsplit(url).hostname
+                for url in tab.requested
+                if not url.startswith(("data:", "blob:"))
+            }
             assert hosts <= {"127.0.0.1"}
             assert allow_console_errors or not tab.console_errors, tab.console_errors
     finally:

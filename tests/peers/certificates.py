@@ -44,7 +44,11 @@ def secure_endpoint() -> str:
 def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
     """Copy the shipped configuration named like `file`, with another endpoint and other replacements."""
     text = (CONFIG / file.name).read_text()
-    changes = {"/etc/nedbus/pki": str(pki), "tcp/0.0.0.0:7447": endpoint, "tls/0.0.0.0:7447": endpoint} | replaced
+    changes = {
+        "/etc/nedbus/pki": str(pki),
+        "tcp/0.0.0.0:7447": endpoint,
+        "tls/0.0.0.0:7447": endpoint,
+    } | replaced
     for old, new in changes.items():
         text = text.replace(old, new)
     file.write_text(text)
@@ -53,7 +57,11 @@ def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
 
 def tls_settings(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
     """Return the TLS settings of a client with the certificate `name`; None: without a certificate."""
-    own = {} if name is None else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
+    own = (
+        {}
+        if name is None
+        else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
+    )
     return {"tls_ca": pki / ca, **own}
 
 
@@ -64,4 +72,6 @@ def client_tls(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
 
 def tls_options(pki: Path, name: str | None) -> list[str]:
     """Return the TLS settings of `tls_settings` as command-line options."""
-    return [f"--{setting.replace('_', '-')}={path}" for setting, path in tls_settings(pki, name).items()]
+    return [
+        f"--{setting.replace('_', '-')}={path}" for setting, path in tls_settings(pki, name).items()
+    ]

@@ -47,7 +47,12 @@ def run_command(*arguments: str, **environment: str) -> CommandResult:
     exit_code, out, err = 0, io.BytesIO(), io.BytesIO()
     stdout = io.TextIOWrapper(out, "utf-8", write_through=True)
     stderr = io.TextIOWrapper(err, "utf-8", errors="backslashreplace", write_through=True)
-    with patch.dict(os.environ, _SIZE | environment), redirect_stdout(stdout), redirect_stderr(stderr), _as_process():
+    with (
+        patch.dict(os.environ, _SIZE | environment),
+        redirect_stdout(stdout),
+        redirect_stderr(stderr),
+        _as_process(),
+    ):
         try:
             _commands().main(arguments, prog_name="nedbus")
         except SystemExit as exc:
@@ -78,7 +83,9 @@ def fork_command(
     with Path(os.devnull).open("r+b") as null:
         streams = null.fileno(), out, null.fileno() if err is None else err
         started = without_coverage() | environment
-        return fork_server.start(("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams)
+        return fork_server.start(
+            ("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams
+        )
 
 
 @cache
@@ -90,15 +97,24 @@ def _commands() -> Any:
 @contextmanager
 def _as_process() -> Iterator[None]:
     """Save and restore process-wide state: logging, signal handlers and hooks for uncaught errors."""
-    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signals = {
+        number: signal.getsignal(number)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
     root = logging.getLogger()
     levels = {logger: logger.level for logger in (root, logging.getLogger("nedbus"))}
-    handlers, root.handlers = root.handlers, []  # otherwise pytest's handlers would count as a configured log
+    # otherwise pytest's handlers would count as a configured log
+    handlers, root.handlers = root.handlers, []
     hooks = sys.excepthook, threading.excepthook
     try:
         yield
     finally:
-        for limit in [each for handler in root.handlers for each in handler.filters if isinstance(each, RateLimit)]:
+        for limit in [
+            each
+            for handler in root.handlers
+            for each in handler.filters
+            if isinstance(each, RateLimit)
+        ]:
             limit.report()
             atexit.unregister(limit.report)
         root.handlers = handlers

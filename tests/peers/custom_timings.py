@@ -19,6 +19,8 @@ main()
 """
 
 
-def start_with_timings(start: Start, timings: Timings, *arguments: str, **environment: str) -> Process:
+def start_with_timings(
+    start: Start, timings: Timings, *arguments: str, **environment: str
+) -> Process:
     """Start `nedbus` with these timings and arguments."""
     return start("-c", _SCRIPT, repr(timings), *arguments, **environment)

@@ -20,7 +20,14 @@ import types
 from contextlib import suppress
 from typing import Any, Final
 
-_PRELOADED: Final = ("nedbus.cli.app", "numpy", "rich.console", "rich.live", "prometheus_client", "http.server")
+_PRELOADED: Final = (
+    "nedbus.cli.app",
+    "numpy",
+    "rich.console",
+    "rich.live",
+    "prometheus_client",
+    "http.server",
+)
 _DUMP_STACKS: Final = signal.SIGRTMIN
 """Signal that makes a process write the stacks of all its threads to pytest's terminal."""
 _TERMINAL: Final = 100
@@ -105,9 +112,11 @@ if __name__ == "__main__":
     for _name in _PRELOADED:
         importlib.import_module(_name)
     gc.collect()
-    gc.freeze()  # otherwise the final garbage collection of each child would copy all of these pages
+    # otherwise the final garbage collection of each child would copy all of these pages
+    gc.freeze()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # reap children automatically
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for pytest, which stops the server by closing the socket
+    # Ctrl-C is for pytest, which stops the server by closing the socket
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _request = _serve(socket.socket(fileno=int(sys.argv[1])))
     if _request is not None:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -40,5 +40,10 @@ class HttpClient:
 
     def values(self, name: str, **labels: str) -> list[float]:
         """Return the values of all series of a metric that have these labels."""
-        samples = [each for family in self.families().values() for each in family.samples if each.name == name]
+        samples = [
+            each
+            for family in self.families().values()
+            for each in family.samples
+            if each.name == name
+        ]
         return [each.value for each in samples if labels.items() <= each.labels.items()]

@@ -15,10 +15,14 @@ from tests.waits import DEADLINE
 class Listener:
     """A listening live source: pending messages, all rejections, and the topics that are currently unavailable."""
 
-    def __init__(self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None) -> None:
+    def __init__(
+        self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None
+    ) -> None:
         source = parse_source(text).open_source(vehicle="1", routers=routers)
         assert isinstance(source, LiveSource)
-        self._events = cast("Generator[SourceMessage | Rejection | UnavailableTopics | None]", source.listen(router))
+        self._events = cast(
+            "Generator[SourceMessage | Rejection | UnavailableTopics | None]", source.listen(router)
+        )
         self.messages: list[SourceMessage] = []
         self.rejections: list[Rejection] = []
         self.unavailable = UnavailableTopics()

@@ -15,7 +15,11 @@ _ports = islice(cycle(range(10_000, 32_000)), os.getpid() * 2503 % 22_000, None)
 def free_port() -> int:
     """Return a port that is free for TCP and UDP."""
     for port in _ports:
-        with suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+        with (
+            suppress(OSError),
+            socket.socket() as tcp,
+            socket.socket(type=socket.SOCK_DGRAM) as udp,
+        ):
             tcp.bind(("127.0.0.1", port))
             udp.bind(("127.0.0.1", port))
             return port

@@ -70,7 +70,12 @@ class ForkServer:
             )
 
     def start(
-        self, arguments: Sequence[str], *, cwd: Path, environment: dict[str, str], streams: tuple[int, int, int]
+        self,
+        arguments: Sequence[str],
+        *,
+        cwd: Path,
+        environment: dict[str, str],
+        streams: tuple[int, int, int],
     ) -> ForkedProcess:
         """Fork a process with these arguments of `python`, and these standard streams."""
         request = {"arguments": arguments, "cwd": str(cwd), "environment": environment}
@@ -88,18 +93,30 @@ class Process:
     """A process that a test starts, with its output in files."""
 
     def __init__(
-        self, command: Sequence[str], where: Path, environment: dict[str, str], fork_server: ForkServer | None = None
+        self,
+        command: Sequence[str],
+        where: Path,
+        environment: dict[str, str],
+        fork_server: ForkServer | None = None,
     ) -> None:
         self._measured = any(name.startswith("COVERAGE_") for name in environment)
         self._out = where / "stdout"
         self._err = where / "stderr"
         self.popen: ForkedProcess | subprocess.Popen[bytes]
-        with self._out.open("wb") as out, self._err.open("wb") as err, Path(os.devnull).open("rb") as null:
+        with (
+            self._out.open("wb") as out,
+            self._err.open("wb") as err,
+            Path(os.devnull).open("rb") as null,
+        ):
             if fork_server is not None:
                 streams = null.fileno(), out.fileno(), err.fileno()
-                self.popen = fork_server.start(command[1:], cwd=where, environment=environment, streams=streams)
+                self.popen = fork_server.start(
+                    command[1:], cwd=where, environment=environment, streams=streams
+                )
             else:
-                self.popen = subprocess.Popen(command, stdin=null, stdout=out, stderr=err, cwd=where, env=environment)
+                self.popen = subprocess.Popen(
+                    command, stdin=null, stdout=out, stderr=err, cwd=where, env=environment
+                )
 
     @property
     def out(self) -> str:
@@ -118,7 +135,9 @@ class Process:
             with suppress(subprocess.TimeoutExpired):
                 self.popen.wait(DEADLINE)
             output = f"{self.out[-_MAX_SHOWN:]}{self.err[-_MAX_SHOWN:]}"
-            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; its output:\n{output}")
+            pytest.fail(
+                f"{self.popen.args!r} did not end within {seconds} s; its output:\n{output}"
+            )
 
     def signal(self, number: signal.Signals) -> None:
         if self._measured and number == signal.SIGINT:

@@ -20,7 +20,8 @@ PACKAGING: Final = Path(__file__).parents[2] / "packaging"
 ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
 # `start` starts Python; this script opens a file as stdin and replaces itself with another program.
 _EXEC_SCRIPT: Final = (
-    "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
+    "import os, sys; "
+    "os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
 )
 
 
@@ -43,10 +44,15 @@ class Prometheus:
     def __init__(self, start: Start, folder: Path, rules: str, jobs: dict[str, list[str]]) -> None:
         program = find_program("prometheus")
         (folder / "alerts.yml").write_text(rules)
-        scraped = [{"job_name": job, "static_configs": [{"targets": targets}]} for job, targets in jobs.items()]
+        scraped = [
+            {"job_name": job, "static_configs": [{"targets": targets}]}
+            for job, targets in jobs.items()
+        ]
         every = {"scrape_interval": "1s", "scrape_timeout": "1s", "evaluation_interval": "1s"}
         config = folder / "prometheus.yml"  # JSON is YAML
-        config.write_text(json.dumps({"global": every, "rule_files": ["alerts.yml"], "scrape_configs": scraped}))
+        config.write_text(
+            json.dumps({"global": every, "rule_files": ["alerts.yml"], "scrape_configs": scraped})
+        )
         self._url = f"http://127.0.0.1:{free_port()}"
         self.process = start(
             "-c", _EXEC_SCRIPT, os.devnull, program,
@@ -57,12 +63,20 @@ class Prometheus:
 
     def alerts(self, name: str, **labels: str) -> list[dict[str, str]]:
         """Return the labels of the alert's firing instances that have these labels."""
-        firing = [each["labels"] for each in self._get("/api/v1/alerts")["alerts"] if each["state"] == "firing"]
+        firing = [
+            each["labels"]
+            for each in self._get("/api/v1/alerts")["alerts"]
+            if each["state"] == "firing"
+        ]
         return [each for each in firing if {"alertname": name, **labels}.items() <= each.items()]
 
     def annotations(self) -> list[str]:
         """Return the annotations of all alerts, including pending ones."""
-        return [text for each in self._get("/api/v1/alerts")["alerts"] for text in each["annotations"].values()]
+        return [
+            text
+            for each in self._get("/api/v1/alerts")["alerts"]
+            for text in each["annotations"].values()
+        ]
 
     def query(self, expression: str) -> list[tuple[dict[str, str], float]]:
         """Return the labels and the current value of each series of an expression."""

@@ -40,9 +40,11 @@ The header is short, because on a very busy machine a long one is refused, as on
 START, STOP = dialect.MAV_CMD_LOGGING_START, dialect.MAV_CMD_LOGGING_STOP
 HEARTBEAT: Final = 0
 _DATA, _ACKED = dialect.MAVLINK_MSG_ID_LOGGING_DATA, dialect.MAVLINK_MSG_ID_LOGGING_DATA_ACKED
-_FIELDS: Final = struct.Struct("<HBBBB")  # sequence, target ids, length, first_message_offset; then the data
+# sequence, target ids, length, first_message_offset; then the data
+_FIELDS: Final = struct.Struct("<HBBBB")
 _REPEAT: Final = 0.05  # s; retransmission interval without an acknowledgement
-_DATA_SIZE, _NO_RECORD = 249, 255  # bytes; first_message_offset of a message in which no record begins
+# bytes; first_message_offset of a message in which no record begins
+_DATA_SIZE, _NO_RECORD = 249, 255
 _OTHER_LINK: Final = (0, 0)  # ids of a client on another link
 _MAX_LATE: Final = 5  # frames
 _SENDS: Final = 50  # transmissions of one message after which the stream ends
@@ -112,7 +114,9 @@ def stream_message(frame: bytes) -> Message | None:
     if number not in (_DATA, _ACKED):
         return None
     sequence, _, _, length, offset = _FIELDS.unpack_from(payload.ljust(_FIELDS.size, b"\0"))
-    return Message(number == _ACKED, sequence, offset, payload[_FIELDS.size :][:length].ljust(length, b"\0"))
+    return Message(
+        number == _ACKED, sequence, offset, payload[_FIELDS.size :][:length].ljust(length, b"\0")
+    )
 
 
 def read_recording(path: Path) -> Recording:
@@ -137,15 +141,22 @@ def read_recording(path: Path) -> Recording:
             recording.entries.append(Entry(now, message))
             if last is not None and message.sequence != (last + 1) % 2**16:
                 data.clear()
-            data += message.data if data or message.offset == 255 else message.data[message.offset :]
+            data += (
+                message.data if data or message.offset == 255 else message.data[message.offset :]
+            )
             last = message.sequence
             for kind, body in split_records(data):
                 if kind == "A":
                     record = struct.pack("<HB", len(body), ord(kind)) + body
                     recording.definitions.append((len(recording.entries), record))
-        elif number == dialect.MAVLINK_MSG_ID_COMMAND_ACK and payload[:2] in (b"\xce\x09", b"\xcf\x09"):
+        elif number == dialect.MAVLINK_MSG_ID_COMMAND_ACK and payload[:2] in (
+            b"\xce\x09",
+            b"\xcf\x09",
+        ):
             is_stopping = is_stopping or payload[:2] == b"\xcf\x09"
-        elif number == dialect.MAVLINK_MSG_ID_TIMESYNC and (answer := int.from_bytes(payload[:8], "little")):
+        elif number == dialect.MAVLINK_MSG_ID_TIMESYNC and (
+            answer := int.from_bytes(payload[:8], "little")
+        ):
             recording.clock.append((now, answer))
         else:
             recording.entries.append(Entry(now, frame))
@@ -243,27 +254,40 @@ class Px4LogStream:
         self.dropped = self.late = self.streams = 0
         self.finished = threading.Event()
         self.recording, self._port, self._speed, self._is_ready = recording, port, speed, is_ready
-        self._loss, self._burst, self._reorder, self._random = loss / burst, burst, reorder, random.Random(seed)
+        self._loss, self._burst, self._reorder, self._random = (
+            loss / burst,
+            burst,
+            reorder,
+            random.Random(seed),
+        )
         self._round_trip = round_trip if round_trip is not None else _ROUND_TRIP if speed else 0.0
         self._refusal, self._answers, self._unsent, self._waits = refusal, answers, unsent, waits
         self._events, self._on_send = deque(sorted((events or {}).items())), on_send
         self._on_message = on_message
         self._triggered: deque[Event] = deque()
         self._ports = [port] if second_port is None else [port, second_port]
-        self._streamer: tuple[int, tuple[int, int]] | None = None  # port and ids of the client that has the stream
+        # port and ids of the client that has the stream
+        self._streamer: tuple[int, tuple[int, int]] | None = None
         self._mav = dialect.MAVLink(None, recording.system, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
         self._crc_extra: dict[int, int] = {}
-        self._answers_due: deque[tuple[float, int, int]] = deque()  # to TIMESYNC: when, its time, the port
-        self._held: list[tuple[int, bytes, int]] = []  # late frames: the number of the frame that they follow
+        # to TIMESYNC: when, its time, the port
+        self._answers_due: deque[tuple[float, int, int]] = deque()
+        # late frames: the number of the frame that they follow
+        self._held: list[tuple[int, bytes, int]] = []
         self._frames = self._drops_left = self._data_sent = self._newest = 0
-        self._unnoticed: list[int] = []  # LOGGING_DATA that were dropped since the last one that arrived
+        # LOGGING_DATA that were dropped since the last one that arrived
+        self._unnoticed: list[int] = []
         self._is_gone = False
         self._busy_until = self._next_heartbeat = 0.0
         self._is_full, self._next_look = False, 0
-        self._heartbeat = next(each for _, each in recording.entries if isinstance(each, bytes) and is_heartbeat(each))
+        self._heartbeat = next(
+            each for _, each in recording.entries if isinstance(each, bytes) and is_heartbeat(each)
+        )
         self._rewind()
-        self._stream: _Stream | None = _Stream(owner, is_owner_on_link, sequence=5000) if owner else None
+        self._stream: _Stream | None = (
+            _Stream(owner, is_owner_on_link, sequence=5000) if owner else None
+        )
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
@@ -348,7 +372,11 @@ class Px4LogStream:
             return 0.0005
         if self._is_held or self._index == len(entries):
             return _MAX_IDLE
-        return min(_MAX_IDLE, max(0.0, entries[self._index].time - self._clock)) if self._speed else 0.0
+        return (
+            min(_MAX_IDLE, max(0.0, entries[self._index].time - self._clock))
+            if self._speed
+            else 0.0
+        )
 
     def _handle(self, message: Any, now: float, port: int) -> None:
         ids, stream = (message.get_srcSystem(), message.get_srcComponent()), self._stream
@@ -356,13 +384,19 @@ class Px4LogStream:
             case "COMMAND_LONG":
                 self.commands.append(message.command)
                 if message.command in (START, STOP) and self._answers:
-                    self._queue.append(_Request(message.command, ids, self._stop_from is not None, port))
+                    self._queue.append(
+                        _Request(message.command, ids, self._stop_from is not None, port)
+                    )
                 self._is_held = self._is_held and message.command != START
             case "LOGGING_ACK" if stream and stream.sends and stream.acknowledged is None:
                 if message.sequence == stream.pending[0].sequence:
-                    stream.acknowledged = max(now, stream.sent - _REPEAT * (stream.sends - 1) + self._round_trip)
+                    stream.acknowledged = max(
+                        now, stream.sent - _REPEAT * (stream.sends - 1) + self._round_trip
+                    )
             case "TIMESYNC" if message.tc1 == 0:
-                self._answers_due.append((now + max(0.0, self._round_trip - _ROUND_TRIP), message.ts1, port))
+                self._answers_due.append(
+                    (now + max(0.0, self._round_trip - _ROUND_TRIP), message.ts1, port)
+                )
 
     def _boot_ns(self) -> int:
         """Return the time of the vehicle, interpolated from its recorded replies to TIMESYNC."""
@@ -417,7 +451,8 @@ class Px4LogStream:
             self._answer(request, dialect.MAV_RESULT_TEMPORARILY_REJECTED)
         else:
             self._answer(request, dialect.MAV_RESULT_ACCEPTED)
-            if request.during_stop or self._unsent:  # the first message of this stream is never delivered
+            # the first message of this stream is never delivered
+            if request.during_stop or self._unsent:
                 self._unsent, self._busy_until = max(0, self._unsent - 1), now + _BLOCKED
             else:
                 self._stream = self._begin(request)
@@ -437,7 +472,9 @@ class Px4LogStream:
             stream.expected = recording.header[-1].sequence + 1
         first = stream.pending[0]
         boot_us = int.from_bytes(first.data[8:16], "little") + self.streams
-        stream.pending[0] = first._replace(data=first.data[:8] + boot_us.to_bytes(8, "little") + first.data[16:])
+        stream.pending[0] = first._replace(
+            data=first.data[:8] + boot_us.to_bytes(8, "little") + first.data[16:]
+        )
         self.streams += 1
         self._clock = max(self._clock, recording.start)
         return stream
@@ -445,7 +482,9 @@ class Px4LogStream:
     def _append_tail(self, stream: _Stream) -> None:
         """Queue the rest of the current record, then PX4's messages after STOP."""
         tail = self.recording.tail
-        messages = [each for _, each in self.recording.entries[self._index :] if isinstance(each, Message)]
+        messages = [
+            each for _, each in self.recording.entries[self._index :] if isinstance(each, Message)
+        ]
         if messages and tail:
             tail = [tail[0]._replace(offset=0, data=tail[0].data[tail[0].offset :]), *tail[1:]]
         for each in messages if stream.expected is not None else []:
@@ -486,12 +525,17 @@ class Px4LogStream:
     def _send_entry(self, message: Message) -> None:
         """Send a message of the recording if a stream is active, beginning with its first complete record."""
         stream = self._stream
-        if stream is None or self._stop_from or (stream.expected is None and message.offset == _NO_RECORD):
+        if (
+            stream is None
+            or self._stop_from
+            or (stream.expected is None and message.offset == _NO_RECORD)
+        ):
             return
         if stream.expected is None:
             message = message._replace(offset=0, data=message.data[message.offset :])
         else:
-            stream.sequence += (message.sequence - stream.expected) % 2**16  # lost before it was recorded
+            # lost before it was recorded
+            stream.sequence += (message.sequence - stream.expected) % 2**16
         stream.expected = message.sequence + 1
         if not stream.is_on_link:
             stream.sequence += 1
@@ -502,11 +546,19 @@ class Px4LogStream:
             stream.sequence += 1
 
     def _send_message(self, stream: _Stream, message: Message) -> None:
-        kind = dialect.MAVLink_logging_data_acked_message if message.acked else dialect.MAVLink_logging_data_message
+        kind = (
+            dialect.MAVLink_logging_data_acked_message
+            if message.acked
+            else dialect.MAVLink_logging_data_message
+        )
         data = message.data.ljust(_DATA_SIZE, b"\0")
         self._data_sent += not message.acked
         number = 0 if message.acked else self._data_sent
-        self._send(kind(*stream.ids, message.sequence, len(message.data), message.offset, [*data]), number, stream.port)
+        self._send(
+            kind(*stream.ids, message.sequence, len(message.data), message.offset, [*data]),
+            number,
+            stream.port,
+        )
 
     def _answer(self, request: _Request, result: int) -> None:
         if request.ids != _OTHER_LINK:
@@ -559,7 +611,9 @@ class Px4LogStream:
         """Return a frame with the next MAVLink sequence number of this link."""
         number, _ = unpack(frame)
         if number not in self._crc_extra:  # some messages are not in this dialect
-            self._crc_extra[number] = next(each for each in range(256) if _crc(frame[:-2], each) == frame[-2:])
+            self._crc_extra[number] = next(
+                each for each in range(256) if _crc(frame[:-2], each) == frame[-2:]
+            )
         frame = frame[:4] + bytes([self._frames % 256]) + frame[5:-2]
         return frame + _crc(frame, self._crc_extra[number])
 
@@ -580,7 +634,9 @@ def is_heartbeat(frame: bytes) -> bool:
 def queued_bytes(port: int) -> int:
     """Return the number of unread bytes in the receive buffers of a UDP port."""
     rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
-    return sum(int(row[4].split(":")[1], 16) for row in rows if int(row[1].split(":")[1], 16) == port)
+    return sum(
+        int(row[4].split(":")[1], 16) for row in rows if int(row[1].split(":")[1], 16) == port
+    )
 
 
 def _crc(frame: bytes, extra: int) -> bytes:

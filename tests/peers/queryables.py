@@ -13,7 +13,9 @@ from tests.waits import DEADLINE
 
 
 @contextmanager
-def answer_queries(session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]) -> Iterator[None]:
+def answer_queries(
+    session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]
+) -> Iterator[None]:
     """Declare a queryable for `key_expr` that the router has registered before the block begins."""
     queryable = session.declare_queryable(key_expr, zenoh.handlers.Callback(reply, indirect=False))
     token_keys(

@@ -29,8 +29,12 @@ def zenohd_path() -> Path:
     unpacked = ROOT / "build" / f"zenohd-{hashlib.sha256(ARCHIVE.read_bytes()).hexdigest()[:12]}"
     if not unpacked.is_dir():
         unpacked.parent.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=unpacked.parent) as folder, tarfile.open(ARCHIVE) as archive:
-            archive.extraction_filter = getattr(tarfile, "data_filter", None)  # missing in Debian's Python 3.11.2
+        with (
+            tempfile.TemporaryDirectory(dir=unpacked.parent) as folder,
+            tarfile.open(ARCHIVE) as archive,
+        ):
+            # missing in Debian's Python 3.11.2
+            archive.extraction_filter = getattr(tarfile, "data_filter", None)
             for member in archive:
                 archive.extract(member, folder)
             try:

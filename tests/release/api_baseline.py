@@ -25,7 +25,8 @@ from nedbus_msgs import MESSAGES
 ROOT: Final = Path(__file__).parents[2]
 BASELINE: Final = ROOT / "packaging" / "public_api.pyi.txt"
 MODULES: Final = (*PUBLIC_MODULES, "nedbus_msgs")
-_NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")  # not created by scripts
+# not created by scripts
+_NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")
 _DECORATORS: Final = ("property", "staticmethod", "classmethod")
 
 
@@ -47,7 +48,11 @@ def find_breakages(old: str, new: str) -> Iterator[str]:
     before, after = (griffe.visit("api", Path("api.py"), code=text) for text in (old, new))
     for breakage in griffe.find_breaking_changes(before, after):
         name = breakage.obj.path.removeprefix("api.").replace("__", ".", 1)
-        values = (getattr(each, "name", each) for each in (breakage.old_value, breakage.new_value) if each is not None)
+        values = (
+            getattr(each, "name", each)
+            for each in (breakage.old_value, breakage.new_value)
+            if each is not None
+        )
         yield f"{name}: {breakage.kind.value} ({' -> '.join(map(str, values))})"
 
 
@@ -56,9 +61,13 @@ def describe_api() -> str:
     loader = griffe.GriffeLoader(search_paths=[str(ROOT / "service"), str(ROOT / "schemas")])
     loader.load("nedbus_msgs")
     loader.load("nedbus")
-    logging.getLogger("griffe").setLevel(logging.ERROR)  # otherwise it warns of packages that are not loaded
+    # otherwise it warns of packages that are not loaded
+    logging.getLogger("griffe").setLevel(logging.ERROR)
     loader.resolve_aliases(implicit=True)
-    lines, seen = [f"# nedbus {nedbus.__version__}, written by `make api-baseline`"], dict[str, str]()
+    lines, seen = (
+        [f"# nedbus {nedbus.__version__}, written by `make api-baseline`"],
+        dict[str, str](),
+    )
     for module in MODULES:
         imported = import_module(module)
         lines += ["", f"class {module.replace('.', '__')}:"]
@@ -84,8 +93,12 @@ def _find(loader: griffe.GriffeLoader, module: ModuleType, name: str) -> griffe.
 def _stub(name: str, found: griffe.Object) -> Iterator[str]:
     if isinstance(found, griffe.Class):
         yield f"class {name}({', '.join(str(base).partition('[')[0] for base in found.bases)}):"
-        members = {key: member for key, member in found.all_members.items() if not key.startswith("_")}
-        if "__init__" in found.all_members and not _NOT_MADE.search(found.docstring.value if found.docstring else ""):
+        members = {
+            key: member for key, member in found.all_members.items() if not key.startswith("_")
+        }
+        if "__init__" in found.all_members and not _NOT_MADE.search(
+            found.docstring.value if found.docstring else ""
+        ):
             members["__init__"] = found.all_members["__init__"]
         for key, member in sorted(members.items()):
             target = member.final_target if isinstance(member, griffe.Alias) else member

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
-_ROOT_ONLY: Final = "tests.nedbus.test_atomic_write::test_folder_without_read_permission_is_not_synced"
+_ROOT_ONLY: Final = (
+    "tests.nedbus.test_atomic_write::test_folder_without_read_permission_is_not_synced"
+)
 _LANGUAGES: Final = "tests.other_languages"
 _LANGUAGE: Final = f"{_LANGUAGES}.test_vectors::test_program_in_another_language_conforms"
 _PACKAGES: Final = "needs the tools of a language, and packages from its registry"
@@ -52,7 +54,13 @@ def summarize(files: Sequence[Path], known: dict[str, str]) -> tuple[list[str], 
             continue
         for case in cases:
             found = {child.tag: child for child in case}
-            kind = "failed" if found.keys() & {"failure", "error"} else "skipped" if "skipped" in found else "passed"
+            kind = (
+                "failed"
+                if found.keys() & {"failure", "error"}
+                else "skipped"
+                if "skipped" in found
+                else "passed"
+            )
             name = f"{case.get('classname')}::{case.get('name')}"
             outcomes[kind].add(name)
             if kind == "skipped":
@@ -60,7 +68,9 @@ def summarize(files: Sequence[Path], known: dict[str, str]) -> tuple[list[str], 
     failed = outcomes["failed"]
     passed = outcomes["passed"] - failed
     skipped = outcomes["skipped"] - passed - failed
-    unknown = {name for name in skipped if name not in known and name.partition("[")[0] not in known}
+    unknown = {
+        name for name in skipped if name not in known and name.partition("[")[0] not in known
+    }
     good = bool(passed) and not (failed or unknown or lines)
     listed = Counter((name in unknown, name.partition("[")[0], reasons[name]) for name in skipped)
     for (is_unknown, name, reason), count in sorted(listed.items()):
@@ -71,9 +81,15 @@ def summarize(files: Sequence[Path], known: dict[str, str]) -> tuple[list[str], 
 
 def main() -> None:
     """Print the summary of these files."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("files", nargs="+", type=Path)
-    parser.add_argument("--newest", action="store_true", help="run of .ci/newest: no counts, and more may be skipped")
+    parser.add_argument(
+        "--newest",
+        action="store_true",
+        help="run of .ci/newest: no counts, and more may be skipped",
+    )
     arguments = parser.parse_args()
     lines, good = summarize(arguments.files, KNOWN | NEWEST if arguments.newest else KNOWN)
     sys.stdout.writelines(f"{line}\n" for line in (lines[:-1] if arguments.newest else lines))

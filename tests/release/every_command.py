@@ -133,7 +133,9 @@ def allowed_packages(extras: Iterable[str]) -> frozenset[str]:
         except metadata.PackageNotFoundError:  # for another platform
             continue
     names = metadata.packages_distributions()
-    return frozenset(name for name, owners in names.items() if distributions & set(map(_normalized, owners)))
+    return frozenset(
+        name for name, owners in names.items() if distributions & set(map(_normalized, owners))
+    )
 
 
 def _normalized(distribution: str) -> str:
@@ -183,7 +185,9 @@ def problems(extras: Sequence[str]) -> list[str]:
             started.append((case, folder, _start(case, folder)))
         for case, folder, pid in started:
             code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-            found.append(problem_of(case, code, (folder / "out").read_text(), (folder / "err").read_text()))
+            found.append(
+                problem_of(case, code, (folder / "out").read_text(), (folder / "err").read_text())
+            )
     return [problem for problem in found if problem]
 
 
@@ -197,7 +201,9 @@ def main() -> int:
     wrong = problems(extras)
     for problem in wrong:
         print(problem, file=sys.stderr)
-    print(f"{len(RUNS)} commands with extras {extras}: {len(wrong)} problems, {time.monotonic() - start:.1f} s")
+    print(
+        f"{len(RUNS)} commands with extras {extras}: {len(wrong)} problems, {time.monotonic() - start:.1f} s"
+    )
     return 1 if wrong else 0
 
 

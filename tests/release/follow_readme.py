@@ -45,14 +45,27 @@ class Clone:
         self.path = folder / "nedbus"
         self._output = folder / "output"
         self._number = 0
-        kept = ("HOME", "PATH", "LANG", "TMPDIR", "PIP_CONFIG_FILE", "PIP_INDEX_URL", "PIP_CERT", "SSL_CERT_FILE")
+        kept = (
+            "HOME",
+            "PATH",
+            "LANG",
+            "TMPDIR",
+            "PIP_CONFIG_FILE",
+            "PIP_INDEX_URL",
+            "PIP_CERT",
+            "SSL_CERT_FILE",
+        )
         self._environment = {name: value for name, value in os.environ.items() if name in kept}
         self._environment["PATH"] = os.pathsep.join(
-            each for each in self._environment["PATH"].split(os.pathsep) if not each.startswith(str(ROOT))
+            each
+            for each in self._environment["PATH"].split(os.pathsep)
+            if not each.startswith(str(ROOT))
         )
         subprocess.run(["git", "clone", "-q", ROOT, self.path], check=True)
 
-    def run(self, command: str, *, codes: frozenset[int] = frozenset({0}), seconds: float = _WAIT) -> str:
+    def run(
+        self, command: str, *, codes: frozenset[int] = frozenset({0}), seconds: float = _WAIT
+    ) -> str:
         """Run a command to its end; return its output."""
         with self.start(command) as (process, read):
             try:
@@ -79,7 +92,10 @@ class Clone:
             yield
             os.killpg(process.pid, signal.SIGINT)
             code = process.wait(_WAIT)
-            check(code in _ENDED and "Traceback" not in read(), f"{command}: exit {code} after Ctrl-C\n{read()}")
+            check(
+                code in _ENDED and "Traceback" not in read(),
+                f"{command}: exit {code} after Ctrl-C\n{read()}",
+            )
 
     @contextmanager
     def start(self, command: str) -> Iterator[tuple[subprocess.Popen[bytes], Callable[[], str]]]:
@@ -117,14 +133,19 @@ def section(title: str) -> tuple[list[Block], str]:
     lines = readme.read_text().splitlines()
     start = lines.index(f"## {title}") + 1
     end = next(index for index in range(start, len(lines)) if lines[index].startswith("## "))
-    return [block for block in blocks_of(readme) if start < block.line <= end], "\n".join(lines[start:end])
+    return [block for block in blocks_of(readme) if start < block.line <= end], "\n".join(
+        lines[start:end]
+    )
 
 
 def _start(clone: Clone, blocks: list[Block], service: ExitStack) -> None:
     make_run, position, script, output, web = blocks
     check(make_run.text == "make run\n", f"{make_run}: no handler")
     service.enter_context(clone.running("make run", "In a second terminal", seconds=_INSTALL))
-    check(script.text == (ROOT / "examples/position.py").read_text(), f"{script}: differs from the example")
+    check(
+        script.text == (ROOT / "examples/position.py").read_text(),
+        f"{script}: differs from the example",
+    )
     check(bool(_POSITION.match(output.text)), f"{output}: no position")
     (command,) = position.commands
     clone.run_until(command, _POSITION.pattern)
@@ -141,7 +162,10 @@ def _your_vehicle(clone: Clone, blocks: list[Block], _: ExitStack) -> None:
     mavlink = [command for command in serve.commands if "mavlink:" in command]
     for command in mavlink:
         shown = clone.run(activated(command), codes=frozenset({2}))
-        check(len(shown.splitlines()) == 1 and ".[mavlink]" in shown, f"{command} without the extra: {shown}")
+        check(
+            len(shown.splitlines()) == 1 and ".[mavlink]" in shown,
+            f"{command} without the extra: {shown}",
+        )
     clone.run(activated('pip install -e ".[mavlink]"'), seconds=_INSTALL)
     for command in serve.commands:
         check(command.startswith("nedbus serve --source "), f"{serve}: no handler for {command!r}")
@@ -154,7 +178,10 @@ def _everyday_commands(clone: Clone, blocks: list[Block], service: ExitStack) ->
     text = section("Everyday commands")[1]
     commands = re.findall(r"^\| `(nedbus [^`]+)` \|", text, re.MULTILINE)
     service.enter_context(clone.running("make run", "In a second terminal"))
-    endless = {"nedbus echo": "vehicle_local_position|m north", "nedbus hz": "1/vehicle_local_position"}
+    endless = {
+        "nedbus echo": "vehicle_local_position|m north",
+        "nedbus hz": "1/vehicle_local_position",
+    }
     for command in commands:
         if command in endless:
             clone.run_until(activated(command), endless[command])
@@ -173,7 +200,10 @@ def _other_hosts(clone: Clone, blocks: list[Block], _: ExitStack) -> None:
     serve, echo = block.commands
     remote = re.sub(r"tcp/192\.168\.1\.5:", "tcp/127.0.0.1:", echo)
     check(remote != echo and remote.startswith("nedbus echo "), f"{block}: no handler for {echo!r}")
-    check("there, after pip install /path/to/the/clone" in block.text, f"{block}: names another install line")
+    check(
+        "there, after pip install /path/to/the/clone" in block.text,
+        f"{block}: names another install line",
+    )
     other = clone.path.parent / "other"
     clone.run(f"python3 -m venv {other} && {other}/bin/pip install {clone.path}", seconds=_INSTALL)
     with clone.running(activated(serve), "router on"):
@@ -182,15 +212,22 @@ def _other_hosts(clone: Clone, blocks: list[Block], _: ExitStack) -> None:
 
 def main() -> None:
     """Follow the page; print each command, and raise AssertionError at the first fault."""
-    handlers = dict(zip(SECTIONS, (_start, _your_vehicle, _everyday_commands, _other_hosts), strict=True))
+    handlers = dict(
+        zip(SECTIONS, (_start, _your_vehicle, _everyday_commands, _other_hosts), strict=True)
+    )
     begin = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         clone = Clone(Path(folder))
         for title, follow in handlers.items():
             blocks, text = section(title)
-            unknown = [each for each in _COMMAND.findall(text) if each not in _IN_TEXT and f"| `{each}` |" not in text]
+            unknown = [
+                each
+                for each in _COMMAND.findall(text)
+                if each not in _IN_TEXT and f"| `{each}` |" not in text
+            ]
             check(not unknown, f"README.md, {title}: no handler for {unknown}")
-            with ExitStack() as service:  # ends with its section: the page stops it before the next one
+            # ends with its section: the page stops it before the next one
+            with ExitStack() as service:
                 follow(clone, blocks, service)
     print(f"README.md: all commands of {', '.join(SECTIONS)} run, {time.monotonic() - begin:.0f} s")
 

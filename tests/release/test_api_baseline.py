@@ -41,7 +41,8 @@ def test_public_api_is_compatible_with_last_release() -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "same"), [("0.1.0", "0.1.9", True), ("0.1.0", "0.2.0", False), ("1.0.0", "1.9.0", True)]
+    ("one", "other", "same"),
+    [("0.1.0", "0.1.9", True), ("0.1.0", "0.2.0", False), ("1.0.0", "1.9.0", True)],
 )
 def test_compatible_versions_share_a_range(one: str, other: str, same: bool) -> None:
     assert (compatible_range(one) == compatible_range(other)) is same

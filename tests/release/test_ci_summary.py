@@ -10,7 +10,9 @@ from tests.release.ci_summary import KNOWN, NEWEST, summarize
 
 ROOT = Path(__file__).parents[2]
 PASSED = '<testcase classname="tests.test_a" name="test_one"/>'
-FAILED = '<testcase classname="tests.test_a" name="test_one"><failure message="assert 1"/></testcase>'
+FAILED = (
+    '<testcase classname="tests.test_a" name="test_one"><failure message="assert 1"/></testcase>'
+)
 SKIPPED = '<testcase classname="tests.test_a" name="test_two[1]"><skipped message="no such&#10;log"/></testcase>'
 ENTRY = "tests.test_a::test_two"
 
@@ -22,7 +24,12 @@ ENTRY = "tests.test_a::test_two"
         ([PASSED, PASSED], (), ["1 passed, 0 failed, 0 skipped"], True),
         ([PASSED, FAILED], (), ["0 passed, 1 failed, 0 skipped"], False),
         ([], (), ["0 passed, 0 failed, 0 skipped"], False),
-        ([PASSED + SKIPPED], (ENTRY,), [f"skipped: {ENTRY}: no such log", "1 passed, 0 failed, 1 skipped"], True),
+        (
+            [PASSED + SKIPPED],
+            (ENTRY,),
+            [f"skipped: {ENTRY}: no such log", "1 passed, 0 failed, 1 skipped"],
+            True,
+        ),
         (
             [PASSED + SKIPPED],
             (f"{ENTRY}[1]",),
@@ -32,7 +39,10 @@ ENTRY = "tests.test_a::test_two"
         (
             [PASSED + SKIPPED],
             (f"{ENTRY}[2]",),
-            [f"skipped, which fails this run: {ENTRY}: no such log", "1 passed, 0 failed, 1 skipped"],
+            [
+                f"skipped, which fails this run: {ENTRY}: no such log",
+                "1 passed, 0 failed, 1 skipped",
+            ],
             False,
         ),
     ],
@@ -63,4 +73,7 @@ def test_missing_result_file_fails_the_run(tmp_path: Path, content: str | None) 
 def test_known_skip_names_an_existing_test(entry: str) -> None:
     """Each test that may be skipped exists."""
     module, _, name = entry.partition("::")
-    assert f"def {name.partition('[')[0]}(" in ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text()
+    assert (
+        f"def {name.partition('[')[0]}("
+        in ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text()
+    )

@@ -33,4 +33,6 @@ def test_commands_run_without_optional_packages(start: Start, extras: list[str])
 def test_faults_of_a_run_are_found(extra: str, code: int, err: str) -> None:
     """A traceback, another exit code, a second line, and a line without the extra are faults."""
     assert problem_of(Case(("record",), frozenset({2}), extra), code, "", err)
-    assert not problem_of(Case(("record",), frozenset({2}), "mcap"), 2, "", "nedbus: run pip install -e '.[mcap]'\n")
+    assert not problem_of(
+        Case(("record",), frozenset({2}), "mcap"), 2, "", "nedbus: run pip install -e '.[mcap]'\n"
+    )

@@ -14,8 +14,12 @@ from packaging.utils import canonicalize_name
 
 ROOT: Final = Path(__file__).parents[2]
 PROJECT: Final[dict[str, Any]] = tomllib.loads((ROOT / "pyproject.toml").read_text())
-EXTRAS: Final = re.findall(r"^IMAGE_EXTRAS = (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].split()
-ENVIRONMENTS: Final = [(python, machine) for python in ("3.11", "3.13", "3.14") for machine in ("x86_64", "aarch64")]
+EXTRAS: Final = re.findall(r"^IMAGE_EXTRAS = (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[
+    0
+].split()
+ENVIRONMENTS: Final = [
+    (python, machine) for python in ("3.11", "3.13", "3.14") for machine in ("x86_64", "aarch64")
+]
 
 
 def read_lock(name: str) -> dict[str, list[tuple[Requirement, int]]]:
@@ -61,7 +65,9 @@ def test_lock_satisfies_pyproject(name: str, python: str, machine: str) -> None:
         [(pin, hashes)] = own
         [version] = pin.specifier
         assert version.operator == "=="
-        assert requirement.specifier.contains(version.version), f"{pin} is not {requirement}; run `make lock`"
+        assert requirement.specifier.contains(version.version), (
+            f"{pin} is not {requirement}; run `make lock`"
+        )
         assert hashes
 
 

@@ -28,7 +28,9 @@ def subscribe(bus: nedbus.Bus) -> None:
             row.message.y_valid  # type: ignore[attr-defined] # no such field
         for batch in subscription.batches():
             assert_type(batch, nedbus.Batch)
-            assert_type(batch.of(nedbus.Address("7", "vehicle_local_position")), nedbus.MessageArray)
+            assert_type(
+                batch.of(nedbus.Address("7", "vehicle_local_position")), nedbus.MessageArray
+            )
         assert_type(subscription.receive(1.0), nedbus.Sample)
     assert_type(bus.subscribe(max_rate=5), nedbus.Subscription)
     bus.subscribe(max_rate="5")  # type: ignore[call-overload] # not a number
@@ -59,8 +61,12 @@ def subscribe_by_class_and_topic(bus: nedbus.Bus, any_topic: str) -> None:
     both = bus.subscribe(nedbus.VehicleAttitude, nedbus.SensorGps, limit=100)
     assert_type(both, nedbus.Subscription[nedbus.VehicleAttitude | nedbus.SensorGps])
     three = bus.subscribe(nedbus.VehicleAttitude, nedbus.SensorGps, nedbus.HomePosition)
-    assert_type(three.receive().message, nedbus.VehicleAttitude | nedbus.SensorGps | nedbus.HomePosition)
-    assert_type(bus.subscribe(nedbus.VehicleAttitude, "sensor_gps"), nedbus.Subscription[nedbus.Message])
+    assert_type(
+        three.receive().message, nedbus.VehicleAttitude | nedbus.SensorGps | nedbus.HomePosition
+    )
+    assert_type(
+        bus.subscribe(nedbus.VehicleAttitude, "sensor_gps"), nedbus.Subscription[nedbus.Message]
+    )
     both.batches(max_messages="1")  # type: ignore[arg-type] # not a number
     bus.subscribe(nedbus.VehicleAttitude, vehicle=["1", 2])
     bus.latest("*", vehicle=("1", "2"))
@@ -79,7 +85,9 @@ def subscribe_by_class_and_topic(bus: nedbus.Bus, any_topic: str) -> None:
     assert_type(bus.latest(), list[nedbus.Sample[nedbus.VehicleLocalPosition]])
 
 
-def use_rows_as_messages(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
+def use_rows_as_messages(
+    sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]
+) -> None:
     """Functions that accept a message also accept a row."""
     assert_type(nedbus.frames.to_global(sample.message), nedbus.frames.GlobalPosition | None)
     assert_type(nedbus.frames.to_global(row.message), nedbus.frames.GlobalPosition | None)
@@ -100,7 +108,8 @@ def publish(bus: nedbus.Bus) -> None:
     publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x=2.0))
     publisher.publish({"timestamp": 1, "x": 2.0})
     publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x="2"))  # type: ignore[arg-type] # not a number
-    publisher.publish({"timestamp": 1, "x": "2"})  # checked when it is published: a publisher is of any message
+    # checked when it is published: a publisher is of any message
+    publisher.publish({"timestamp": 1, "x": "2"})
     publisher.publish_many(np.zeros(3, nedbus.DTYPE))
     publisher.publish(1.0)  # type: ignore[arg-type] # not a message
     nedbus.VehicleLocalPosition(timestamp=1, X=2.0)  # type: ignore[call-arg] # no such field
@@ -149,7 +158,9 @@ def open_files(any_topic: str) -> None:
             assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
         assert_type(flight("*"), nedbus.FlightSamples[nedbus.Message])
         assert_type(flight(any_topic), nedbus.FlightSamples[nedbus.Message])
-        assert_type(flight(nedbus.VehicleAttitude, "home_position"), nedbus.FlightSamples[nedbus.Message])
+        assert_type(
+            flight(nedbus.VehicleAttitude, "home_position"), nedbus.FlightSamples[nedbus.Message]
+        )
         for batch in flight(nedbus.SensorGps, topic="vehicle_gps_position").batches():
             assert_type(batch, nedbus.Batch)
         assert_type(flight.utc, nedbus.UtcOffset | None)

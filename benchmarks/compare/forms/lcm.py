@@ -21,7 +21,13 @@ CHANNEL = "vehicle_local_position"
 
 
 # LCM has only signed integers of these sizes.
-LCM_TYPES = {"bool": "boolean", "uint64": "int64_t", "uint8": "byte", "float32": "float", "float64": "double"}
+LCM_TYPES = {
+    "bool": "boolean",
+    "uint64": "int64_t",
+    "uint8": "byte",
+    "float32": "float",
+    "float64": "double",
+}
 
 
 def field(name: str, type_name: str) -> str:
@@ -34,8 +40,12 @@ def generate() -> Any:
     """Run lcm-gen, like a build, and import the generated class."""
     with tempfile.TemporaryDirectory() as directory:
         source = Path(directory, "position.lcm")
-        source.write_text(f"struct bench_position {{ {' '.join(field(*item) for item in TYPES.items())} }}")
-        subprocess.run([Path(lcm.LCM_BIN_DIR, "lcm-gen"), "-p", "--ppath", directory, source], check=True)
+        source.write_text(
+            f"struct bench_position {{ {' '.join(field(*item) for item in TYPES.items())} }}"
+        )
+        subprocess.run(
+            [Path(lcm.LCM_BIN_DIR, "lcm-gen"), "-p", "--ppath", directory, source], check=True
+        )
         sys.path.insert(0, directory)
         try:
             return importlib.import_module("bench_position").bench_position

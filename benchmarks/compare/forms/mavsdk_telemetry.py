@@ -27,18 +27,26 @@ MASK = (1 << 24) - 1
 
 @contextmanager
 def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
-    link = mavutil.mavlink_connection(f"udpout:127.0.0.1:{PORT}", source_system=1, source_component=1)
+    link = mavutil.mavlink_connection(
+        f"udpout:127.0.0.1:{PORT}", source_system=1, source_component=1
+    )
     stop = threading.Event()
     position = [FIELDS[axis] for axis in "xyz"]
 
     def send_heartbeats() -> None:
         while not stop.wait(0.2):
             link.mav.heartbeat_send(
-                mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, mavlink.MAV_STATE_ACTIVE
+                mavlink.MAV_TYPE_QUADROTOR,
+                mavlink.MAV_AUTOPILOT_PX4,
+                0,
+                0,
+                mavlink.MAV_STATE_ACTIVE,
             )
 
     def send(stamp: int) -> None:
-        link.mav.local_position_ned_send(0, *position, stamp >> 48, stamp >> 24 & MASK, stamp & MASK)
+        link.mav.local_position_ned_send(
+            0, *position, stamp >> 48, stamp >> 24 & MASK, stamp & MASK
+        )
 
     heartbeats = threading.Thread(target=send_heartbeats, daemon=True)
     heartbeats.start()
@@ -61,6 +69,10 @@ async def _receive(ready: Callable[[], None], seen: Callable[[int], bool]) -> No
         system = await client.first_autopilot(timeout_s=30.0)
         async for message in TelemetryAsync(system).subscribe_position_velocity_ned():
             velocity = message.velocity
-            high, middle, low = int(velocity.north_m_s), int(velocity.east_m_s), int(velocity.down_m_s)
+            high, middle, low = (
+                int(velocity.north_m_s),
+                int(velocity.east_m_s),
+                int(velocity.down_m_s),
+            )
             if not seen(high << 48 | middle << 24 | low if message.position.north_m else 0):
                 return

@@ -14,20 +14,28 @@ Send = Callable[[int], None]
 def open_publishers(case: Case) -> Iterator[list[nedbus.Publisher]]:
     """Open one publisher for each vehicle."""
     with nedbus.connect(case.endpoint) as bus:
-        yield [bus.publisher(TOPIC, vehicle=vehicle, lossless=case.lossless) for vehicle in case.vehicles]
+        yield [
+            bus.publisher(TOPIC, vehicle=vehicle, lossless=case.lossless)
+            for vehicle in case.vehicles
+        ]
 
 
 @contextmanager
 def open_subscription(case: Case) -> Iterator[nedbus.Subscription]:
     """Subscribe to every sample."""
-    with nedbus.connect(case.endpoint) as bus, bus.subscribe(TOPIC, vehicle=case.vehicle, mode="every") as subscription:
+    with (
+        nedbus.connect(case.endpoint) as bus,
+        bus.subscribe(TOPIC, vehicle=case.vehicle, mode="every") as subscription,
+    ):
         yield subscription
 
 
 @contextmanager
 def publish(case: Case) -> Iterator[list[Send]]:
     def make_send(publisher: nedbus.Publisher) -> Send:
-        return lambda stamp: publisher.publish(nedbus.VehicleLocalPosition(**{**PROVIDED, "timestamp": stamp}))
+        return lambda stamp: publisher.publish(
+            nedbus.VehicleLocalPosition(**{**PROVIDED, "timestamp": stamp})
+        )
 
     with open_publishers(case) as publishers:
         yield list(map(make_send, publishers))

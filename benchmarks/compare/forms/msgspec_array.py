@@ -14,7 +14,10 @@ PACKAGES = ["msgspec==0.22.0", "eclipse-zenoh==1.10.2"]
 
 Position = msgspec.defstruct(
     "Position",
-    [(name, tuple[float, float] if type(value) is tuple else type(value)) for name, value in FIELDS.items()],
+    [
+        (name, tuple[float, float] if type(value) is tuple else type(value))
+        for name, value in FIELDS.items()
+    ],
     array_like=True,
     frozen=True,
 )
@@ -25,7 +28,9 @@ def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
     encoder = msgspec.msgpack.Encoder()
     with open_session(case.endpoint) as session:
         publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-        yield [lambda stamp: publisher.put(encoder.encode(Position(**{**FIELDS, "timestamp": stamp})))]
+        yield [
+            lambda stamp: publisher.put(encoder.encode(Position(**{**FIELDS, "timestamp": stamp})))
+        ]
 
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:

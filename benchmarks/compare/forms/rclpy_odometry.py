@@ -21,7 +21,9 @@ PACKAGES = [
 ]
 
 SECOND = 1_000_000_000
-EVERY_SAMPLE = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
+EVERY_SAMPLE = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0
+)
 os.environ.update(ROS_DOMAIN_ID="77", ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
 
 
@@ -57,7 +59,8 @@ def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) 
         wanted = seen(stamp.sec * SECOND + stamp.nanosec if message.pose.pose.position.x else 0)
 
     node.create_subscription(Odometry, TOPIC, on_message, EVERY_SAMPLE)
-    executor = SingleThreadedExecutor()  # `rclpy.spin_once` adds the node to an executor at each call
+    # `rclpy.spin_once` adds the node to an executor at each call
+    executor = SingleThreadedExecutor()
     executor.add_node(node)
     ready()
     while wanted:

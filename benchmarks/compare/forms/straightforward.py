@@ -14,7 +14,10 @@ from benchmarks.compare.zenoh_session import declare_publishers, open_session, r
 Position = create_model(
     "Position",
     __config__=ConfigDict(frozen=True, strict=True, extra="forbid"),
-    **{name: (tuple[float, float] if type(value) is tuple else type(value), ...) for name, value in FIELDS.items()},
+    **{
+        name: (tuple[float, float] if type(value) is tuple else type(value), ...)
+        for name, value in FIELDS.items()
+    },
 )
 
 Send = Callable[[int], None]

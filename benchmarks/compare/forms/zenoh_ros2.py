@@ -25,7 +25,10 @@ OVERRIDE = ";".join(
     ]
 )
 
-VALUES = {name: np.array(value, np.float32) if type(value) is tuple else value for name, value in FIELDS.items()}
+VALUES = {
+    name: np.array(value, np.float32) if type(value) is tuple else value
+    for name, value in FIELDS.items()
+}
 
 
 def options(endpoint: str) -> dict[str, Any]:

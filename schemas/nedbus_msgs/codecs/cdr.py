@@ -19,7 +19,8 @@ from .records import encode_upgraded
 
 HEADER: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
 _ALIGNMENT: Final = 4  # bytes to which writers may pad a payload
-_PX4_TRAILER: Final = 24  # PX4 sends 4 + sizeof(struct) + 24 bytes, and its struct may be longer than the CDR body
+# PX4 sends 4 + sizeof(struct) + 24 bytes, and its struct may be longer than the CDR body
+_PX4_TRAILER: Final = 24
 
 
 class CdrLayout:
@@ -60,7 +61,9 @@ class CdrLayout:
             return f"{len(payload)} bytes, expected {sizes} for layout {self.name}"
         if wrong := int.from_bytes(payload[:size], "little") & self.bool_mask:
             offset = ((wrong & -wrong).bit_length() - 1) // 8
-            name = next(name for name, first in reversed([*self.offsets.items()]) if first <= offset)
+            name = next(
+                name for name, first in reversed([*self.offsets.items()]) if first <= offset
+            )
             return f"{name} is {payload[offset]}, not a bool (0 or 1)"
         return None
 
@@ -76,7 +79,9 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     cdr = cdr_layout(layout)
     if reason := cdr.check(payload):
         raise DecodeError(f"{reason}{_explain_size(definition, payload, layout)}", definition.name)
-    return cdr.validation.by_name(cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER))))
+    return cdr.validation.by_name(
+        cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER)))
+    )
 
 
 def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None:
@@ -84,7 +89,8 @@ def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None
 
     A payload has the size of the layout, or else that with the bytes that PX4 appends.
     """
-    forms, found = [(layout, cdr_layout(layout)) for layout in definition.layouts.values()], list[Layout]()
+    forms = [(layout, cdr_layout(layout)) for layout in definition.layouts.values()]
+    found = list[Layout]()
     exact = [layout for layout, cdr in forms if len(payload) - cdr.size in range(_ALIGNMENT)]
     for layout in exact or [layout for layout, cdr in forms if len(payload) == cdr.limit]:
         if not cdr_layout(layout).check(payload):
@@ -100,7 +106,11 @@ def _explain_size(definition: Definition[Any], payload: bytes, layout: Layout) -
     if fits is None or fits is layout:
         return ""
     is_release = fits.name in RELEASES
-    remedy = f"rebuild px4_msgs at release/{fits.name}" if is_release else "rebuild px4_msgs at the vehicle's version"
+    remedy = (
+        f"rebuild px4_msgs at release/{fits.name}"
+        if is_release
+        else "rebuild px4_msgs at the vehicle's version"
+    )
     which = f"PX4 {fits.name}" if is_release else f"{fits.name}, a development version of PX4"
     return f"; they fit the layout of {which}: the vehicle's px4_msgs differ, {remedy}"
 
@@ -120,7 +130,9 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
         name, problem = list(layout.types)[int(exc.errors()[0]["loc"][0])], "is not of type"
     except OverflowError:
         (name, _), problem = next(cdr.validation.overflows(fields)), "is beyond the range of"
-    raise EncodeError(f"{name}={fields[name]!r:.40} {problem} {layout.types[name]}", definition.name)
+    raise EncodeError(
+        f"{name}={fields[name]!r:.40} {problem} {layout.types[name]}", definition.name
+    )
 
 
 @cached_on_owner

@@ -40,9 +40,17 @@ def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
         one = tag, "?", b"\x01"
     if kind.length is None or kind.is_text:
         return one
-    head = bytes([0x90 | kind.length]) if kind.length < 16 else b"\xdc" + kind.length.to_bytes(2, "big")
+    head = (
+        bytes([0x90 | kind.length])
+        if kind.length < 16
+        else b"\xdc" + kind.length.to_bytes(2, "big")
+    )
     tags, form, bits = one
-    return head + tags * kind.length, f"{len(head)}x" + form * kind.length, bytes(len(head)) + bits * kind.length
+    return (
+        head + tags * kind.length,
+        f"{len(head)}x" + form * kind.length,
+        bytes(len(head)) + bits * kind.length,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,14 +91,24 @@ class Codec(Generic[M]):
 @cached_on_owner
 def codec_of(definition: Definition[M]) -> Codec[M]:
     """Return the codec of a message; its functions are closures, to avoid attribute access on the hot path."""
-    name, types, model = definition.name, definition.types, definition.model
+    name = definition.name
+    types = definition.types
+    model = definition.model
     validation, make_row = definition.validation, definition.row
-    check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
+    check_row = validation.check_row
+    row_of = validation.row_of
+    passes_rules = validation.passes_rules
     by_name, flatten = validation.by_name, validation.flatten
-    count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
+    count = len(types)
+    head = struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
     tags, tag_mask, packed, offsets = _payload_parts(types, head)
-    size, pack_flat, unpack_flat = packed.size, packed.pack, packed.unpack
-    new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
+    size = packed.size
+    pack_flat = packed.pack
+    unpack_flat = packed.unpack
+    new_row = tuple.__new__
+    unpack = msgpack.unpackb
+    from_bytes = int.from_bytes
+    all_fields = definition.all_fields
 
     def pack(row: Values) -> bytes:
         """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
@@ -127,7 +145,9 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         try:
             return model.model_validate(dict(fields))
         except ValidationError as exc:
-            violations = [(str(detail["loc"][0]), detail["msg"]) for detail in exc.errors(include_url=False)]
+            violations = [
+                (str(detail["loc"][0]), detail["msg"]) for detail in exc.errors(include_url=False)
+            ]
             raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
 
     def decode_full_width(payload: bytes) -> Values | None:
@@ -135,12 +155,16 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
             return None
         # The tags prove type and range of every value; only the rules are left to check.
-        row: Values = decode_values(payload) if definition.has_text else unpack(payload, use_list=False)[1:]
+        row: Values = (
+            decode_values(payload) if definition.has_text else unpack(payload, use_list=False)[1:]
+        )
         return row if passes_rules(row) else None
 
     def decode_values(payload: bytes) -> Values:
         """Decode a payload with text, which ends at the first NUL and may contain invalid UTF-8."""
-        return validation.unflatten(unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big")))
+        return validation.unflatten(
+            unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big"))
+        )
 
     def decode_any(payload: bytes, newer: NewerLayouts | None) -> M:
         """Decode any msgpack encoding of any known layout."""
@@ -170,14 +194,21 @@ def _payload_parts(
     types: Mapping[str, FieldType], head: bytes
 ) -> tuple[int, int, struct.Struct, tuple[tuple[str, int, int], ...]]:
     """Return the tags, the mask of bits that are not values, the struct of the values, and the offset of each."""
-    tags, values, code = head, bytes(len(head)), f">{len(head)}x"
+    tags = head
+    values = bytes(len(head))
+    code = f">{len(head)}x"
     offsets: list[tuple[str, int, int]] = []
     for name, kind in types.items():
         field_tags, field_code, field_bits = full_width(kind)
-        tags, values, code = tags + field_tags, values + field_bits, code + field_code
+        tags = tags + field_tags
+        values = values + field_bits
+        code = code + field_code
         tag = 3 * kind.is_text or int(kind.base != "bool")  # tag bytes before each value
         step = tag + kind.size
-        offsets += [(name, part, len(tags) - (kind.values - part) * step + tag) for part in range(kind.values)]
+        offsets += [
+            (name, part, len(tags) - (kind.values - part) * step + tag)
+            for part in range(kind.values)
+        ]
     mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
     return int.from_bytes(tags, "big"), mask, struct.Struct(code), tuple(offsets)
 
@@ -189,25 +220,35 @@ def describe(error: ValidationError, definition: Definition[Any]) -> str:
         reason = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
         if detail["type"] == "extra_forbidden":
             reason = definition.explain_unknown_field(str(detail["loc"][0]))
-        reasons.append(reason if detail["type"] == "missing" else f"{reason} (is {detail['input']!r:.40})")
+        reasons.append(
+            reason if detail["type"] == "missing" else f"{reason} (is {detail['input']!r:.40})"
+        )
     return "; ".join(reasons)
 
 
-def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayouts) -> dict[str, object]:
+def _unpack_fields(
+    definition: Definition[Any], payload: bytes, newer: NewerLayouts
+) -> dict[str, object]:
     def reject(reason: str) -> DecodeError:
         return DecodeError(reason, definition.name)
 
     if len(payload) > PAYLOAD_LIMIT:
         raise reject(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
     try:
-        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="surrogateescape")
+        array = msgpack.unpackb(
+            payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="surrogateescape"
+        )
     except (ValueError, msgpack.UnpackException) as exc:
         reason = exc or type(exc).__name__
-        raise reject(f"the {len(payload)}-byte payload is not a single msgpack value ({reason})") from exc
+        raise reject(
+            f"the {len(payload)}-byte payload is not a single msgpack value ({reason})"
+        ) from exc
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
         raise reject("the payload is not an array that starts with a layout number")
     layout, *values = array
-    known = {each.wire: each.fields for each in definition.layouts.values() if each.wire is not None}
+    known = {
+        each.wire: each.fields for each in definition.layouts.values() if each.wire is not None
+    }
     names = {**newer, **known}.get(layout)
     if names is None:
         raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
@@ -223,5 +264,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
         # The model would accept floats as text, such as "NaN", for JSON.
         if not is_text and any(isinstance(part, str) for part in parts):
             raise reject(f"{name} has text, expected numbers or bools")
-        fields[name] = decode_text(value.encode(errors="surrogateescape")) if isinstance(value, str) else value
+        fields[name] = (
+            decode_text(value.encode(errors="surrogateescape")) if isinstance(value, str) else value
+        )
     return fields

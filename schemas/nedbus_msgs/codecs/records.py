@@ -32,7 +32,9 @@ def encode_upgraded(definition: Definition[Any], fields: Mapping[str, object]) -
     if (values := validation.row_of(upgraded)) is not None:
         with suppress(OverflowError):  # beyond float32
             payload = codec.encode_flat(validation.flatten(values))
-            return Encoded(tuple.__new__(definition.row, values), payload, plan.provided, plan.missing)
+            return Encoded(
+                tuple.__new__(definition.row, values), payload, plan.provided, plan.missing
+            )
     payload = codec.encode_fields(upgraded)  # the model decides
     return Encoded(codec.decode_row(payload), payload, plan.provided, plan.missing)
 
@@ -76,7 +78,9 @@ def _compile(
     validation = definition.validation
     fields = definition.types
     copied = [(types[old], fields[name]) for name, old in plan.names.items()]
-    if "timestamp" not in plan.provided or any((a.values, a.is_text) != (b.values, b.is_text) for a, b in copied):
+    if "timestamp" not in plan.provided or any(
+        (a.values, a.is_text) != (b.values, b.is_text) for a, b in copied
+    ):
         return lambda *_: None
     functions: dict[str, Callable[..., Any]] = {
         "encode_text": encode_text, "decode_text": decode_text,
@@ -93,13 +97,18 @@ def _compile(
 
 
 def _conversion(
-    definition: Definition[Any], types: Mapping[str, FieldType], functions: dict[str, Callable[..., Any]]
+    definition: Definition[Any],
+    types: Mapping[str, FieldType],
+    functions: dict[str, Callable[..., Any]],
 ) -> str:
     """Return the expression of a message's values in those of a record; add the functions that convert fields."""
     plan = definition.plan(tuple(types))
     positions = positions_of(types)
     accessors = accessors_of(types)
-    parts, begin, end = list[str](), 0, -1  # values[begin:end] is the last part, if it only copies values
+    # values[begin:end] is the last part, if it only copies values
+    parts = list[str]()
+    begin = 0
+    end = -1
     for name, kind in definition.types.items():
         old, star = plan.names.get(name), "*" * kind.is_array
         if old is not None and not kind.is_text:

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 from nedbus_msgs.model.declaration import DEFAULT_TOPIC
 from nedbus_msgs.model.definition import MESSAGES
 
-for _name in sorted((module.name for module in iter_modules(__path__)), key=lambda name: (name != DEFAULT_TOPIC, name)):
+for _name in sorted(
+    (module.name for module in iter_modules(__path__)),
+    key=lambda name: (name != DEFAULT_TOPIC, name),
+):
     import_module(f"{__name__}.{_name}")
 
 if TYPE_CHECKING:  # one line per file, for type checkers

@@ -16,7 +16,15 @@ class BatteryStatus(Message):
     Bit n (1 << n) of faults stands for the FAULT_ constant n; warning may also be STATE_UNHEALTHY or STATE_CHARGING.
     """
 
-    TOPICS = (Topic("battery_status", 1.0, "each battery's driver or estimator", instances=True, plain_first=True),)
+    TOPICS = (
+        Topic(
+            "battery_status",
+            1.0,
+            "each battery's driver or estimator",
+            instances=True,
+            plain_first=True,
+        ),
+    )
     LAYOUTS = (
         Layout("1.13", """1.16, without internal_resistance_estimate ocv_estimate ocv_estimate_filtered
             volt_based_soc_estimate voltage_prediction prediction_error estimation_covariance_norm,
@@ -44,9 +52,13 @@ class BatteryStatus(Message):
     current_average_a: Float32 = field("Average current in level flight [A], -1 if unknown")
     discharged_mah: Float32 = field("Discharged capacity [mAh], -1 if unknown")
 
-    remaining: Float32 = field("Remaining charge, 0 (empty) to 1 (full); above 1 while charging, negative if unknown")
+    remaining: Float32 = field(
+        "Remaining charge, 0 (empty) to 1 (full); above 1 while charging, negative if unknown"
+    )
     scale: Float32 = field("Thrust compensation for battery sag, at least 1, -1 if unknown")
-    time_remaining_s: Float32 = field("Predicted time until empty at the recent load [s], NaN if unknown")
+    time_remaining_s: Float32 = field(
+        "Predicted time until empty at the recent load [s], NaN if unknown"
+    )
     temperature: Float32 = field("Temperature [deg C], NaN if unknown")
 
     cell_count: Uint8 = field("Number of cells in series, 0 if unknown")
@@ -57,7 +69,9 @@ class BatteryStatus(Message):
     cycle_count: Uint16 = field("Number of discharge cycles")
     average_time_to_empty: Uint16 = field("Average time to empty [min]")
     manufacture_date: Uint16 = field("Date of manufacture: day + 32 * month + 512 * (year - 1980)")
-    state_of_health: Uint16 = field("State of health: full charge relative to that of a new battery [%], 0 to 100")
+    state_of_health: Uint16 = field(
+        "State of health: full charge relative to that of a new battery [%], 0 to 100"
+    )
     max_error: Uint16 = field("Expected error of the state of charge [%], 1 to 100")
 
     id: Uint8 = field("Battery ID on this vehicle, from 1")
@@ -68,7 +82,9 @@ class BatteryStatus(Message):
 
     is_powering_off: Bool = field("Battery is about to power off")
     is_required: Bool = field("Battery is required for arming")
-    warning: Uint8 = field("Warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed, 6 unhealthy, 7 charging")
+    warning: Uint8 = field(
+        "Warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed, 6 unhealthy, 7 charging"
+    )
     faults: Uint16 = field("Fault bitmask, see FAULT_; 0 if none")
 
     full_charge_capacity_wh: Float32 = field("Energy when fully charged [Wh]")

@@ -16,7 +16,14 @@ class EstimatorStatusFlags(Message):
     """
 
     TOPICS = (
-        Topic("estimator_status_flags", 1.0, "each EKF2 instance", instances=True, on_change=True, plain_first=True),
+        Topic(
+            "estimator_status_flags",
+            1.0,
+            "each EKF2 instance",
+            instances=True,
+            on_change=True,
+            plain_first=True,
+        ),
     )
     LAYOUTS = (
         Layout("1.13", """1.14, without cs_fake_pos cs_fake_hgt cs_gravity_vector, reject_ver_pos: reject_mag_x
@@ -58,7 +65,9 @@ class EstimatorStatusFlags(Message):
     cs_ev_yaw: Bool = field("External vision yaw fusion is active")
     cs_ev_hgt: Bool = field("External vision height fusion is active")
     cs_fuse_beta: Bool = field("Synthetic sideslip fusion is active")
-    cs_mag_field_disturbed: Bool = field("Magnetic field differs from the field expected at this location")
+    cs_mag_field_disturbed: Bool = field(
+        "Magnetic field differs from the field expected at this location"
+    )
     cs_fixed_wing: Bool = field("Vehicle is considered to fly as a fixed wing")
     cs_mag_fault: Bool = field("Magnetometer is faulty and no longer used")
     cs_fuse_aspd: Bool = field("Airspeed fusion is active")

@@ -34,13 +34,21 @@ class FailsafeFlags(Message):
     mode_req_attitude: Uint32 = field("Modes that require attitude (bitmask)")
     mode_req_local_alt: Uint32 = field("Modes that require local altitude (bitmask)")
     mode_req_local_position: Uint32 = field("Modes that require local position (bitmask)")
-    mode_req_local_position_relaxed: Uint32 = field("Modes that require local position of relaxed accuracy (bitmask)")
+    mode_req_local_position_relaxed: Uint32 = field(
+        "Modes that require local position of relaxed accuracy (bitmask)"
+    )
     mode_req_global_position: Uint32 = field("Modes that require global position (bitmask)")
-    mode_req_global_position_relaxed: Uint32 = field("Modes that require global position of relaxed accuracy (bitmask)")
+    mode_req_global_position_relaxed: Uint32 = field(
+        "Modes that require global position of relaxed accuracy (bitmask)"
+    )
     mode_req_mission: Uint32 = field("Modes that require a mission (bitmask)")
-    mode_req_offboard_signal: Uint32 = field("Modes that require an offboard control signal (bitmask)")
+    mode_req_offboard_signal: Uint32 = field(
+        "Modes that require an offboard control signal (bitmask)"
+    )
     mode_req_home_position: Uint32 = field("Modes that require a home position (bitmask)")
-    mode_req_wind_and_flight_time_compliance: Uint32 = field("Modes with wind and flight time limits (bitmask)")
+    mode_req_wind_and_flight_time_compliance: Uint32 = field(
+        "Modes with wind and flight time limits (bitmask)"
+    )
     mode_req_prevent_arming: Uint32 = field("Modes that prevent arming (bitmask)")
     mode_req_manual_control: Uint32 = field("Modes that require manual control (bitmask)")
     mode_req_other: Uint32 = field("Modes with other requirements (bitmask)")
@@ -52,7 +60,9 @@ class FailsafeFlags(Message):
     local_position_invalid_relaxed: Bool = field("Local position invalid even at relaxed accuracy")
     local_velocity_invalid: Bool = field("Local velocity invalid")
     global_position_invalid: Bool = field("Global position invalid")
-    global_position_invalid_relaxed: Bool = field("Global position invalid even at relaxed accuracy")
+    global_position_invalid_relaxed: Bool = field(
+        "Global position invalid even at relaxed accuracy"
+    )
 
     auto_mission_missing: Bool = field("No mission available")
     offboard_control_signal_lost: Bool = field("Offboard control signal lost")
@@ -60,11 +70,15 @@ class FailsafeFlags(Message):
     manual_control_signal_lost: Bool = field("Manual control (RC or joystick) signal lost")
     gcs_connection_lost: Bool = field("Ground control station connection lost")
 
-    battery_warning: Uint8 = field("Battery warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed ...")
+    battery_warning: Uint8 = field(
+        "Battery warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed ..."
+    )
     battery_low_remaining_time: Bool = field("Remaining battery time too short")
     battery_unhealthy: Bool = field("Battery unhealthy")
 
-    fd_critical_failure: Bool = field("Failure detector: critical failure (roll, pitch or external)")
+    fd_critical_failure: Bool = field(
+        "Failure detector: critical failure (roll, pitch or external)"
+    )
     fd_esc_arming_failure: Bool = field("Failure detector: ESC failed to arm")
     fd_imbalanced_prop: Bool = field("Failure detector: imbalanced propeller")
     fd_motor_failure: Bool = field("Failure detector: motor failure")

@@ -16,9 +16,13 @@ class HomePosition(Message):
     x, y and z become outdated when the estimator moves the origin of local NED.
     """
 
-    TOPICS = (Topic("home_position", 0.0, "the commander, when home is set or moved", on_change=True),)
+    TOPICS = (
+        Topic("home_position", 0.0, "the commander, when home is set or moved", on_change=True),
+    )
     LAYOUTS = (
-        Layout("1.13", "timestamp lat lon alt x y z yaw valid_alt valid_hpos valid_lpos manual_home"),
+        Layout(
+            "1.13", "timestamp lat lon alt x y z yaw valid_alt valid_hpos valid_lpos manual_home"
+        ),
         Layout("1.15", "1.13, manual_home: update_count"),
         Layout("1.17", "1.15, z: roll pitch"),
         Layout("main", "*"),

@@ -18,5 +18,7 @@ class LogMessage(Message):
 
     EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
 
-    severity: Uint8 = field("Severity: 0 emergency, 1 alert, 2 critical, 3 error, 4 warning, 5 notice, 6 info, 7 debug")
+    severity: Uint8 = field(
+        "Severity: 0 emergency, 1 alert, 2 critical, 3 error, 4 warning, 5 notice, 6 info, 7 debug"
+    )
     text: Char127 = field("Text in UTF-8, at most 127 bytes")

@@ -3,8 +3,27 @@
 import math
 
 from nedbus_msgs.frames import GlobalPosition, Ned
-from nedbus_msgs.model import LONGITUDE_LIMIT, FiniteWhile, InRange, Layout, Message, RenamedField, Topic, Within
-from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64, field
+from nedbus_msgs.model import (
+    LONGITUDE_LIMIT,
+    FiniteWhile,
+    InRange,
+    Layout,
+    Message,
+    RenamedField,
+    Topic,
+    Within,
+)
+from nedbus_msgs.model.px4_types import (
+    Bool,
+    Float32,
+    Float64,
+    Int32,
+    Uint8,
+    Uint16,
+    Uint32,
+    Uint64,
+    field,
+)
 
 
 def _integer(value: float, scale: float) -> int:
@@ -25,7 +44,9 @@ class SensorGps(Message):
     """
 
     TOPICS = (
-        Topic("sensor_gps", 8.0, "the driver of each GNSS receiver", instances=True, plain_first=True),
+        Topic(
+            "sensor_gps", 8.0, "the driver of each GNSS receiver", instances=True, plain_first=True
+        ),
         Topic("vehicle_gps_position", 50.0, "the GNSS selector or blending"),
     )
     LAYOUTS = (
@@ -38,10 +59,22 @@ class SensorGps(Message):
         Layout("1.18", "*"),
     )  # fmt: skip
     OLDER = (
-        RenamedField("lat", "latitude_deg", lambda lat: lat / 1e7, lambda deg: _integer(deg, 1e7), "int32"),
-        RenamedField("lon", "longitude_deg", lambda lon: lon / 1e7, lambda deg: _integer(deg, 1e7), "int32"),
-        RenamedField("alt", "altitude_msl_m", lambda mm: mm / 1e3, lambda m: _integer(m, 1e3), "int32"),
-        RenamedField("alt_ellipsoid", "altitude_ellipsoid_m", lambda mm: mm / 1e3, lambda m: _integer(m, 1e3), "int32"),
+        RenamedField(
+            "lat", "latitude_deg", lambda lat: lat / 1e7, lambda deg: _integer(deg, 1e7), "int32"
+        ),
+        RenamedField(
+            "lon", "longitude_deg", lambda lon: lon / 1e7, lambda deg: _integer(deg, 1e7), "int32"
+        ),
+        RenamedField(
+            "alt", "altitude_msl_m", lambda mm: mm / 1e3, lambda m: _integer(m, 1e3), "int32"
+        ),
+        RenamedField(
+            "alt_ellipsoid",
+            "altitude_ellipsoid_m",
+            lambda mm: mm / 1e3,
+            lambda m: _integer(m, 1e3),
+            "int32",
+        ),
     )
     RULES = (
         Within(latitude_deg=90.0, longitude_deg=LONGITUDE_LIMIT),
@@ -54,8 +87,12 @@ class SensorGps(Message):
         FIX_TYPE_NONE, FIX_TYPE_2D, FIX_TYPE_3D, FIX_TYPE_RTCM_CODE_DIFFERENTIAL, FIX_TYPE_RTK_FLOAT,
         FIX_TYPE_RTK_FIXED, FIX_TYPE_EXTRAPOLATED,
     ) = 1, 2, 3, 4, 5, 6, 8  # fmt: skip
-    JAMMING_STATE_UNKNOWN, JAMMING_STATE_OK, JAMMING_STATE_MITIGATED, JAMMING_STATE_DETECTED = range(4)
-    SPOOFING_STATE_UNKNOWN, SPOOFING_STATE_OK, SPOOFING_STATE_MITIGATED, SPOOFING_STATE_DETECTED = range(4)
+    JAMMING_STATE_UNKNOWN, JAMMING_STATE_OK, JAMMING_STATE_MITIGATED, JAMMING_STATE_DETECTED = (
+        range(4)
+    )
+    SPOOFING_STATE_UNKNOWN, SPOOFING_STATE_OK, SPOOFING_STATE_MITIGATED, SPOOFING_STATE_DETECTED = (
+        range(4)
+    )
     (
         AUTHENTICATION_STATE_UNKNOWN, AUTHENTICATION_STATE_INITIALIZING, AUTHENTICATION_STATE_ERROR,
         AUTHENTICATION_STATE_OK, AUTHENTICATION_STATE_DISABLED,
@@ -66,16 +103,22 @@ class SensorGps(Message):
     ) = 0, 1, 2, 4, 8, 16, 32, 64  # fmt: skip
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
-    timestamp_sample: Uint64 = field("Time of the underlying sensor data [us]; with PPS up to 0.1 s after timestamp")
+    timestamp_sample: Uint64 = field(
+        "Time of the underlying sensor data [us]; with PPS up to 0.1 s after timestamp"
+    )
     device_id: Uint32 = field("Device ID, unchanged by restarts")
     latitude_deg: Float64 = field("Latitude [deg] [WGS84]")
-    longitude_deg: Float64 = field("Longitude [deg] [WGS84], also beyond +-180 if receivers are blended")
+    longitude_deg: Float64 = field(
+        "Longitude [deg] [WGS84], also beyond +-180 if receivers are blended"
+    )
     altitude_msl_m: Float64 = field("Altitude above mean sea level [m]")
     altitude_ellipsoid_m: Float64 = field("Altitude above the ellipsoid [m] [WGS84]")
 
     s_variance_m_s: Float32 = field("Speed accuracy [m/s], not a variance")
     c_variance_rad: Float32 = field("Course accuracy [rad], not a variance")
-    fix_type: Uint8 = field("Fix: 0, 1 none, 2 2D, 3 3D, 4 RTCM differential, 5 RTK float, 6 RTK fixed, 8 extrapolated")
+    fix_type: Uint8 = field(
+        "Fix: 0, 1 none, 2 2D, 3 3D, 4 RTCM differential, 5 RTK float, 6 RTK fixed, 8 extrapolated"
+    )
 
     eph: Float32 = field("Horizontal position accuracy [m]")
     epv: Float32 = field("Vertical position accuracy [m]")
@@ -87,7 +130,9 @@ class SensorGps(Message):
     jamming_state: Uint8 = field("Jamming: 0 unknown, 1 OK, 2 mitigated, 3 detected")
     jamming_indicator: Int32 = field("Jamming level, in receiver-specific units")
     spoofing_state: Uint8 = field("Spoofing: 0 unknown, 1 OK, 2 mitigated, 3 detected")
-    authentication_state: Uint8 = field("Signal authentication: 0 unknown, 1 initializing, 2 error, 3 OK, 4 disabled")
+    authentication_state: Uint8 = field(
+        "Signal authentication: 0 unknown, 1 initializing, 2 error, 3 OK, 4 disabled"
+    )
 
     vel_m_s: Float32 = field("Ground speed [m/s]")
     vel_n_m_s: Float32 = field("North velocity [m/s] [NED]")
@@ -118,7 +163,11 @@ class SensorGps(Message):
     def global_position(self) -> GlobalPosition | None:
         """Latitude, longitude [deg] [WGS84] and altitude above mean sea level [m]; None without a 3D fix."""
         has_fix = self.fix_type >= SensorGps.FIX_TYPE_3D
-        return GlobalPosition.wrapped(self.latitude_deg, self.longitude_deg, self.altitude_msl_m) if has_fix else None
+        return (
+            GlobalPosition.wrapped(self.latitude_deg, self.longitude_deg, self.altitude_msl_m)
+            if has_fix
+            else None
+        )
 
     @property
     def velocity(self) -> Ned | None:

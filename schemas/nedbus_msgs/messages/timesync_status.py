@@ -12,7 +12,9 @@ class TimesyncStatus(Message):
     It is published only while the remote side responds; just after a start the offset may be off by milliseconds.
     """
 
-    TOPICS = (Topic("timesync_status", 10.0, "the MAVLink or DDS module, while a companion responds"),)
+    TOPICS = (
+        Topic("timesync_status", 10.0, "the MAVLink or DDS module, while a companion responds"),
+    )
     LAYOUTS = (Layout("1.13", "*"),)
 
     SOURCE_PROTOCOL_UNKNOWN, SOURCE_PROTOCOL_MAVLINK, SOURCE_PROTOCOL_DDS = range(3)

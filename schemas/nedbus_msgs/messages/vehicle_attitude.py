@@ -16,7 +16,12 @@ class VehicleAttitude(Message):
     """
 
     TOPICS = (
-        Topic("vehicle_attitude", 50.0, "EKF2, or the EKF2 selector in multi-EKF mode", priority="data_high"),
+        Topic(
+            "vehicle_attitude",
+            50.0,
+            "EKF2, or the EKF2 selector in multi-EKF mode",
+            priority="data_high",
+        ),
         Topic("vehicle_attitude_groundtruth", 50.0, "simulators (SITL, HITL)"),
         Topic("external_ins_attitude", 50.0, "an external INS driver (VectorNav, ...)"),
         Topic("estimator_attitude", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
@@ -26,5 +31,7 @@ class VehicleAttitude(Message):
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
     q: Float32x4 = field("Rotation from FRD body to NED, Hamilton (w, x, y, z)")
-    delta_q_reset: Float32x4 = field("Change of q at its latest reset: q after = delta_q_reset * q before")
+    delta_q_reset: Float32x4 = field(
+        "Change of q at its latest reset: q after = delta_q_reset * q before"
+    )
     quat_reset_counter: Uint8 = field("Count of q resets, wraps at 255")

@@ -3,7 +3,16 @@
 from typing import ClassVar
 
 from nedbus_msgs.frames import GlobalPosition
-from nedbus_msgs.model import LONGITUDE_LIMIT, FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
+from nedbus_msgs.model import (
+    LONGITUDE_LIMIT,
+    FiniteWhile,
+    Layout,
+    Message,
+    NotLater,
+    NotNegative,
+    Topic,
+    Within,
+)
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field, while_valid
 
 
@@ -20,7 +29,9 @@ class VehicleGlobalPosition(Message):
         Topic("vehicle_global_position", 50.0, "EKF2, or the EKF2 selector in multi-EKF mode"),
         Topic("vehicle_global_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
         Topic("external_ins_global_position", 50.0, "an external INS driver (VectorNav, ...)"),
-        Topic("estimator_global_position", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
+        Topic(
+            "estimator_global_position", 2.0, "each EKF2 instance in multi-EKF mode", instances=True
+        ),
     )
     LAYOUTS = (
         Layout("1.13", "1.16, without lat_lon_valid alt_valid delta_terrain terrain_reset_counter"),

@@ -26,5 +26,7 @@ class VehicleLandDetected(Message):
     vertical_movement: Bool = field("Vertical movement detected")
     horizontal_movement: Bool = field("Horizontal movement detected")
     rotational_movement: Bool = field("Rotation about roll or pitch detected")
-    close_to_ground_or_skipped_check: Bool = field("Close to the ground, or not checked for lack of a sensor")
+    close_to_ground_or_skipped_check: Bool = field(
+        "Close to the ground, or not checked for lack of a sensor"
+    )
     at_rest: Bool = field("Vehicle is at rest")

@@ -5,8 +5,24 @@ from typing import ClassVar, Final
 
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.model import Layout, Message, RenamedField, Topic
-from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Uint8, Uint64, field, while_valid
-from nedbus_msgs.model.rules import FLOAT32_PI, LONGITUDE_LIMIT, FiniteWhile, NotLater, NotNegative, Within
+from nedbus_msgs.model.px4_types import (
+    Bool,
+    Float32,
+    Float32x2,
+    Float64,
+    Uint8,
+    Uint64,
+    field,
+    while_valid,
+)
+from nedbus_msgs.model.rules import (
+    FLOAT32_PI,
+    LONGITUDE_LIMIT,
+    FiniteWhile,
+    NotLater,
+    NotNegative,
+    Within,
+)
 
 _VALID: Final = {"xy_valid": "xy", "z_valid": "z", "v_xy_valid": "vxy", "v_z_valid": "vz"}
 _WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # bad if set
@@ -29,10 +45,17 @@ class VehicleLocalPosition(Message):
     """
 
     TOPICS = (
-        Topic("vehicle_local_position", 100.0, "EKF2, or the EKF2 selector in multi-EKF mode", priority="data_high"),
+        Topic(
+            "vehicle_local_position",
+            100.0,
+            "EKF2, or the EKF2 selector in multi-EKF mode",
+            priority="data_high",
+        ),
         Topic("vehicle_local_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
         Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)"),
-        Topic("estimator_local_position", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
+        Topic(
+            "estimator_local_position", 2.0, "each EKF2 instance in multi-EKF mode", instances=True
+        ),
     )
     LAYOUTS = (
         Layout("1.13", "1.14, without dead_reckoning"),
@@ -94,7 +117,9 @@ class VehicleLocalPosition(Message):
 
     heading: Float32 = field("Euler yaw, body frame to local NED [rad], within [-pi, pi]")
     heading_var: Float32 = field("Variance of heading [rad^2]")
-    unaided_heading: Float32 = field("Heading from gyros alone [rad]; only differences are meaningful")
+    unaided_heading: Float32 = field(
+        "Heading from gyros alone [rad]; only differences are meaningful"
+    )
     delta_heading: Float32 = field("Jump of heading at its latest reset [rad]")
     heading_reset_counter: Uint8 = field("Count of heading resets, wraps at 255")
     heading_good_for_control: Bool = field("heading is good enough for control")
@@ -112,7 +137,9 @@ class VehicleLocalPosition(Message):
     dist_bottom_var: Float32 = field("Variance of the terrain estimate [m^2]")
     delta_dist_bottom: Float32 = field("Jump of dist_bottom at its latest reset [m]")
     dist_bottom_reset_counter: Uint8 = field("Count of dist_bottom resets, wraps at 255")
-    dist_bottom_sensor_bitfield: Uint8 = field("Sensors used for dist_bottom: 0 none, 1 range, 2 flow")
+    dist_bottom_sensor_bitfield: Uint8 = field(
+        "Sensors used for dist_bottom: 0 none, 1 range, 2 flow"
+    )
 
     eph: Float32 = field("Standard deviation of north and east position combined [m]")
     epv: Float32 = field("Standard deviation of down position [m]")
@@ -120,17 +147,31 @@ class VehicleLocalPosition(Message):
     evv: Float32 = field("Standard deviation of down velocity [m/s]")
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
-    vxy_max: Float32 = field("Maximum horizontal speed [m/s]; infinity if unlimited (0 in ground truth)")
-    vz_max: Float32 = field("Maximum vertical speed [m/s]; infinity if unlimited (0 in ground truth)")
-    hagl_min: Float32 = field("Minimum height above ground [m]; infinity if unlimited (0 in ground truth)")
-    hagl_max_z: Float32 = field("Maximum height above ground for z control [m]; infinity if unlimited")
-    hagl_max_xy: Float32 = field("Maximum height above ground for xy control [m]; infinity if unlimited")
+    vxy_max: Float32 = field(
+        "Maximum horizontal speed [m/s]; infinity if unlimited (0 in ground truth)"
+    )
+    vz_max: Float32 = field(
+        "Maximum vertical speed [m/s]; infinity if unlimited (0 in ground truth)"
+    )
+    hagl_min: Float32 = field(
+        "Minimum height above ground [m]; infinity if unlimited (0 in ground truth)"
+    )
+    hagl_max_z: Float32 = field(
+        "Maximum height above ground for z control [m]; infinity if unlimited"
+    )
+    hagl_max_xy: Float32 = field(
+        "Maximum height above ground for xy control [m]; infinity if unlimited"
+    )
 
     position: ClassVar = while_valid(Ned, "x, y and z [m] [local NED]", "xy_valid", "z_valid")
-    velocity: ClassVar = while_valid(Ned, "vx, vy and vz [m/s] [local NED]", "v_xy_valid", "v_z_valid")
+    velocity: ClassVar = while_valid(
+        Ned, "vx, vy and vz [m/s] [local NED]", "v_xy_valid", "v_z_valid"
+    )
     height: ClassVar = while_valid(float.__neg__, "-z, height above the origin [m]", "z_valid")
     height_above_ground: ClassVar = while_valid(float, "dist_bottom [m]", "dist_bottom_valid")
-    good_heading: ClassVar = while_valid(float, "heading, good for control [rad]", "heading_good_for_control")
+    good_heading: ClassVar = while_valid(
+        float, "heading, good for control [rad]", "heading_good_for_control"
+    )
     origin: ClassVar = while_valid(
         GlobalPosition.wrapped, "ref_lat, ref_lon [deg], ref_alt [m]", "xy_global", "z_global"
     )
@@ -165,4 +206,6 @@ def describe_flags(shares: Mapping[str, float]) -> str:
 
 def message_doubts(message: VehicleLocalPosition, missing: Collection[str] = ()) -> str:
     """Describe the flags that cast doubt on one message, which lacks the `missing` fields; "ok" if none does."""
-    return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS if name not in missing})
+    return describe_flags(
+        {name: float(getattr(message, name)) for name in DOUBT_FLAGS if name not in missing}
+    )

@@ -21,9 +21,18 @@ class VehicleOdometry(Message):
     """
 
     TOPICS = (
-        Topic("vehicle_odometry", 100.0, "EKF2, or the EKF2 selector in multi-EKF mode", priority="data_high"),
+        Topic(
+            "vehicle_odometry",
+            100.0,
+            "EKF2, or the EKF2 selector in multi-EKF mode",
+            priority="data_high",
+        ),
         Topic("vehicle_mocap_odometry", 100.0, "a motion capture system, over MAVLink or DDS"),
-        Topic("vehicle_visual_odometry", 100.0, "visual odometry of a companion computer, over MAVLink or DDS"),
+        Topic(
+            "vehicle_visual_odometry",
+            100.0,
+            "visual odometry of a companion computer, over MAVLink or DDS",
+        ),
         Topic("estimator_odometry", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
     )
     LAYOUTS = (
@@ -32,22 +41,36 @@ class VehicleOdometry(Message):
         Layout("1.14", "*"),
     )  # fmt: skip
     OLDER = (
-        RenamedField("local_frame", "pose_frame", lambda f: {0: 1, 1: 2}.get(f, 0), lambda f: {1: 0, 2: 1}.get(f, 2)),
+        RenamedField(
+            "local_frame",
+            "pose_frame",
+            lambda f: {0: 1, 1: 2}.get(f, 0),
+            lambda f: {1: 0, 2: 1}.get(f, 2),
+        ),
         *(RenamedField(name, f"position[{i}]") for i, name in enumerate(("x", "y", "z"))),
         *(RenamedField(name, f"velocity[{i}]") for i, name in enumerate(("vx", "vy", "vz"))),
-        *(RenamedField(f"{name}speed", f"angular_velocity[{i}]") for i, name in enumerate(("roll", "pitch", "yaw"))),
+        *(
+            RenamedField(f"{name}speed", f"angular_velocity[{i}]")
+            for i, name in enumerate(("roll", "pitch", "yaw"))
+        ),
     )
     RULES = (UnitQuaternion("q", tolerance=0.1, or_zeros=True),)
 
     POSE_FRAME_UNKNOWN, POSE_FRAME_NED, POSE_FRAME_FRD = range(3)
-    VELOCITY_FRAME_UNKNOWN, VELOCITY_FRAME_NED, VELOCITY_FRAME_FRD, VELOCITY_FRAME_BODY_FRD = range(4)
+    VELOCITY_FRAME_UNKNOWN, VELOCITY_FRAME_NED, VELOCITY_FRAME_FRD, VELOCITY_FRAME_BODY_FRD = range(
+        4
+    )
 
     timestamp_sample: Uint64 = field("Time of the underlying sensor data [us]")
-    pose_frame: Uint8 = field("Frame of position and q: 0 unknown, 1 NED, 2 FRD with arbitrary heading")
+    pose_frame: Uint8 = field(
+        "Frame of position and q: 0 unknown, 1 NED, 2 FRD with arbitrary heading"
+    )
     position: Float32x3 = field("Position [m] [pose_frame]")
     q: Float32x4 = field("Rotation from FRD body to pose_frame, Hamilton (w, x, y, z)")
 
-    velocity_frame: Uint8 = field("Frame of velocity: 0 unknown, 1 NED, 2 FRD with arbitrary heading, 3 body FRD")
+    velocity_frame: Uint8 = field(
+        "Frame of velocity: 0 unknown, 1 NED, 2 FRD with arbitrary heading, 3 body FRD"
+    )
     velocity: Float32x3 = field("Velocity [m/s] [velocity_frame]")
     angular_velocity: Float32x3 = field("Angular velocity [rad/s] [body FRD]")
 

@@ -58,30 +58,53 @@ class VehicleStatus(Message):
         NAVIGATION_STATE_EXTERNAL8, NAVIGATION_STATE_MAX,
     ) = range(32)  # fmt: skip
     HIL_STATE_OFF, HIL_STATE_ON = range(2)
-    VEHICLE_TYPE_UNSPECIFIED, VEHICLE_TYPE_ROTARY_WING, VEHICLE_TYPE_FIXED_WING, VEHICLE_TYPE_ROVER = range(4)
-    FAILSAFE_DEFER_STATE_DISABLED, FAILSAFE_DEFER_STATE_ENABLED, FAILSAFE_DEFER_STATE_WOULD_FAILSAFE = range(3)
+    (
+        VEHICLE_TYPE_UNSPECIFIED,
+        VEHICLE_TYPE_ROTARY_WING,
+        VEHICLE_TYPE_FIXED_WING,
+        VEHICLE_TYPE_ROVER,
+    ) = range(4)
+    (
+        FAILSAFE_DEFER_STATE_DISABLED,
+        FAILSAFE_DEFER_STATE_ENABLED,
+        FAILSAFE_DEFER_STATE_WOULD_FAILSAFE,
+    ) = range(3)
 
     armed_time: Uint64 = field("Time of arming, since boot [us], 0 if not armed")
     takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if none")
-    arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 init, 3 error, 4 shutdown, 5 in-air restore")
-    latest_arming_reason: Uint8 = field("Arming reason: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
-    latest_disarming_reason: Uint8 = field("Disarming reason, as latest_arming_reason: 6 landing (up to 1.17: 7) ...")
+    arming_state: Uint8 = field(
+        "1 disarmed, 2 armed; up to 1.14 also 0 init, 3 error, 4 shutdown, 5 in-air restore"
+    )
+    latest_arming_reason: Uint8 = field(
+        "Arming reason: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_"
+    )
+    latest_disarming_reason: Uint8 = field(
+        "Disarming reason, as latest_arming_reason: 6 landing (up to 1.17: 7) ..."
+    )
 
     nav_state_timestamp: Uint64 = field("Time of the latest change of nav_state, since boot [us]")
     nav_state_user_intention: Uint8 = field("Mode selected by the user, as nav_state")
-    nav_state: Uint8 = field("Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ...")
+    nav_state: Uint8 = field(
+        "Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ..."
+    )
     executor_in_charge: Uint8 = field("Mode executor in charge: 0 autopilot")
     nav_state_display: Uint8 = field("Mode to display to the user, as nav_state")
     accepts_offboard_setpoints: Bool = field("Active mode accepts offboard setpoints")
     valid_nav_states_mask: Uint32 = field("Available modes, as a bitmask of nav_state")
-    can_set_nav_states_mask: Uint32 = field("Modes that the user can select, as a bitmask of nav_state")
+    can_set_nav_states_mask: Uint32 = field(
+        "Modes that the user can select, as a bitmask of nav_state"
+    )
 
     hil_state: Uint8 = field("Hardware in the loop: 0 off, 1 on")
-    vehicle_type: Uint8 = field("Current type: 0 unspecified, 1 rotary wing, 2 fixed wing, 3 rover; a VTOL changes it")
+    vehicle_type: Uint8 = field(
+        "Current type: 0 unspecified, 1 rotary wing, 2 fixed wing, 3 rover; a VTOL changes it"
+    )
 
     failsafe: Bool = field("Failsafe is active")
     failsafe_and_user_took_over: Bool = field("User took over from a failsafe")
-    failsafe_defer_state: Uint8 = field("Failsafe deferral: 0 disabled, 1 enabled, 2 enabled with a failsafe pending")
+    failsafe_defer_state: Uint8 = field(
+        "Failsafe deferral: 0 disabled, 1 enabled, 2 enabled with a failsafe pending"
+    )
 
     gcs_connection_lost: Bool = field("Ground control station connection lost")
     gcs_connection_lost_counter: Uint8 = field("Number of ground control station connection losses")
@@ -127,6 +150,12 @@ class VehicleStatus(Message):
     engine_failure: Bool = field("Engine failure")
     mission_failure: Bool = field("Mission failure")
     geofence_violated: Bool = field("Geofence violated")
-    onboard_control_sensors_present: Uint64 = field("Sensors present, as a bitmask of MAVLink's SYS_STATUS")
-    onboard_control_sensors_enabled: Uint64 = field("Sensors enabled, as a bitmask of MAVLink's SYS_STATUS")
-    onboard_control_sensors_health: Uint64 = field("Sensors healthy, as a bitmask of MAVLink's SYS_STATUS")
+    onboard_control_sensors_present: Uint64 = field(
+        "Sensors present, as a bitmask of MAVLink's SYS_STATUS"
+    )
+    onboard_control_sensors_enabled: Uint64 = field(
+        "Sensors enabled, as a bitmask of MAVLink's SYS_STATUS"
+    )
+    onboard_control_sensors_health: Uint64 = field(
+        "Sensors healthy, as a bitmask of MAVLink's SYS_STATUS"
+    )

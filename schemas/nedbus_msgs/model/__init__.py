@@ -2,4 +2,13 @@
 
 from .declaration import Layout, RenamedField, Topic
 from .message import Message
-from .rules import FLOAT32_PI, LONGITUDE_LIMIT, FiniteWhile, InRange, NotLater, NotNegative, UnitQuaternion, Within
+from .rules import (
+    FLOAT32_PI,
+    LONGITUDE_LIMIT,
+    FiniteWhile,
+    InRange,
+    NotLater,
+    NotNegative,
+    UnitQuaternion,
+    Within,
+)

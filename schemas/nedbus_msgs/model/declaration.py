@@ -75,7 +75,9 @@ class Layout:
     wire: int | None = None
     aliases: tuple[str, ...] = ()
     types: Mapping[str, FieldType] = dataclasses.field(default_factory=dict, repr=False)
-    caches: dict[object, Callable[..., Any]] = dataclasses.field(default_factory=dict, init=False, repr=False)
+    caches: dict[object, Callable[..., Any]] = dataclasses.field(
+        default_factory=dict, init=False, repr=False
+    )
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -77,12 +77,17 @@ class FieldReader:
         if isinstance(message, Mapping):
             return lambda fields: tuple([fields.get(name, absent) for name in names])
         if positions is None and all(hasattr(message, name) for name in names):
-            return attrgetter(*names) if len(names) > 1 else lambda model: (getattr(model, names[0]),)
+            return (
+                attrgetter(*names) if len(names) > 1 else lambda model: (getattr(model, names[0]),)
+            )
         if positions is None:
             return lambda model: tuple([getattr(model, name, absent) for name in names])
         known = [positions[name] for name in names if name in positions]
-        if len(known) < len(names):  # the publisher defines the fields of a topic that is not built in
-            return lambda row: tuple([row[positions[name]] if name in positions else absent for name in names])
+        # the publisher defines the fields of a topic that is not built in
+        if len(known) < len(names):
+            return lambda row: tuple(
+                [row[positions[name]] if name in positions else absent for name in names]
+            )
         return itemgetter(*known) if len(known) > 1 else itemgetter(slice(known[0], known[0] + 1))
 
 
@@ -131,11 +136,18 @@ class Definition(Generic[M_co]):
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
         """PX4's layouts by name, oldest first; the last one has exactly the model's fields."""
-        found = {layout.name: replace(layout, types=self._types_of(layout.text)) for layout in self.model.LAYOUTS}
+        found = {
+            layout.name: replace(layout, types=self._types_of(layout.text))
+            for layout in self.model.LAYOUTS
+        }
         if all(layout.wire is None for layout in found.values()):
             fields = list(self.types.items())
-            own = next((layout for layout in found.values() if list(layout.types.items()) == fields), None)
-            own = replace(found.pop(own.name) if own else Layout(ALL, "*"), wire=0, types=self.types)
+            own = next(
+                (layout for layout in found.values() if list(layout.types.items()) == fields), None
+            )
+            own = replace(
+                found.pop(own.name) if own else Layout(ALL, "*"), wire=0, types=self.types
+            )
             found[own.name] = own
         return found
 
@@ -152,15 +164,26 @@ class Definition(Generic[M_co]):
     @cached_property
     def row(self) -> type[Row]:
         """The named tuple class of this message."""
-        members: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
-        members |= {name: each for name, each in vars(self.model).items() if isinstance(each, property)}
-        members |= {"_positions": {name: index for index, name in enumerate(self.names)}, "_fields": self.names}
+        members: dict[str, Any] = {
+            name: property(itemgetter(index)) for index, name in enumerate(self.names)
+        }
+        members |= {
+            name: each for name, each in vars(self.model).items() if isinstance(each, property)
+        }
+        members |= {
+            "_positions": {name: index for index, name in enumerate(self.names)},
+            "_fields": self.names,
+        }
         return type(f"{self.name}Row", (Row,), {**members, "__slots__": (), "DEFINITION": self})
 
     @cached_property
     def flat_row(self) -> type[FlatRow]:
         """The class of flattened values of this message."""
-        return type(f"{self.name}FlatRow", (FlatRow,), {"__slots__": (), "_positions": positions_of(self.types)})
+        return type(
+            f"{self.name}FlatRow",
+            (FlatRow,),
+            {"__slots__": (), "_positions": positions_of(self.types)},
+        )
 
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout with this name or of this PX4 release; None if there is none."""
@@ -172,7 +195,9 @@ class Definition(Generic[M_co]):
     def find_layout(self, names: Iterable[str]) -> Layout | None:
         """Return the layout with exactly these field names in any order, or None."""
         given = frozenset(names)
-        return next((layout for layout in self.layouts.values() if given == layout.types.keys()), None)
+        return next(
+            (layout for layout in self.layouts.values() if given == layout.types.keys()), None
+        )
 
     @cached_property
     def known_types(self) -> Mapping[str, Set[FieldType]]:
@@ -188,7 +213,9 @@ class Definition(Generic[M_co]):
 
         If the current layout is not one of PX4's, return PX4's layout with exactly these fields, if there is one.
         """
-        return self.current if self.current.name != ALL else self.find_layout(provided) or self.current
+        return (
+            self.current if self.current.name != ALL else self.find_layout(provided) or self.current
+        )
 
     @cached_on_owner  # all messages of a stream have the same field names
     def plan(self, names: tuple[str, ...]) -> UpgradePlan:
@@ -198,7 +225,9 @@ class Definition(Generic[M_co]):
         for old in (self.older[name] for name in names if name in self.older):
             for base, index in old.targets:
                 if index is not None and base not in direct:
-                    sources, _ = converted.setdefault(base, ([None] * self.types[base].values, lambda *values: values))
+                    sources, _ = converted.setdefault(
+                        base, ([None] * self.types[base].values, lambda *values: values)
+                    )
                     sources[index] = old.name
                 elif old.up and base not in direct:
                     converted.setdefault(base, ([old.name], old.up))
@@ -226,21 +255,29 @@ class Definition(Generic[M_co]):
     def meaning(self, name: str) -> str:
         """Return the unit and meaning of a field of any layout."""
         field = self.model.model_fields.get(name)
-        return (field.description if field else self.older[name].doc if name in self.older else "") or ""
+        return (
+            field.description if field else self.older[name].doc if name in self.older else ""
+        ) or ""
 
     def schema(self) -> dict[str, Any]:
         """Return the JSON Schema (2020-12), where NaN and infinities are strings, and the layouts.
 
         Each layout has its name, its number on the wire (or None), and its fields in order, with name and type.
         """
-        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **self.model.model_json_schema()}
+        schema = {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            **self.model.model_json_schema(),
+        }
         for field in schema["properties"].values():
-            field.pop("default", None)  # JSON has no NaN, and a writer should omit fields that are not provided
+            # JSON has no NaN, and a writer should omit fields that are not provided
+            field.pop("default", None)
         layouts = [
             {
                 "name": layout.name,
                 "wire": layout.wire,
-                "fields": [{"name": name, "type": str(kind)} for name, kind in layout.types.items()],
+                "fields": [
+                    {"name": name, "type": str(kind)} for name, kind in layout.types.items()
+                ],
             }
             for layout in self.layouts.values()
         ]
@@ -249,8 +286,16 @@ class Definition(Generic[M_co]):
     def explain_unknown_field(self, name: str) -> str:
         """Return the error text for an unknown field, with suggestions."""
         base, bracket, _ = name.partition("[")
-        near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"'nedbus schema {self.name}' lists the fields"
+        near = (
+            [base]
+            if bracket and base in self.types
+            else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
+        )
+        hint = (
+            f"did you mean {' or '.join(near)}?"
+            if near
+            else f"'nedbus schema {self.name}' lists the fields"
+        )
         return f"unknown field {name!r}: {hint}"
 
     def __repr__(self) -> str:
@@ -283,7 +328,9 @@ class Definition(Generic[M_co]):
             return name, field_type(kind) if kind else self.types[name]
         old = self.older[name]
         base, index = old.targets[0]
-        return name, field_type(old.type or (str(self.types[base]) if index is None else self.types[base].base))
+        return name, field_type(
+            old.type or (str(self.types[base]) if index is None else self.types[base].base)
+        )
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
@@ -324,8 +371,12 @@ BY_TOPIC: Final[dict[str, Definition[Any]]] = {}
 
 def register(definition: Definition[Any]) -> None:
     """Register a message; raise ValueError if its name or one of its topics is already registered."""
-    if taken := [name for name in (definition.name, *definition.topics) if name in MESSAGES or name in TOPICS]:
-        raise ValueError(f"cannot register {definition.name}: {', '.join(taken)} already registered")
+    if taken := [
+        name for name in (definition.name, *definition.topics) if name in MESSAGES or name in TOPICS
+    ]:
+        raise ValueError(
+            f"cannot register {definition.name}: {', '.join(taken)} already registered"
+        )
     MESSAGES[definition.name] = definition
     for topic in definition.topics.values():
         TOPICS[topic.name], BY_TOPIC[topic.name] = topic, definition

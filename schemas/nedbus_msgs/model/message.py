@@ -4,7 +4,14 @@ import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from .declaration import Layout, RenamedField, Topic
@@ -54,7 +61,11 @@ class Message(BaseModel):
             if values is None:
                 super().__init__(**fields)
             else:
-                fill(self, values, definition.all_fields if len(fields) == len(values) else frozenset(fields))
+                fill(
+                    self,
+                    values,
+                    definition.all_fields if len(fields) == len(values) else frozenset(fields),
+                )
 
         # Marks this constructor as Pydantic's own, so that validation of dicts and JSON bypasses it.
         __init__.__pydantic_base_init__ = True
@@ -157,5 +168,10 @@ def fill(message: M, values: dict[str, object], given: Set[str]) -> M:
 # The slots that Pydantic's own validator sets (since 2.12); set directly because models are frozen.
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
-    for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")
+    for slot in (
+        "__dict__",
+        "__pydantic_fields_set__",
+        "__pydantic_extra__",
+        "__pydantic_private__",
+    )
 )

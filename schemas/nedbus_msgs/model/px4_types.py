@@ -13,8 +13,10 @@ from pydantic_core import CoreSchema, core_schema
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
-YEAR_2000: Final = 946_684_800_000_000  # us since 1970; for scripts that know it from earlier releases
-FIRST_UNIX_TIME: Final = 1_234_567_890_000_000  # us since 1970, 2009-02-13: PX4 sets no clock to an earlier time
+# us since 1970; for scripts that know it from earlier releases
+YEAR_2000: Final = 946_684_800_000_000
+# us since 1970, 2009-02-13: PX4 sets no clock to an earlier time
+FIRST_UNIX_TIME: Final = 1_234_567_890_000_000
 _YEAR_2100: Final = 4_102_444_800_000_000
 _MAX_ARRAY: Final = 1024  # elements; PX4's longest array has 512
 
@@ -42,7 +44,8 @@ BASES: Final[Mapping[str, Base]] = {
     "float64": Base("d", 0xCB, 11, NAN),
     "char": Base("s", 0xDA, 3, ""),  # only in arrays, which are text; ROS 2 uses uint8
 }
-ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}  # PX4's other names for types of single values
+# PX4's other names for types of single values
+ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 
 
 class FieldType(str):
@@ -68,7 +71,11 @@ class FieldType(str):
         self.size = struct.calcsize("<" + self.form) // self.values
         self.absent: object = (base.absent,) * self.values if self.is_array else base.absent
         bits = 8 * self.size
-        self.limits = (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        self.limits = (
+            (0, 2**bits - 1)
+            if self.base.startswith("uint")
+            else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        )
 
     def fit(self, value: Any) -> Any:
         """Convert a value, or a tuple of at most `length` values, to this type; return None if a value would change.
@@ -77,7 +84,9 @@ class FieldType(str):
         """
         base = BASES[self.base]
         if self.is_text:
-            return value if isinstance(value, str) and len(encode_text(value)) <= self.size else None
+            return (
+                value if isinstance(value, str) and len(encode_text(value)) <= self.size else None
+            )
         if self.length is not None:
             if not isinstance(value, tuple) or len(value) > self.length:
                 return None
@@ -93,7 +102,15 @@ class FieldType(str):
     @cached_property
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
-        value = str if self.is_text else bool if self.base == "bool" else float if self.is_float else int
+        value = (
+            str
+            if self.is_text
+            else bool
+            if self.base == "bool"
+            else float
+            if self.is_float
+            else int
+        )
         python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one per value
         return Annotated[python, self, Field(default=self.absent)]
 
@@ -115,7 +132,9 @@ class FieldType(str):
             return number
         names = core_schema.literal_schema(["NaN", "Infinity", "-Infinity"])
         from_name = core_schema.no_info_after_validator_function(float, names)
-        return core_schema.json_or_python_schema(core_schema.union_schema([number, from_name]), number)
+        return core_schema.json_or_python_schema(
+            core_schema.union_schema([number, from_name]), number
+        )
 
     def _check_text(self, text: str) -> str:
         if len(encode_text(text)) > self.size:
@@ -149,7 +168,9 @@ def field_type(text: str) -> FieldType:
     if not (base == "char" and length):
         base = ALIASES.get(base, base)
     if base not in BASES:
-        raise ValueError(f"{base!r} is not a type; expected {', '.join(BASES)}, or an array of fixed length")
+        raise ValueError(
+            f"{base!r} is not a type; expected {', '.join(BASES)}, or an array of fixed length"
+        )
     if length and not 0 < int(length) <= _MAX_ARRAY:
         raise ValueError(f"array of {int(length)} elements; expected 1 to {_MAX_ARRAY}")
     return FieldType(f"{base}[{int(length)}]" if length else base)
@@ -174,7 +195,11 @@ def while_valid(make: Callable[..., _T], meaning: str, *flags: str) -> _T | None
     def value(message: Any) -> _T | None:
         fields = message.DEFINITION.flags
         is_valid = all(getattr(message, flag) for flag in flags)
-        return make(*(getattr(message, name) for flag in flags for name in fields[flag])) if is_valid else None
+        return (
+            make(*(getattr(message, name) for flag in flags for name in fields[flag]))
+            if is_valid
+            else None
+        )
 
     return cast("_T | None", property(value, doc=f"{meaning}; None unless {' and '.join(flags)}."))
 
@@ -193,6 +218,10 @@ Char127 = Annotated[str, field_type("char[127]"), Field(default="")]
 Float64 = Annotated[float, field_type("float64"), Field(default=NAN)]
 Float32 = Annotated[float, field_type("float32"), Field(default=NAN)]
 Float32x2 = Annotated[tuple[float, float], field_type("float32[2]"), Field(default=(NAN,) * 2)]
-Float32x3 = Annotated[tuple[float, float, float], field_type("float32[3]"), Field(default=(NAN,) * 3)]
-Float32x4 = Annotated[tuple[float, float, float, float], field_type("float32[4]"), Field(default=(NAN,) * 4)]
+Float32x3 = Annotated[
+    tuple[float, float, float], field_type("float32[3]"), Field(default=(NAN,) * 3)
+]
+Float32x4 = Annotated[
+    tuple[float, float, float, float], field_type("float32[4]"), Field(default=(NAN,) * 4)
+]
 Float32x14 = Annotated[tuple[float, ...], field_type("float32[14]"), Field(default=(NAN,) * 14)]

@@ -59,7 +59,11 @@ class FiniteWhile(Rule):
     def __init__(self, **flags: str) -> None:
         self.flags = {flag: tuple(names.split()) for flag, names in flags.items()}
         super().__init__(
-            Check(name, f"must be finite while {flag} is true", f"({{{flag}}} and not isfinite({{{name}}}))")
+            Check(
+                name,
+                f"must be finite while {flag} is true",
+                f"({{{flag}}} and not isfinite({{{name}}}))",
+            )
             for flag, names in self.flags.items()
             for name in names
         )
@@ -69,7 +73,9 @@ class NotNegative(Rule):
     """Variances, standard deviations and the like are not negative; NaN and infinity pass."""
 
     def __init__(self, *fields: str) -> None:
-        super().__init__(Check(name, "must not be negative", f"({{{name}}} < 0)") for name in fields)
+        super().__init__(
+            Check(name, "must not be negative", f"({{{name}}} < 0)") for name in fields
+        )
 
 
 class Within(Rule):
@@ -86,15 +92,29 @@ class InRange(Rule):
     """A field, or each element of an array, is within `least` and `greatest`, or is `or_` ("unknown"); NaN passes."""
 
     def __init__(
-        self, field: str, least: float, greatest: float, *, or_: float | None = None, is_array: bool = False
+        self,
+        field: str,
+        least: float,
+        greatest: float,
+        *,
+        or_: float | None = None,
+        is_array: bool = False,
     ) -> None:
-        reason = f"must be {least:.9g} to {greatest:.9g}" + ("" if or_ is None else f", or {or_:g} if unknown")
+        reason = f"must be {least:.9g} to {greatest:.9g}" + (
+            "" if or_ is None else f", or {or_:g} if unknown"
+        )
         # A valid value must stay valid when rounded to float32; the bounds may be infinite.
         least, greatest = min(least, float32(least)), max(greatest, float32(greatest))
         each = "each" if is_array else f"{{{field}}}"
-        known = [] if or_ is None else [f"({each} != {value!r})" for value in dict.fromkeys((or_, float32(or_)))]
+        known = (
+            []
+            if or_ is None
+            else [f"({each} != {value!r})" for value in dict.fromkeys((or_, float32(or_)))]
+        )
         wrong = f"({' and '.join([f'(({each} < {least!r}) or ({each} > {greatest!r}))', *known])})"
-        super().__init__([Check(field, reason, f"any([{wrong} for each in {{{field}}}])" if is_array else wrong)])
+        super().__init__(
+            [Check(field, reason, f"any([{wrong} for each in {{{field}}}])" if is_array else wrong)]
+        )
 
 
 class NotLater(Rule):
@@ -147,7 +167,9 @@ def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tup
             yield check.field, check.reason.format_map(values)
 
 
-def column_checks(rules: Sequence[Rule], **functions: Callable[..., Any]) -> list[Callable[[Any], Any]]:
+def column_checks(
+    rules: Sequence[Rule], **functions: Callable[..., Any]
+) -> list[Callable[[Any], Any]]:
     """Return one function per check that maps a structured array to a mask of the messages that break it.
 
     `functions`: column versions of the functions that checks call; array columns are transposed.
@@ -162,8 +184,15 @@ def column_checks(rules: Sequence[Rule], **functions: Callable[..., Any]) -> lis
 @lru_cache(1024)
 def compile_lambda(expression: str, **functions: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a lambda generated from numbers and field positions, never from data of a peer."""
-    names = {"isfinite": math.isfinite, "squared_norm": _rounded_norm, "inf": math.inf, "nan": math.nan, **functions}
-    code = compile(expression, "<rules>", "eval")  # eval() of a str makes CPython lose a pending Ctrl-C
+    names = {
+        "isfinite": math.isfinite,
+        "squared_norm": _rounded_norm,
+        "inf": math.inf,
+        "nan": math.nan,
+        **functions,
+    }
+    # eval() of a str makes CPython lose a pending Ctrl-C
+    code = compile(expression, "<rules>", "eval")
     return cast("Callable[..., Any]", eval(code, names))  # noqa: S307 - see above
 
 

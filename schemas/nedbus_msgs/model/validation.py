@@ -44,7 +44,9 @@ class Validation:
         self._types = types
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
         # Not the model's schema: Pydantic takes 20 ms to build it for all messages, during which it swallows Ctrl-C.
-        tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
+        tuples = core_schema.tuple_positional_schema(
+            [kind.core_schema(from_json=False) for kind in kinds]
+        )
         self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
         self._struct = struct.Struct("=" + "".join(kind.form for kind in kinds))
         self._flat, nested = _flat_expressions(list(kinds))
@@ -53,7 +55,9 @@ class Validation:
         if any(kind.length is not None for kind in kinds):
             self.flatten = compile_lambda(f"lambda row: ({self._flat},)", encode_text=encode_text)
             self.unflatten = compile_lambda(f"lambda row: ({nested},)", decode_text=decode_text)
-        valid = f"(values := validate(values)) and {expression_of(rules, accessors)} and values or None"
+        valid = (
+            f"(values := validate(values)) and {expression_of(rules, accessors)} and values or None"
+        )
         self._valid_row: Callable[[Values], Values | None] = compile_lambda(
             f"lambda values: {valid}", validate=self.validate
         )
@@ -61,7 +65,10 @@ class Validation:
     @cached_property
     def rounded_by_name(self) -> ByName:
         """Return the same as `by_name`, rounded to float32; raise OverflowError beyond its range."""
-        functions: dict[str, Callable[..., Any]] = {"pack": self._struct.pack, "unpack": self._struct.unpack}
+        functions: dict[str, Callable[..., Any]] = {
+            "pack": self._struct.pack,
+            "unpack": self._struct.unpack,
+        }
         return _compile_by_name(self._types, f"unpack(pack({self._flat}))", **functions)
 
     def check_row(self, values: Values) -> Values | None:
@@ -92,12 +99,18 @@ class Validation:
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the name and the reason for each number beyond the range of its float32 field."""
         for name, kind in self._types.items():
-            for number in (values[name] if kind.is_array else (values[name],)) if kind.base == "float32" else ():
+            for number in (
+                (values[name] if kind.is_array else (values[name],))
+                if kind.base == "float32"
+                else ()
+            ):
                 if math.isfinite(number) and abs(number) > _FLOAT32_MAX:
                     yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
 
 
-def _compile_by_name(types: Mapping[str, FieldType], source: str, **functions: Callable[..., Any]) -> ByName:
+def _compile_by_name(
+    types: Mapping[str, FieldType], source: str, **functions: Callable[..., Any]
+) -> ByName:
     """Return a function that assigns the values of `source`, an expression, to the items of a copied dict.
 
     This takes half the time of `dict.update`. With `functions`, for the source, its values are flattened.
@@ -105,11 +118,24 @@ def _compile_by_name(types: Mapping[str, FieldType], source: str, **functions: C
     targets, arrays = list[str](), list[str]()
     for position, (name, kind) in enumerate(types.items()):
         item = f"values[{name!r}]"
-        parts = [f"part{position}_{index}" for index in range(kind.values)] if functions and kind.is_array else [item]
+        parts = (
+            [f"part{position}_{index}" for index in range(kind.values)]
+            if functions and kind.is_array
+            else [item]
+        )
         targets += parts
         if functions and kind.length is not None:
-            arrays.append(f" {item} = " + (f"decode_text({item})" if kind.is_text else f"({', '.join(parts)},)"))
-    lines = ["def by_name(row):", " values = copy()", f" {', '.join(targets)}, = {source}", *arrays, " return values"]
+            arrays.append(
+                f" {item} = "
+                + (f"decode_text({item})" if kind.is_text else f"({', '.join(parts)},)")
+            )
+    lines = [
+        "def by_name(row):",
+        " values = copy()",
+        f" {', '.join(targets)}, = {source}",
+        *arrays,
+        " return values",
+    ]
     texts = {"encode_text": encode_text, "decode_text": decode_text}
     namespace: dict[str, Any] = {"copy": dict.fromkeys(types).copy, **texts, **functions}
     exec(compile("\n".join(lines), "<fields>", "exec"), namespace)  # noqa: S102 - names are identifiers, quoted by repr
@@ -129,7 +155,10 @@ def positions_of(types: Mapping[str, FieldType]) -> dict[str, int | slice]:
 def accessors_of(types: Mapping[str, FieldType]) -> dict[str, str]:
     """Return an expression for each field of flattened values."""
     found = positions_of(types).items()
-    return {name: f"values[{at}]" if isinstance(at, int) else f"values[{at.start}:{at.stop}]" for name, at in found}
+    return {
+        name: f"values[{at}]" if isinstance(at, int) else f"values[{at.start}:{at.stop}]"
+        for name, at in found
+    }
 
 
 def _flat_expressions(kinds: Sequence[FieldType]) -> tuple[str, str]:

@@ -17,7 +17,9 @@ from .types import NESTED, PACKAGE, TYPE_IDS, describe_field, type_hash
 
 # Possessive quantifiers: a comment may have 200,000 spaces or digits.
 _NUMBER: Final = r"[-+]?(?:(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?|inf)"
-_VALUE: Final = rf"(?:{_NUMBER}|[-+]?0[xXbBoO][\da-fA-F]++|nan|[Tt]rue|[Ff]alse|\"[^\"]*+\"|'[^']*+')"
+_VALUE: Final = (
+    rf"(?:{_NUMBER}|[-+]?0[xXbBoO][\da-fA-F]++|nan|[Tt]rue|[Ff]alse|\"[^\"]*+\"|'[^']*+')"
+)
 _FIELD = re.compile(
     r"(?P<type>(?P<text>w?string(?=\s))|[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})(?:(?:\s*(?P<equals>=)\s*|\s+)"
     rf"(?:{_VALUE}|\[(?:\s*+{_VALUE}\s*+(?:,|(?=\])))*+\s*+\]|(?(text)[^#]*|(?!))))?\s*(?P<comment>#.*)?"
@@ -25,7 +27,8 @@ _FIELD = re.compile(
 """A field, with or without a default value, or a constant; a string may have no quotes."""
 _LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or form feed, which may occur in a comment
 _LENGTH = re.compile(r"\[([1-9]\d{0,2})\]")  # length of an array of nested messages
-_LIMIT: Final = rf"\s*+(?:({_NUMBER})|[-+]?[A-Za-z]\w*+)?\s*+(?:\([^()]*+\)\s*+)?"  # such as 1, pi, -1 (Left)
+# such as 1, pi, -1 (Left)
+_LIMIT: Final = rf"\s*+(?:({_NUMBER})|[-+]?[A-Za-z]\w*+)?\s*+(?:\([^()]*+\)\s*+)?"
 _RANGE = re.compile(rf"(\[)?@range(?![A-Za-z_])(?:\s{_LIMIT}(?P<comma>,){_LIMIT}(?(1)\]))?")
 _INVALID = re.compile(rf"@invalid\s++({_NUMBER})")
 _MAX_FIELDS: Final = 1000  # including nested ones; the limit of a message is lower
@@ -86,7 +89,10 @@ def define_msg(name: str, text: str) -> Definition[Message]:
 def hash_of_msg(name: str, text: str, *, literal_char: bool = False) -> str:
     """Return the RIHS01 hash of the type in a .msg file, with nested messages; raise MsgError if it is malformed."""
     parts = _parts(text)
-    types = {part: [_describe(line, parts, literal_char) for line in lines.values()] for part, lines in parts.items()}
+    types = {
+        part: [_describe(line, parts, literal_char) for line in lines.values()]
+        for part, lines in parts.items()
+    }
     used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
     return type_hash(*((f"{PACKAGE}/{each or name}", types[each]) for each in ["", *used]))
 
@@ -123,9 +129,16 @@ def _parts(text: str) -> _Parts:
         elif line.strip() and line[start] != "#" and not line.startswith("==="):
             found = _FIELD.fullmatch(line.strip())
             if found is None:
-                raise MsgError(number, start + 1, "expected a field, such as 'float32[4] q  # comment', or a constant")
+                raise MsgError(
+                    number,
+                    start + 1,
+                    "expected a field, such as 'float32[4] q  # comment', or a constant",
+                )
             base, bracket, length = found["type"].rpartition("/")[2].partition("[")
-            name, comment = found["name"], (found["comment"] or "").lstrip("# ")[:_MAX_COMMENT].strip()
+            name, comment = (
+                found["name"],
+                (found["comment"] or "").lstrip("# ")[:_MAX_COMMENT].strip(),
+            )
             if name in current:
                 raise MsgError(number, start + 1 + found.start("name"), f"duplicate field {name!r}")
             if not found["equals"]:
@@ -151,7 +164,9 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
 def _describe(line: _Line, parts: Mapping[str, object], literal_char: bool) -> Mapping[str, object]:
     count = _LENGTH.fullmatch(line.length)
     if line.base in parts and (count or not line.length):
-        return describe_field(line.name, NESTED, int(count[1]) if count else 0, f"{PACKAGE}/{line.base}")
+        return describe_field(
+            line.name, NESTED, int(count[1]) if count else 0, f"{PACKAGE}/{line.base}"
+        )
     length = _type_of(line).length or 0
     return describe_field(line.name, TYPE_IDS[literal_char][line.base], length)
 
@@ -166,7 +181,9 @@ def _type_of(line: _Line) -> FieldType:
 def _range_of(field: MsgField) -> InRange | None:
     found, invalid = _RANGE.search(field.comment), _INVALID.search(field.comment)
     if found and not found["comma"]:
-        raise ValueError(f"malformed @range of {field.name}; expected limits, such as [@range 0, 100]")
+        raise ValueError(
+            f"malformed @range of {field.name}; expected limits, such as [@range 0, 100]"
+        )
     if found is None or field.type.base == "bool" or field.type.is_text:
         return None
     least = float(found[2] or "-inf")
@@ -175,5 +192,7 @@ def _range_of(field: MsgField) -> InRange | None:
     lowest, highest = (-math.inf, math.inf) if field.type.is_float else field.type.limits
     first, last = max(least, lowest), min(greatest, highest)
     if first > last or (not field.type.is_float and math.ceil(first) > last):
-        raise ValueError(f"no number is in the @range of {field.name}, from {least:.9g} to {greatest:.9g}")
+        raise ValueError(
+            f"no number is in the @range of {field.name}, from {least:.9g} to {greatest:.9g}"
+        )
     return InRange(field.name, least, greatest, or_=or_, is_array=field.type.is_array)

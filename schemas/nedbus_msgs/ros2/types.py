@@ -41,13 +41,18 @@ def _named_layouts() -> Iterator[tuple[str, Definition[Any], Layout]]:
     """Yield the layouts of built-in messages, each with its ROS 2 types."""
     for definition in MESSAGES.values():
         for layout in definition.layouts.values():
-            yield from ((name, definition, layout) for name in (ros2_type(definition), *layout.aliases))
+            yield from (
+                (name, definition, layout) for name in (ros2_type(definition), *layout.aliases)
+            )
 
 
 def hash_of(layout: Layout, ros2_type: str, *, literal_char: bool = False) -> str:
     """Return the RIHS01 hash (REP 2016) of a ROS 2 type with the fields of a layout: `RIHS01_` and 64 hex digits."""
     ids = TYPE_IDS[literal_char]
-    fields = [describe_field(name, ids[kind.base], kind.length or 0) for name, kind in layout.types.items()]
+    fields = [
+        describe_field(name, ids[kind.base], kind.length or 0)
+        for name, kind in layout.types.items()
+    ]
     return type_hash((ros2_type, fields))
 
 
@@ -61,14 +66,21 @@ def type_hash(*types: tuple[str, Sequence[Mapping[str, object]]]) -> str:
 def describe_field(name: str, type_id: int, length: int, nested: str = "") -> Mapping[str, object]:
     """Return a field of a type description; `length`: 0 unless it is an array; `nested`: type of a nested message."""
     type_id += _ARRAY if length else 0
-    kind = {"type_id": type_id, "capacity": length, "string_capacity": 0, "nested_type_name": nested}
+    kind = {
+        "type_id": type_id,
+        "capacity": length,
+        "string_capacity": 0,
+        "nested_type_name": nested,
+    }
     return {"name": name, "type": kind}
 
 
 def definition_text(definition: Definition[Any], layout: Layout) -> str:
     """Return the .msg definition of a layout, with the unit and meaning of each field."""
     lines = ((f"{kind} {name}", definition.meaning(name)) for name, kind in layout.types.items())
-    return "".join(f"{field}  # {meaning}\n" if meaning else f"{field}\n" for field, meaning in lines)
+    return "".join(
+        f"{field}  # {meaning}\n" if meaning else f"{field}\n" for field, meaning in lines
+    )
 
 
 def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
@@ -79,10 +91,15 @@ def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
 
 def has_char_hash(text: str) -> bool:
     """Return whether a type hash is known only with `literal_char`."""
-    return message_of_type_hash(text) is not None and text.removeprefix(_RIHS01).lower() not in _by_hash(False)
+    return message_of_type_hash(text) is not None and text.removeprefix(
+        _RIHS01
+    ).lower() not in _by_hash(False)
 
 
 @cache
 def _by_hash(literal_char: bool) -> Mapping[str, tuple[Definition[Any], Layout]]:
-    hashes = [(hash_of(at, name, literal_char=literal_char), each, at) for name, each, at in _named_layouts()]
+    hashes = [
+        (hash_of(at, name, literal_char=literal_char), each, at)
+        for name, each, at in _named_layouts()
+    ]
     return {text.removeprefix(_RIHS01): (each, layout) for text, each, layout in hashes}

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 FOXGLOVE_PORT: Final = 8765
 """The default port of the Foxglove app."""
 
-__getattr__ = lazy_exports(__name__, {"FoxgloveServer": ("foxglove", "foxglove"), "Ros2Bridge": ("", "ros2")})
+__getattr__ = lazy_exports(
+    __name__, {"FoxgloveServer": ("foxglove", "foxglove"), "Ros2Bridge": ("", "ros2")}
+)
 
 __all__ = ["FOXGLOVE_PORT", "FoxgloveServer", "Ros2Bridge"]

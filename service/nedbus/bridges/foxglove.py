@@ -34,7 +34,13 @@ from nedbus_msgs import (
     get_topic,
     ros2_type,
 )
-from nedbus_msgs.frames import CommonOrigin, ned_to_enu, quaternion_ned_to_enu, to_global, yaw_ned_to_enu
+from nedbus_msgs.frames import (
+    CommonOrigin,
+    ned_to_enu,
+    quaternion_ned_to_enu,
+    to_global,
+    yaw_ned_to_enu,
+)
 
 from . import FOXGLOVE_PORT
 
@@ -55,22 +61,30 @@ class FoxgloveServer:
         self._bus, self._newest = bus, Monitor()
         self._context = foxglove.Context()
         self._fields: dict[tuple[Address, Definition[Any]], foxglove.Channel] = {}
-        self._unseen: set[Address] = set()  # streams without a rate, whose last message no client has received
+        # streams without a rate, whose last message no client has received
+        self._unseen: set[Address] = set()
         self._channels: dict[str, tuple[PoseInFrameChannel, LocationFixChannel]] = {}  # by vehicle
         self._map = CommonOrigin()
-        self._local_in_map: dict[str, messages.Vector3] = {}  # last known translation of each local frame
+        # last known translation of each local frame
+        self._local_in_map: dict[str, messages.Vector3] = {}
         try:
-            self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
+            self._server = foxglove.start_server(
+                name="nedbus", host=host, port=port, context=self._context
+            )
         except RuntimeError as exc:  # "...: Address already in use (os error 98)"
             reason = str(exc).rpartition(": ")[2].partition(" (os error")[0].lower()
-            raise ListenError([f"ws://{host}:{port}"], reason, hint="choose another address with --http") from exc
+            raise ListenError(
+                [f"ws://{host}:{port}"], reason, hint="choose another address with --http"
+            ) from exc
         self._transforms = FrameTransformsChannel("/tf", context=self._context)
         self.url = f"ws://{host}:{self._server.port}"
 
     def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
         """Serve the selected addresses, by default all, until `stop` is set; raise ClosedError if the bus is closed."""
         of = selection or Selection()
-        with self._bus.newest(*of.topics, vehicle=of.vehicles, instance=of.instance) as self._newest:
+        with self._bus.newest(
+            *of.topics, vehicle=of.vehicles, instance=of.instance
+        ) as self._newest:
             next_poll = time.monotonic() + TIMINGS.bridge_poll
             while not stop.is_set():
                 if time.monotonic() >= next_poll:
@@ -100,11 +114,16 @@ class FoxgloveServer:
         if channel is None:
             text = definition_text(definition, definition.current).encode()
             schema = foxglove.Schema(name=ros2_type(definition), encoding="ros2msg", data=text)
-            channel = foxglove.Channel(f"/{address}", schema=schema, message_encoding="cdr", context=self._context)
+            channel = foxglove.Channel(
+                f"/{address}", schema=schema, message_encoding="cdr", context=self._context
+            )
             self._fields[address, definition] = channel
         if channel.has_sinks():
             self._unseen.discard(address)
-            channel.log(encode_with(definition, message.__dict__, definition.current), log_time=_time_of(sample))
+            channel.log(
+                encode_with(definition, message.__dict__, definition.current),
+                log_time=_time_of(sample),
+            )
         elif not get_topic(address.topic).rate:
             self._unseen.add(address)  # it may never have another message
 
@@ -114,23 +133,35 @@ class FoxgloveServer:
         time_ns = _time_of(sample)
         if vehicle not in self._channels:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
-            self._channels[vehicle] = pose, LocationFixChannel(f"/{vehicle}/location", context=self._context)
+            self._channels[vehicle] = (
+                pose,
+                LocationFixChannel(f"/{vehicle}/location", context=self._context),
+            )
         poses, locations = self._channels[vehicle]
         stamp = messages.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         if math.isfinite(message.x + message.y + message.z):
             east, north, up = ned_to_enu((message.x, message.y, message.z))
             attitude = self._newest.get(Address(vehicle, _ATTITUDE))
             x, y, z, w = orientation_of(message, attitude.message if attitude else None)
-            position, orientation = messages.Vector3(x=east, y=north, z=up), messages.Quaternion(x=x, y=y, z=z, w=w)
-            local, pose_in_local = f"{vehicle}/local", messages.Pose(position=position, orientation=orientation)
-            poses.log(messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local), log_time=time_ns)
+            position = messages.Vector3(x=east, y=north, z=up)
+            orientation = messages.Quaternion(x=x, y=y, z=z, w=w)
+            local = f"{vehicle}/local"
+            pose_in_local = messages.Pose(position=position, orientation=orientation)
+            poses.log(
+                messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local),
+                log_time=time_ns,
+            )
             if message.xy_global:
                 self._local_in_map[vehicle] = self._locate(vehicle, message)
             origin = self._local_in_map.get(vehicle, messages.Vector3(x=0.0, y=0.0, z=0.0))
             frames = (("map", local, origin, _NO_ROTATION), (local, vehicle, position, orientation))
             transforms = [
                 messages.FrameTransform(
-                    timestamp=stamp, parent_frame_id=parent, child_frame_id=child, translation=moved, rotation=turned
+                    timestamp=stamp,
+                    parent_frame_id=parent,
+                    child_frame_id=child,
+                    translation=moved,
+                    rotation=turned,
                 )
                 for parent, child, moved, turned in frames
             ]
@@ -146,7 +177,9 @@ class FoxgloveServer:
                 latitude=fix.latitude,
                 longitude=fix.longitude,
                 altitude=fix.altitude,
-                position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2] if is_known else [],
+                position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2]
+                if is_known
+                else [],
                 position_covariance_type=types.Approximated if is_known else types.Unknown,
             )
             locations.log(location, log_time=time_ns)
@@ -161,7 +194,9 @@ class FoxgloveServer:
         published = self._bus.publishers()
         if not self._bus.connected:
             return  # without a link the list of vehicles is incomplete
-        for address, definition in [stream for stream in self._fields if stream[0] not in published]:
+        for address, definition in [
+            stream for stream in self._fields if stream[0] not in published
+        ]:
             self._fields.pop((address, definition)).close()
             self._unseen.discard(address)
             self._newest.forget(address)
@@ -176,7 +211,9 @@ def _time_of(sample: Sample[Any]) -> int:
     return sample.sent or sample.received
 
 
-def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
+def orientation_of(
+    message: VehicleLocalPosition, attitude: Any = None
+) -> tuple[float, float, float, float]:
     """Return the rotation from FLU to ENU as (x, y, z, w).
 
     It comes from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, FLU faces east.

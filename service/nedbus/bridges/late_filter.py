@@ -18,7 +18,8 @@ class LateFilter:
     """Admit current samples; hold back and count late samples, and retained samples, whose age is unknown."""
 
     def __init__(self) -> None:
-        self._clocks: dict[Address, tuple[str, _PublisherClock]] = {}  # id of the publishing session, and its clock
+        # id of the publishing session, and its clock
+        self._clocks: dict[Address, tuple[str, _PublisherClock]] = {}
         self._held = Counter[Address]()
         self._latest = 0  # ns; maximum lateness of the samples held back
         self._limit = round(1e9 * TIMINGS.lateness)  # ns

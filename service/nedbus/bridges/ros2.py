@@ -50,7 +50,8 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
-_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; longer than the 20 s of loss recovery
+# s after which a withdrawn address is forgotten; longer than the 20 s of loss recovery
+_MAX_ABSENCE: Final = 60.0
 _MAX_UNSUPPORTED: Final = 1000  # addresses that are logged as unsupported
 _MAX_HELD: Final = 10_000  # held messages; beyond that the oldest is dropped
 _REFUSALS: Final = {
@@ -94,7 +95,8 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # definition, layout and type hash, by topic
+        # definition, layout and type hash, by topic
+        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}
         for topic, definition in BY_TOPIC.items():
             if found := definition.layout_of_release(layout):
                 type_hash = hash_of(found, ros2_type(definition)) if hashed else NO_HASH
@@ -102,11 +104,13 @@ class Ros2Bridge:
         self._zid, self._node = str(session.info.zid()), f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
-        self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter still has its clock
+        # withdrawal time [s]; the late filter still has its clock
+        self._withdrawn: dict[Address, float] = {}
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0  # entity ids used so far
         self._unsupported: set[Address] = set()
-        self._held: dict[Address, Sample[Any]] = {}  # last sample of streams without a rate, kept until published
+        # last sample of streams without a rate, kept until published
+        self._held: dict[Address, Sample[Any]] = {}
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
@@ -136,7 +140,8 @@ class Ros2Bridge:
         end = time.monotonic() + TIMINGS.token_visible
         while not stop.is_set() and not token_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
-                end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
+                # restart the timeout while there is no link
+                end = time.monotonic() + TIMINGS.token_visible
             elif time.monotonic() > end:
                 raise NedbusError(
                     "no ROS 2 node sees this bridge, probably because the router's access control denies ROS 2's keys:"
@@ -173,8 +178,16 @@ class Ros2Bridge:
     def _poll(self) -> None:
         """Report late samples, query the bus and the ROS 2 nodes, and apply the decisions."""
         if held_back := self._late_filter.report():
-            _log.warning("%s; ROS 2 nodes would treat old messages as current", held_back, extra=about("bridge_late"))
-        for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
+            _log.warning(
+                "%s; ROS 2 nodes would treat old messages as current",
+                held_back,
+                extra=about("bridge_late"),
+            )
+        for address in [
+            each
+            for each, since in self._withdrawn.items()
+            if time.monotonic() - since > _MAX_ABSENCE
+        ]:
             del self._withdrawn[address]
             self._held.pop(address, None)
             self._late_filter.forget(address)
@@ -187,7 +200,11 @@ class Ros2Bridge:
                 token = PublisherToken.parse(text)
                 if token.session != self._zid:
                     nodes.setdefault(token.key, token.node)
-        others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
+        others = {
+            address: node
+            for address in addresses
+            if (node := nodes.get(self._key(address))) is not None
+        }
         for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
             self._apply(decision)
 
@@ -200,12 +217,21 @@ class Ros2Bridge:
             self._withdrawn.pop(address, None)
             definition, layout, _ = self._types[address.topic]
             name = ros2_type(definition)
-            _log.info("%s -> /%s, %s of layout %s", address, topic, name, layout.name, extra=about("bridged", address))
+            _log.info(
+                "%s -> /%s, %s of layout %s",
+                address,
+                topic,
+                name,
+                layout.name,
+                extra=about("bridged", address),
+            )
             if address in self._held:
                 self._put(self._held.pop(address))
         elif decision.action in _REFUSALS:
             self._close(address)
-            _log.warning(_REFUSALS[decision.action], address, other, topic, extra=about("conflict", address))
+            _log.warning(
+                _REFUSALS[decision.action], address, other, topic, extra=about("conflict", address)
+            )
         else:
             self._close(address)
             # After a router restart the address soon returns, with the messages of the outage.
@@ -216,10 +242,13 @@ class Ros2Bridge:
     def _open(self, address: Address) -> None:
         key = self._key(address)
         self._entities += 1
-        token, drop = key.token("MP", self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
+        token = key.token("MP", self._zid, self._node, self._entities)
+        drop = zenoh.CongestionControl.DROP
         encoding = BRIDGED_ENCODING
         with translate_zenoh_errors():
-            publisher = self._session.declare_publisher(str(key), encoding=encoding, congestion_control=drop)
+            publisher = self._session.declare_publisher(
+                str(key), encoding=encoding, congestion_control=drop
+            )
             declared = self._session.liveliness().declare_token(token)
         self._publishers[address] = _Ros2Publisher(gid_of_token(token), publisher, declared)
 
@@ -231,7 +260,9 @@ class Ros2Bridge:
     def _put(self, sample: Sample[Message]) -> None:
         publisher = self._publishers[sample.address]
         definition, layout, _ = self._types[sample.topic]
-        payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
+        payload = encode_with(
+            definition, definition.downgrade(sample.message.__dict__, layout), layout
+        )
         publisher.sequence += 1
         attachment = bytes(Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
         with translate_zenoh_errors():
@@ -251,8 +282,17 @@ class Ros2Bridge:
         if address not in self._unsupported and len(self._unsupported) < _MAX_UNSUPPORTED:
             self._unsupported.add(address)
             known = address.topic in BY_TOPIC
-            reason = f"PX4 {self._layout} has no such message" if known else "its px4_msgs type is unknown"
-            _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
+            reason = (
+                f"PX4 {self._layout} has no such message"
+                if known
+                else "its px4_msgs type is unknown"
+            )
+            _log.warning(
+                "%s is not published to ROS 2: %s",
+                address,
+                reason,
+                extra=about("unsupported", address),
+            )
         return False
 
 

@@ -41,7 +41,11 @@ class Ros2Arbiter:
     def __init__(self, namespaces: Mapping[str, str]) -> None:
         for namespace in namespaces.values():
             if not _NAMESPACE.fullmatch(namespace.strip("/")):
-                raise AddressError("namespace", namespace, "a letter, then letters, digits and _, with / between names")
+                raise AddressError(
+                    "namespace",
+                    namespace,
+                    "a letter, then letters, digits and _, with / between names",
+                )
         self._namespaces = {"1": "", **namespaces}
         self.published: dict[Address, str] = {}
         self._deferred: dict[Address, float] = {}  # when another node's publisher was last seen [s]
@@ -66,9 +70,13 @@ class Ros2Arbiter:
         present = set(addresses)
         gone = sorted(self.published.keys() - present)
         decisions = [Decision("withdraw", address, self.published.pop(address)) for address in gone]
-        self._deferred = {address: seen for address, seen in self._deferred.items() if address in present}
+        self._deferred = {
+            address: seen for address, seen in self._deferred.items() if address in present
+        }
         self._conflicts &= present
-        decided = (self._decide(address, other_nodes.get(address), now) for address in sorted(present))
+        decided = (
+            self._decide(address, other_nodes.get(address), now) for address in sorted(present)
+        )
         return decisions + [decision for decision in decided if decision]
 
     def _decide(self, address: Address, other_node: str | None, now: float) -> Decision | None:
@@ -78,9 +86,14 @@ class Ros2Arbiter:
             self._deferred[address] = now
             self.published.pop(address, None)
             return Decision("defer", address, topic, other_node) if is_new else None
-        if address in self.published or now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over:
+        if (
+            address in self.published
+            or now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over
+        ):
             return None
-        owner = next((each for each, published in self.published.items() if published == topic), None)
+        owner = next(
+            (each for each, published in self.published.items() if published == topic), None
+        )
         if owner is None:
             self._deferred.pop(address, None)
             self._conflicts.discard(address)

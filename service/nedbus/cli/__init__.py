@@ -13,9 +13,11 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run `nedbus`."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback during the imports; a script's `&` sets SIG_IGN
+    # no traceback during the imports; a script's `&` sets SIG_IGN
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass  # otherwise a socket could get the descriptor of a closed standard stream, and receive the output
+        # otherwise a socket could get the descriptor of a closed standard stream, and receive the output
+        pass
     os.close(descriptor)
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - open until exit
@@ -27,9 +29,11 @@ def main() -> None:
     gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
     from .app import make_app
 
-    is_completing = "_NEDBUS_COMPLETE" in os.environ  # by a shell, which passes the command line in COMP_WORDS
+    # by a shell, which passes the command line in COMP_WORDS
+    is_completing = "_NEDBUS_COMPLETE" in os.environ
     app = make_app(None if is_completing else sys.argv[1:])
-    gc.freeze()  # what was imported stays: the first collection would search all of it, for a tenth of a short command
+    # what was imported stays: the first collection would search all of it, for a tenth of a short command
+    gc.freeze()
     gc.enable()
     app()
 

@@ -31,7 +31,9 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
         more = f"; and {hidden} more" if hidden > 0 else ""
         return Absence(f"{'; '.join(reasons[:_MAX_REASONS])}{more}", is_fault=True)
     if published:
-        return Absence(f"choose one of {to_text(', '.join(sorted(published)[:_MAX_NAMED]))}", is_fault=False)
+        return Absence(
+            f"choose one of {to_text(', '.join(sorted(published)[:_MAX_NAMED]))}", is_fault=False
+        )
     if services:
         advice = "see 'nedbus info' and the access rules for it and this client (docs/security.md)"
         outdated = [service.service for service in services if service.is_outdated]
@@ -42,7 +44,9 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
     if prefixes := bus.other_prefixes(timeout=_TIMEOUT)[:_MAX_REASONS]:
         names = " and ".join(f"{to_text(prefix)}/" for prefix in prefixes)
         advice = f"use --prefix {to_text(prefixes[0])}"
-        reason = f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
+        reason = (
+            f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
+        )
         return Absence(reason, is_fault=True)
     return Absence("start a source with 'nedbus serve'", is_fault=False)
 
@@ -54,7 +58,9 @@ def describe_outdated(services: Sequence[ServiceStatus]) -> list[str]:
     for service in outdated[:_MAX_NAMED]:
         where = f"service {to_text(service.service, 64)} on {to_text(service.host or 'an unknown host', 64)}"
         version = f"nedbus {to_text(service.version or 'of an unknown version', 20)}"
-        lines.append(f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it")
+        lines.append(
+            f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
+        )
     more = len(outdated) - _MAX_NAMED
     if more > 0:
         lines.append(f"{counted(more, 'more older service')}, which any vehicle can invent")
@@ -75,10 +81,14 @@ def _source_reason(source: SourceStatus, wanted: Sequence[str]) -> str:
         return f"has failed: {error}"
     if source.state == "retrying":
         return f"fails and is restarted: {error}"
-    stale = [address for address in source.stale if not wanted or address.partition("/")[0] in wanted]
+    stale = [
+        address for address in source.stale if not wanted or address.partition("/")[0] in wanted
+    ]
     if stale:
         names = to_text(", ".join(stale[:_MAX_NAMED]))
-        return f"receives no more messages of {names}: check that the vehicle is on and its link is up"
+        return (
+            f"receives no more messages of {names}: check that the vehicle is on and its link is up"
+        )
     if source.state in {"waiting", "starting"} and not source.addresses:
         return "has received no message yet: check that the vehicle sends to it"
     return ""

@@ -22,7 +22,10 @@ class _Command(NamedTuple):
 _COMMANDS: Final[Mapping[str, _Command]] = {
     "serve": _Command("serve", "Run a service: publish validated messages from sources."),
     "router": _Command("serve", "Run a Zenoh router without sources, for services and scripts."),
-    "list": _Command("query", "List the published streams with the state of each and the age of its last message."),
+    "list": _Command(
+        "query",
+        "List the published streams with the state of each and the age of its last message.",
+    ),
     "echo": _Command("echo", "Print messages as they arrive, one line each."),
     "hz": _Command("hz", "Measure rate, jitter, latency, loss and validity of each stream."),
     "get": _Command("query", "Show the last message of each stream with all its fields."),
@@ -36,17 +39,27 @@ _COMMANDS: Final[Mapping[str, _Command]] = {
         "fusion",
         "Show whether a position that is sent into a vehicle is used, and why not, live or from a file.",
     ),
-    "health": _Command("checks", "Check services, sources, messages and vehicles; exit with 0 if healthy."),
+    "health": _Command(
+        "checks", "Check services, sources, messages and vehicles; exit with 0 if healthy."
+    ),
     "doctor": _Command("checks", "Diagnose why no messages arrive."),
     "check": _Command("checks", "Check settings and router files."),
-    "export": _Command("bridges", "Serve Prometheus metrics of all streams, measured by a subscriber, until Ctrl-C."),
+    "export": _Command(
+        "bridges",
+        "Serve Prometheus metrics of all streams, measured by a subscriber, until Ctrl-C.",
+    ),
     "schema": _Command("query", "Print the JSON Schema of a message, or its supported layouts."),
     "ros2": _Command("bridges", "Publish px4_msgs on /fmu/out/... to ROS 2 with rmw_zenoh."),
     "foxglove": _Command("bridges", "Serve live vehicles to Foxglove until Ctrl-C."),
-    "web": _Command("bridges", "Serve a web page with a map, the faults and plots of all vehicles."),
+    "web": _Command(
+        "bridges", "Serve a web page with a map, the faults and plots of all vehicles."
+    ),
     "record": _Command("recordings", "Record messages to an MCAP file until Ctrl-C."),
     "convert": _Command("files", "Convert flight logs to an MCAP recording."),
-    "plot": _Command("files", "Plot flights: track, height, speed, flags, resets and events; or fields over time."),
+    "plot": _Command(
+        "files",
+        "Plot flights: track, height, speed, flags, resets and events; or fields over time.",
+    ),
     "pki": _Command("pki", "Manage keys, certificates and access rules for tls/ endpoints."),
 }
 """All commands, in the order of the help. The list of commands imports none of their modules."""
@@ -67,7 +80,8 @@ def make_app(arguments: Collection[str] | None = None) -> typer.Typer:
     )
     app.callback()(_set_up)
     for name, command in _COMMANDS.items():
-        if arguments is None or name in arguments:  # a value of an option, such as info, imports a command in vain
+        # a value of an option, such as info, imports a command in vain
+        if arguments is None or name in arguments:
             _add_command(app, name, command.module)
         else:
             app.command(name, help=command.summary)(_not_imported)
@@ -99,15 +113,23 @@ def _show_version(requested: bool) -> None:
         raise typer.Exit
 
 
-VersionOption = Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version")]
-LevelOption = Annotated[LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Lowest level to log")]
-FormatOption = Annotated[LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="Format of the log")]
+VersionOption = Annotated[
+    bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version")
+]
+LevelOption = Annotated[
+    LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Lowest level to log")
+]
+FormatOption = Annotated[
+    LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="Format of the log")
+]
 
 
 def _set_up(
     *,
     version: VersionOption = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Log debug messages, show tracebacks")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Log debug messages, show tracebacks")
+    ] = False,
     log_level: LevelOption = "info",
     log_format: FormatOption = "text",
 ) -> None:

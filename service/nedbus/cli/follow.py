@@ -41,7 +41,9 @@ def follow(
 
     def log_link(is_up: bool) -> None:
         text = "the link to %s is up again" if is_up else "the link to %s is lost: reconnecting"
-        _log.warning(text, " or ".join(bus.routers), extra=about("link_up" if is_up else "link_lost"))
+        _log.warning(
+            text, " or ".join(bus.routers), extra=about("link_up" if is_up else "link_lost")
+        )
 
     bus.on_link(log_link)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -71,4 +73,6 @@ def follow(
 
 def write_notice(subscription: Subscription[Any]) -> None:
     """Notify the user on stderr that a subscription has not received a message yet."""
-    write_stderr(f"no message on {subscription.name} yet, still waiting; 'nedbus list' shows the published streams")
+    write_stderr(
+        f"no message on {subscription.name} yet, still waiting; 'nedbus list' shows the published streams"
+    )

@@ -16,7 +16,16 @@ import typer
 from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Selection
+from nedbus_msgs import (
+    ANY,
+    BY_TOPIC,
+    DEFAULT_PREFIX,
+    DEFAULT_TOPIC,
+    MESSAGES,
+    TOPICS,
+    Definition,
+    Selection,
+)
 from nedbus_msgs.frames import derived_from
 
 from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
@@ -26,34 +35,65 @@ if TYPE_CHECKING:
 
     OpenBus = Callable[[], Bus]
 else:
-    OpenBus = Callable[[], Any]  # evaluated by `command`; the client loads Zenoh, which commands for files do not need
+    # evaluated by `command`; the client loads Zenoh, which commands for files do not need
+    OpenBus = Callable[[], Any]
 
 _log = logging.getLogger("nedbus")
 
 _ROUTER: Final = f"Router to connect to; repeatable (default: {DEFAULT_ENDPOINT})"
 _ADDRESS: Final = "TOPIC, or VEHICLE/TOPIC/INSTANCE as printed by nedbus list"
 _FILES: Final = "Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"
-_TOPIC: Final = f'Topic, "*" for all; repeatable (default: {DEFAULT_TOPIC} for echo and get, else all)'
+_TOPIC: Final = (
+    f'Topic, "*" for all; repeatable (default: {DEFAULT_TOPIC} for echo and get, else all)'
+)
 _TOPICS: Final = "Topic; repeatable (default: all)"
 _VEHICLES: Final = "Vehicle; repeatable (default: all)"
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: ./nedbus.toml)")]
-ConnectOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ROUTER)]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="Settings file (default: ./nedbus.toml)")
+]
+ConnectOption = Annotated[
+    list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ROUTER)
+]
 PrefixOption = Annotated[str | None, typer.Option(help=f"Key prefix (default: {DEFAULT_PREFIX})")]
-TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="CA certificate for tls/ routers, PEM")]
-TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="Client certificate, PEM")]
-TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of the client certificate, PEM")]
-TopicsArgument = Annotated[list[str] | None, typer.Argument(metavar="TOPIC", help=_ADDRESS, show_default=False)]
+TlsCaOption = Annotated[
+    Path | None, typer.Option("--tls-ca", help="CA certificate for tls/ routers, PEM")
+]
+TlsCertificateOption = Annotated[
+    Path | None, typer.Option("--tls-certificate", help="Client certificate, PEM")
+]
+TlsKeyOption = Annotated[
+    Path | None, typer.Option("--tls-key", help="Key of the client certificate, PEM")
+]
+TopicsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="TOPIC", help=_ADDRESS, show_default=False)
+]
 FilesArgument = Annotated[list[Path] | None, typer.Argument(metavar="FILE", help=_FILES)]
-TopicsOption = Annotated[list[str] | None, typer.Option("--topic", "-t", metavar="TOPIC", help=_TOPICS)]
-DefaultTopicsOption = Annotated[list[str] | None, typer.Option("--topic", "-t", metavar="TOPIC", help=_TOPIC)]
-VehiclesOption = Annotated[list[str] | None, typer.Option("--vehicle", "-v", metavar="VEHICLE", help=_VEHICLES)]
-InstanceOption = Annotated[int | None, typer.Option("--instance", "-i", help="Instance of the topic (default: all)")]
-FieldOption = Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Fields to show: x,y,z")]
+TopicsOption = Annotated[
+    list[str] | None, typer.Option("--topic", "-t", metavar="TOPIC", help=_TOPICS)
+]
+DefaultTopicsOption = Annotated[
+    list[str] | None, typer.Option("--topic", "-t", metavar="TOPIC", help=_TOPIC)
+]
+VehiclesOption = Annotated[
+    list[str] | None, typer.Option("--vehicle", "-v", metavar="VEHICLE", help=_VEHICLES)
+]
+InstanceOption = Annotated[
+    int | None, typer.Option("--instance", "-i", help="Instance of the topic (default: all)")
+]
+FieldOption = Annotated[
+    str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Fields to show: x,y,z")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Write JSON")]
 CsvOption = Annotated[bool, typer.Option("--csv", help="Write CSV with a header line")]
-WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait until the router is reachable")]
-CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this number of samples")]
-DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")]
+WaitOption = Annotated[
+    bool, typer.Option("--wait", "-w", help="Wait until the router is reachable")
+]
+CountOption = Annotated[
+    int | None, typer.Option("--count", "-n", min=1, help="Stop after this number of samples")
+]
+DurationOption = Annotated[
+    float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")
+]
 
 ALL: Final = Selection()  # default selection of commands that show all topics
 POSITIONS: Final = Selection(DEFAULT_TOPIC)  # default selection of commands that show positions
@@ -74,7 +114,9 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(**values: Any) -> None:
         with exit_on_errors(), ExitStack() as stack:
             for name, factory in factories.items():
-                make = functools.partial(factory, **{each.name: values.pop(each.name) for each in expanded[name]})
+                make = functools.partial(
+                    factory, **{each.name: values.pop(each.name) for each in expanded[name]}
+                )
                 if name == "selection":
                     values[name] = make(default=parameters[name].default.topics)
                 else:
@@ -84,7 +126,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     options = sorted([*direct, *itertools.chain(*expanded.values())], key=lambda each: each.kind)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined] # Typer reads both
     run.__annotations__ = {each.name: each.annotation for each in options}
-    run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")  # because rich keeps line breaks
+    # because rich keeps line breaks
+    run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")
     return run
 
 
@@ -92,7 +135,11 @@ def _options_of(factory: Callable[..., object]) -> list[inspect.Parameter]:
     """Return a factory's parameters that have defaults; `**settings_options` expands to those of `_read_settings`."""
     parameters = [*inspect.signature(factory, eval_str=True).parameters.values()]
     options = [each for each in parameters if each.default is not each.empty]
-    return [*_options_of(_read_settings), *options] if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD else options
+    return (
+        [*_options_of(_read_settings), *options]
+        if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD
+        else options
+    )
 
 
 @contextmanager
@@ -109,7 +156,8 @@ def exit_on_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except BrokenPipeError:
-        discard_stdout()  # the reader of the pipe has gone (`| head`): the flush at exit would also fail
+        # the reader of the pipe has gone (`| head`): the flush at exit would also fail
+        discard_stdout()
         raise typer.Exit(0) from None
     except EOFError as exc:  # Typer prints "Aborted." alone
         hint = "if a full disk truncated Python's bytecode, delete all __pycache__ folders; --debug shows the traceback"
@@ -118,7 +166,8 @@ def exit_on_errors() -> Iterator[None]:
         where = f"{exc.filename}: " if exc.filename else ""
         raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
     except BaseException as exc:
-        if type(exc).__name__ != "PanicException":  # Zenoh raises this class, which cannot be imported
+        # Zenoh raises this class, which cannot be imported
+        if type(exc).__name__ != "PanicException":
             raise
         hint = "check the system clock, free memory and the limit of open files ('ulimit -n')"
         raise _exit_with(NedbusError(f"Zenoh failed ({exc}): {hint}"), 1) from exc
@@ -169,7 +218,9 @@ def _select(
     if not topics:
         return Selection(topic_option or default, vehicle or ANY, instance)
     if topic_option:
-        raise ConfigError("--topic", f"the argument already names the topic {topics[0]!r}: remove one of the two")
+        raise ConfigError(
+            "--topic", f"the argument already names the topic {topics[0]!r}: remove one of the two"
+        )
     streams = [_split_stream(text) for text in topics]
     first = streams[0]
     for text, stream in zip(topics, streams, strict=True):
@@ -178,7 +229,9 @@ def _select(
             raise ConfigError("TOPIC", reason)
     chosen = vehicle or ANY if first.vehicle is None else first.vehicle
     return Selection(
-        [stream.topic for stream in streams], chosen, instance if first.instance is None else first.instance
+        [stream.topic for stream in streams],
+        chosen,
+        instance if first.instance is None else first.instance,
     )
 
 
@@ -220,10 +273,16 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
     topics = selection.topics
-    known = list(MESSAGES.values()) if topics == (ANY,) else [BY_TOPIC.get(topic) for topic in topics]
+    known = (
+        list(MESSAGES.values()) if topics == (ANY,) else [BY_TOPIC.get(topic) for topic in topics]
+    )
     for name in names:
         first = known[0]
-        if first is not None and None not in known and not any(each and name in _columns_of(each) for each in known):
+        if (
+            first is not None
+            and None not in known
+            and not any(each and name in _columns_of(each) for each in known)
+        ):
             raise ConfigError("--field", first.explain_unknown_field(name))
     return names
 

@@ -17,7 +17,8 @@ _MEANT: Final[Mapping[str, str]] = {
 """The option meant by a name that no command has: other tools call it so."""
 
 
-_UsageError = cast("type[Exception]", typer.BadParameter.__mro__[1])  # Click's, which newer releases of Typer contain
+# Click's, which newer releases of Typer contain
+_UsageError = cast("type[Exception]", typer.BadParameter.__mro__[1])
 
 
 class _StrictParsing:
@@ -29,8 +30,14 @@ class _StrictParsing:
         try:
             _, _, parsed = command.make_parser(ctx).parse_args(args=list(args))
             for option, times in Counter(parsed).items():
-                if times > 1 and option.param_type_name == "option" and not (option.multiple or option.is_flag):
-                    raise typer.BadParameter(f"given {times} times, but it takes one value", ctx=ctx, param=option)
+                if (
+                    times > 1
+                    and option.param_type_name == "option"
+                    and not (option.multiple or option.is_flag)
+                ):
+                    raise typer.BadParameter(
+                        f"given {times} times, but it takes one value", ctx=ctx, param=option
+                    )
             parsed_args: list[str] = super().parse_args(ctx, args)  # type: ignore[misc] # of the command
         except _UsageError as exc:
             meant = _MEANT.get(getattr(exc, "option_name", ""))

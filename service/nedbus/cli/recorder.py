@@ -36,7 +36,11 @@ class Recorder:
     def status(self) -> str:
         """The counts so far as text, such as "120 messages, 2 lost"."""
         names = ("lost", "dropped", "invalid", "discarded", "forgotten")
-        counts = [f"{count} {name}" for name in names if (count := getattr(self._subscription.counts, name))]
+        counts = [
+            f"{count} {name}"
+            for name in names
+            if (count := getattr(self._subscription.counts, name))
+        ]
         if self._writer is not None and self._writer.omitted:
             counts.append(f"{self._writer.omitted} not recorded")
         return ", ".join([f"{counted(self.messages, 'message')}", *counts])
@@ -50,12 +54,16 @@ class Recorder:
         start = now = time.monotonic()
         end = float("inf") if duration is None else now + duration
         next_flush = now + _FLUSH_INTERVAL
-        with RecordingWriter(self._path) as self._writer, suppress(ClosedError):  # raised once all is written
+        # raised once all is written
+        with RecordingWriter(self._path) as self._writer, suppress(ClosedError):
             while True:
                 if stop.is_set() or now >= end:
                     self._subscription.drain()
                 with suppress(NoDataError):
-                    _write(self._writer, self._subscription.receive_batch(max(0.0, min(_POLL_INTERVAL, end - now))))
+                    _write(
+                        self._writer,
+                        self._subscription.receive_batch(max(0.0, min(_POLL_INTERVAL, end - now))),
+                    )
                 now = time.monotonic()
                 if now >= next_flush:
                     self._writer.flush()

@@ -19,8 +19,10 @@ from nedbus.log_event import about
 
 _log = logging.getLogger("nedbus")
 
-_END_TIMEOUT: Final = 8.0  # s between a signal and a forced exit; systemd and Docker kill after 10 s
-_CLOSE_TIMEOUT: Final = 1.6  # s for Zenoh to close a session: it waits 10 s for a peer that does not read
+# s between a signal and a forced exit; systemd and Docker kill after 10 s
+_END_TIMEOUT: Final = 8.0
+# s for Zenoh to close a session: it waits 10 s for a peer that does not read
+_CLOSE_TIMEOUT: Final = 1.6
 _TICK: Final = 0.5  # s between two calls of `on_tick`
 _HANGUP_PAUSE: Final = 0.2  # s; some shells forward SIGHUP before the terminal is closed
 

@@ -32,8 +32,11 @@ def notify(address: str, **fields: object) -> bool:
     where = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-            sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), where)
-    except OSError as exc:  # no reader, a full queue or no file descriptor left: READY and STATUS are sent again
+            sender.sendto(
+                "\n".join(f"{name}={value}" for name, value in fields.items()).encode(), where
+            )
+    except OSError as exc:
+        # no reader, a full queue or no file descriptor left: READY and STATUS are sent again
         _log.debug("cannot notify systemd: %s", exc)
         return False
     return True
@@ -55,11 +58,14 @@ class Notifier:
         self._daemon = daemon
         address = environment.get("NOTIFY_SOCKET", "")
         self._is_active = address.startswith(("/", "@"))
-        self._send: Callable[..., bool] = partial(notify, address) if self._is_active else lambda **_: False
+        self._send: Callable[..., bool] = (
+            partial(notify, address) if self._is_active else lambda **_: False
+        )
         self._watchdog = watchdog_interval(environment)
         self._router_deadline = time.monotonic() + TIMINGS.systemd_patience
         self._counted = time.monotonic(), 0  # time, and messages published until then
-        self._is_ready = self._ticked = False  # READY was accepted; `tick` was called since the last ping
+        # READY was accepted; `tick` was called since the last ping
+        self._is_ready = self._ticked = False
         self._rejected = ""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-systemd", daemon=True)
@@ -100,7 +106,8 @@ class Notifier:
 
     def _run(self) -> None:
         next_status = next_ping = 0.0
-        interval, errors = self._watchdog, UnexpectedErrors(_log, "unexpected error in a status update (logged once)")
+        interval = self._watchdog
+        errors = UnexpectedErrors(_log, "unexpected error in a status update (logged once)")
         while True:
             now = time.monotonic()
             is_overdue = self._daemon.role == "client" and now >= self._router_deadline
@@ -112,7 +119,12 @@ class Notifier:
                 elif now >= next_status:
                     self._send(STATUS=self._status())
                     next_status = now + TIMINGS.systemd_status
-                if interval is not None and now >= next_ping and self._ticked and self._daemon.busy < interval:
+                if (
+                    interval is not None
+                    and now >= next_ping
+                    and self._ticked
+                    and self._daemon.busy < interval
+                ):
                     self._ticked, next_ping = False, now + interval
                     self._send(WATCHDOG=1)
             pause = TIMINGS.systemd_status if self._is_ready else _START_INTERVAL
@@ -123,7 +135,11 @@ class Notifier:
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)
-            return f"waiting for a router at {where}" if daemon.role == "client" else f"starting a router on {where}"
+            return (
+                f"waiting for a router at {where}"
+                if daemon.role == "client"
+                else f"starting a router on {where}"
+            )
         now, sources = time.monotonic(), daemon.sources
         published = sum(source.published for source in sources)
         since, before = self._counted
@@ -134,12 +150,18 @@ class Notifier:
             f"{counted(len(sources), 'source')}, {counted(streams, 'stream')}, "
             f"{float(f'{rate:.2g}'):g} messages/s, {counted(daemon.sessions, 'session')}"
         )
-        return to_text("; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])), MAX_TEXT)
+        return to_text(
+            "; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])), MAX_TEXT
+        )
 
 
 def watchdog_interval(environment: Mapping[str, str]) -> float | None:
     """Return the interval of watchdog pings [s], half of systemd's limit; None if the watchdog is off."""
     limit = environment.get("WATCHDOG_USEC", "")
-    if not limit.isdecimal() or int(limit) == 0 or environment.get("WATCHDOG_PID", "") not in {"", str(os.getpid())}:
+    if (
+        not limit.isdecimal()
+        or int(limit) == 0
+        or environment.get("WATCHDOG_PID", "") not in {"", str(os.getpid())}
+    ):
         return None
     return int(limit) / 2e6

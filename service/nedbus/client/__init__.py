@@ -19,7 +19,15 @@ from .discovery import (
     find_services,
     reply_parts,
 )
-from .health import Health, Histogram, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
+from .health import (
+    Health,
+    Histogram,
+    StreamHealth,
+    StreamState,
+    describe_stream,
+    health_of_last,
+    stream_state,
+)
 from .link import LinkCallback
 from .newest import Monitor, Newest, NewestMessage
 from .publishing.publisher import Publisher

@@ -94,10 +94,13 @@ class AsyncBus:
         self, message: type[M_co], other: type[M2], third: type[M3], /, **options: Unpack[Subscribe]
     ) -> AsyncSubscription[M_co | M2 | M3]: ...
     @overload
-    def subscribe(self, *messages: type[Message] | str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
+    def subscribe(
+        self, *messages: type[Message] | str, **options: Unpack[Subscribe]
+    ) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
-        return Bus.subscribe(cast("Bus", self), *message, **options)  # uses only `_subscribe` of `self`
+        # uses only `_subscribe` of `self`
+        return Bus.subscribe(cast("Bus", self), *message, **options)
 
     def _subscribe(
         self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None
@@ -118,10 +121,13 @@ class AsyncBus:
         inbox = bus._make_inbox(selection, "latest", max_rate, None)
 
         def open_receiver() -> Receiver:
-            bus.publishers(timeout=0.0)  # connects for the list of publishers, which would block the event loop
+            # connects for the list of publishers, which would block the event loop
+            bus.publishers(timeout=0.0)
             return bus._open_receiver(inbox)
 
-        return AsyncNewest(partial(self._in_thread, open_receiver), inbox, selection.topics, owner=bus)
+        return AsyncNewest(
+            partial(self._in_thread, open_receiver), inbox, selection.topics, owner=bus
+        )
 
     def on_link(self, call: Callable[[bool], object]) -> LinkCallback:
         """Call a function in the running event loop when the link to the router is lost or up; see `Bus.on_link`."""
@@ -137,7 +143,9 @@ class AsyncBus:
         self, message: type[M_co], other: type[M2], /, **options: Unpack[Query]
     ) -> list[Sample[M_co | M2]]: ...
     @overload
-    async def latest(self, *messages: type[Message] | str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
+    async def latest(
+        self, *messages: type[Message] | str, **options: Unpack[Query]
+    ) -> list[Sample[Message]]: ...
     async def latest(self, *message: Any, **options: Any) -> Any:
         """Query the last sample of each key; see `Bus.latest`."""
         return await self._in_thread(self._blocking.latest, *message, **options)
@@ -181,14 +189,17 @@ class AsyncBus:
         """Close the bus; see `Bus.close`. Cancellation closes the bus at once, without waiting for readers."""
         if (bus := self._bus) is not None:  # in a new thread: the pool's threads may be blocked
             thread = ThreadPoolExecutor(1, "nedbus-close")
-            await _run_cancellable(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
+            await _run_cancellable(
+                thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus)
+            )
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
         opening = _Opening(partial(self._open_bus, cancelled), close=lambda bus: bus.close(0.0))
         running = asyncio.create_task(self._in_thread(opening.run))
         try:
-            while not running.done():  # asyncio can miss a Ctrl-C just before it blocks: wake it regularly
+            # asyncio can miss a Ctrl-C just before it blocks: wake it regularly
+            while not running.done():
                 await asyncio.wait({running}, timeout=1.0)
             self._bus = running.result()
         except asyncio.CancelledError:
@@ -202,7 +213,9 @@ class AsyncBus:
         await self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(call, *args, **kwargs))
+        return await asyncio.get_running_loop().run_in_executor(
+            self._threads, partial(call, *args, **kwargs)
+        )
 
 
 class _Opening(Generic[_T]):
@@ -243,7 +256,9 @@ def _stop_waiting(bus: Bus) -> None:
         publisher._flow_control.cancelled.set()
 
 
-async def _run_cancellable(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
+async def _run_cancellable(
+    thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]
+) -> _T:
     """Run a call in a thread; on cancellation, call `cancel`, which must end the call soon."""
     running = asyncio.get_running_loop().run_in_executor(thread, call)
     try:

@@ -22,7 +22,12 @@ class AsyncNewest(NewestBase):
     """The asyncio version of Newest; `bus.newest(...)` returns one, which opens on first use."""
 
     def __init__(
-        self, open_receiver: Callable[[], Awaitable[Receiver]], inbox: Inbox, topics: Iterable[str], *, owner: Bus
+        self,
+        open_receiver: Callable[[], Awaitable[Receiver]],
+        inbox: Inbox,
+        topics: Iterable[str],
+        *,
+        owner: Bus,
     ) -> None:
         super().__init__(inbox, topics, owner._network)
         self._subscription = AsyncSubscription[Message](open_receiver, inbox)

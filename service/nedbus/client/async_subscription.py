@@ -45,7 +45,9 @@ class AsyncSubscription(SubscriptionBase[M_co]):
         """Wait for the next sample and return it; `timeout` and errors as in `Subscription.receive`."""
         return await self._next(self._inbox.pop, timeout)
 
-    async def receive_batch(self, timeout: float | None = None, *, max_messages: int | None = None) -> Batch:
+    async def receive_batch(
+        self, timeout: float | None = None, *, max_messages: int | None = None
+    ) -> Batch:
         """Wait for at least one message and return unread ones, as `Subscription.receive_batch` does."""
         return await self._next(self._pop_batch(max_messages), timeout)
 
@@ -117,12 +119,15 @@ class AsyncSubscription(SubscriptionBase[M_co]):
         require_unforked()
         loop, opening = asyncio.get_running_loop(), self._opening
         if opening is not None and opening.get_loop() is not loop:
-            raise RuntimeError(f"the subscription to {self.name} is bound to another event loop: subscribe in this one")
+            raise RuntimeError(
+                f"the subscription to {self.name} is bound to another event loop: subscribe in this one"
+            )
         if self._finalizer is not None or self._inbox.ended:
             return
         if opening is None or opening.done():
             opening = self._opening = loop.create_task(self._open_in(loop))
-            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # may never be awaited
+            # may never be awaited
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.shield(opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:

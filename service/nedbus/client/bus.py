@@ -45,7 +45,15 @@ from .publishing.publish_permission import PublishPermission
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receiving import Decoder, Inbox, LayoutLookup, MaxRateInbox, MaxRateReceiver, Receiver, find_schemas
+from .receiving import (
+    Decoder,
+    Inbox,
+    LayoutLookup,
+    MaxRateInbox,
+    MaxRateReceiver,
+    Receiver,
+    find_schemas,
+)
 from .subscription import Subscription
 
 if TYPE_CHECKING:
@@ -64,7 +72,12 @@ class Bus(AbstractContextManager["Bus"]):
     """
 
     def __init__(
-        self, settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
+        self,
+        settings: Settings,
+        *,
+        timeout: float | None,
+        tls: Tls | None = None,
+        stop: threading.Event | None = None,
     ) -> None:
         self.prefix, self.routers = settings.prefix, settings.routers
         self._tls, prefix = tls or settings.tls, settings.prefix
@@ -80,9 +93,17 @@ class Bus(AbstractContextManager["Bus"]):
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         self._links: list[LinkWatch] = []  # one, created by the first `on_link`
         self._links_lock = threading.Lock()
-        closing = ExitStack()  # runs in reverse order; closing the session ends an open query for layouts
-        heartbeats = self._publishers.heartbeats  # not the registry: its publishers reference the bus
-        for close in (self._layouts.close, self._directory.close, session.close, heartbeats.close, self._queries.close):
+        # runs in reverse order; closing the session ends an open query for layouts
+        closing = ExitStack()
+        # not the registry: its publishers reference the bus
+        heartbeats = self._publishers.heartbeats
+        for close in (
+            self._layouts.close,
+            self._directory.close,
+            session.close,
+            heartbeats.close,
+            self._queries.close,
+        ):
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
         closing.callback(_close_all, self._links)
@@ -111,7 +132,9 @@ class Bus(AbstractContextManager["Bus"]):
         self, message: type[M_co], other: type[M2], third: type[M3], /, **options: Unpack[Subscribe]
     ) -> Subscription[M_co | M2 | M3]: ...
     @overload
-    def subscribe(self, *messages: type[Message] | str, **options: Unpack[Subscribe]) -> Subscription[Message]: ...
+    def subscribe(
+        self, *messages: type[Message] | str, **options: Unpack[Subscribe]
+    ) -> Subscription[Message]: ...
     def subscribe(
         self,
         *messages: type[Message] | str,
@@ -170,9 +193,13 @@ class Bus(AbstractContextManager["Bus"]):
         self, message: type[M_co] = ..., /, *, topic: str = ..., **options: Unpack[Query]
     ) -> list[Sample[M_co]]: ...
     @overload
-    def latest(self, message: type[M_co], other: type[M2], /, **options: Unpack[Query]) -> list[Sample[M_co | M2]]: ...
+    def latest(
+        self, message: type[M_co], other: type[M2], /, **options: Unpack[Query]
+    ) -> list[Sample[M_co | M2]]: ...
     @overload
-    def latest(self, *messages: type[Message] | str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
+    def latest(
+        self, *messages: type[Message] | str, **options: Unpack[Query]
+    ) -> list[Sample[Message]]: ...
     def latest(
         self,
         *messages: type[Message] | str,
@@ -194,7 +221,8 @@ class Bus(AbstractContextManager["Bus"]):
         answers = query(self._session, *key_exprs, timeout=timeout, group_of=group_of)
         samples = list(Decoder(self._layouts, prefix=self.prefix).read(answers))
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
-        newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
+        # the last sample of each address wins
+        newest = {sample.address: sample for sample in samples}
         return [newest[address] for address in sorted(newest)]
 
     def vehicles(self, *, timeout: float = 2.0) -> Vehicles:
@@ -274,8 +302,15 @@ class Bus(AbstractContextManager["Bus"]):
                     is_received = tracker.add_sample(subscription.receive(left)) or is_received
         if not is_received:
             raise NoDataError(f"{name}: topics {', '.join(FUSION_TOPICS)}", duration)
-        positions = [each for service in self.services() for source in service.sources for each in source.positions]
-        return tracker.fusion(name, next((each for each in positions if each.vehicle == name), None))
+        positions = [
+            each
+            for service in self.services()
+            for source in service.sources
+            for each in source.positions
+        ]
+        return tracker.fusion(
+            name, next((each for each in positions if each.vehicle == name), None)
+        )
 
     def rejections(self) -> Rejections:
         """Subscribe to reports of the messages that services on this network reject."""
@@ -310,10 +345,13 @@ class Bus(AbstractContextManager["Bus"]):
             self._publishers.permission.require(address.vehicle)
         if definition is None and not isinstance(message, str):
             definition = message.DEFINITION
-        publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)
+        publisher = self._publishers.publisher(
+            address, definition, lossless=lossless, source=source, owner=self
+        )
         try:
             # This key matches nothing: a session that queries its own token sometimes lists it forever (Zenoh 1.10).
-            token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=2.0)  # usually milliseconds
+            # usually milliseconds
+            token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=2.0)
         except BaseException:  # such as Ctrl-C
             publisher.close(timeout=0.0)
             raise
@@ -346,7 +384,9 @@ class Bus(AbstractContextManager["Bus"]):
         """
         try:
             if not self.closed and timeout > 0:
-                lossless = [each for each in tuple(self._publishers.publishers.values()) if each.lossless]
+                lossless = [
+                    each for each in tuple(self._publishers.publishers.values()) if each.lossless
+                ]
                 with suppress(NedbusError):
                     self._publishers.flush(lossless, timeout=timeout)
         finally:
@@ -369,12 +409,16 @@ class Bus(AbstractContextManager["Bus"]):
         if self.closed:
             raise ClosedError
 
-    def _make_inbox(self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None) -> Inbox:
+    def _make_inbox(
+        self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None
+    ) -> Inbox:
         """Return the inbox of a new subscription; also used by AsyncBus."""
         self._require_open()
         decoder = Decoder(self._layouts, prefix=self.prefix)
         if max_rate is None:
-            return Inbox(mode, decoder, key_exprs=selection.key_exprs(prefix=self.prefix), limit=limit)
+            return Inbox(
+                mode, decoder, key_exprs=selection.key_exprs(prefix=self.prefix), limit=limit
+            )
         return MaxRateInbox(mode, decoder, selection, max_rate=max_rate, limit=limit)
 
     def _open_receiver(self, inbox: Inbox) -> Receiver:
@@ -409,7 +453,11 @@ def connect(
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
-    return Bus(load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls), timeout=timeout, tls=tls)
+    return Bus(
+        load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls),
+        timeout=timeout,
+        tls=tls,
+    )
 
 
 def require_callable(call: object) -> None:
@@ -419,11 +467,16 @@ def require_callable(call: object) -> None:
 
 
 def select(
-    messages: Sequence[type[Message] | str], vehicle: VehicleNames, instance: int | None, topic: str | None = None
+    messages: Sequence[type[Message] | str],
+    vehicle: VehicleNames,
+    instance: int | None,
+    topic: str | None = None,
 ) -> Selection:
     """Return the selection of the arguments of `subscribe`; raise ArgumentError for `topic` with several messages."""
     if topic is not None and len(messages) > 1:
-        raise ArgumentError("topic", topic, "None with several messages: pass the names of the topics instead")
+        raise ArgumentError(
+            "topic", topic, "None with several messages: pass the names of the topics instead"
+        )
     topics = [topic_of(message, topic) for message in messages or (VehicleLocalPosition,)]
     return Selection(topics, vehicle, instance)
 

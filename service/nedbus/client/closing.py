@@ -13,7 +13,8 @@ from nedbus.transport import is_forked
 from .io_thread import CallThread
 
 _closer = CallThread("nedbus-closer")
-atexit.register(_closer.drain, timeout=2.0)  # a thread still in Zenoh at interpreter exit aborts the process
+# a thread still in Zenoh at interpreter exit aborts the process
+atexit.register(_closer.drain, timeout=2.0)
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 
 

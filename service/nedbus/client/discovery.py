@@ -32,7 +32,8 @@ _log = logging.getLogger(__name__)
 
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
-_MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
+# bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
+_MAX_MEMORY: Final = 2**28
 # Queued reports, each of at most 16 kB, the size limit of sessions; beyond that the oldest are dropped.
 _MAX_REPORTS: Final = 250
 
@@ -101,8 +102,15 @@ class SourceStatus(UntrustedReply):
     @property
     def vehicles(self) -> set[str]:
         """The vehicles that this status names."""
-        addresses = (*self.addresses, *self.stale, *self.silent, *(each.address for each in self.streams))
-        return {_vehicle_of(each) for each in addresses} | {each.vehicle for each in self.log_streams}
+        addresses = (
+            *self.addresses,
+            *self.stale,
+            *self.silent,
+            *(each.address for each in self.streams),
+        )
+        return {_vehicle_of(each) for each in addresses} | {
+            each.vehicle for each in self.log_streams
+        }
 
     def about(self, vehicle: str, *, refused: Collection[str]) -> SourceStatus:
         """Return what this status says about one vehicle, and which streams it has of the `refused` ones."""
@@ -184,7 +192,11 @@ class ServiceStatus(UntrustedReply):
         """Split into one status per source, or omit the stream health of the only one; return [] if neither applies."""
         if len(self.sources) > 1:
             return [replace(self, sources=(each,)) for each in self.sources]
-        return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
+        return [
+            replace(self, sources=(replace(each, streams=()),))
+            for each in self.sources
+            if each.streams
+        ]
 
 
 def _vehicle_of(address: str) -> str:
@@ -207,12 +219,16 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     beginning thus leaves out no vehicle because another one claims many services.
     """
     found: dict[tuple[str | None, str], ServiceStatus] = {}
-    for vehicle, service, content in _find(session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout):
+    for vehicle, service, content in _find(
+        session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout
+    ):
         if not isinstance(content, dict):
             continue
         given = _status_type().validate_python(content)
         if vehicle is None:
-            found[vehicle, service] = ServiceStatus(service=service, host=given.host, version=given.version)
+            found[vehicle, service] = ServiceStatus(
+                service=service, host=given.host, version=given.version
+            )
             continue
         part = replace(given.about(vehicle), service=service)
         known = found.get((vehicle, service))
@@ -227,7 +243,9 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     return [status for _, _, status in ranked]
 
 
-def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
+def find_reports(
+    session: Session, *, prefix: str, within: float, timeout: float
+) -> list[AccountReport]:
     """Query all services for their event reports of the last `within` seconds, one report per vehicle and service.
 
     Ignores invalid and oversized replies, and statements about other vehicles than that of the key.
@@ -239,11 +257,15 @@ def find_reports(session: Session, *, prefix: str, within: float, timeout: float
     for vehicle, service, content in _find(session, selector, prefix=prefix, timeout=timeout):
         part = from_json(content)
         if vehicle is not None and part is not None:
-            found.setdefault((vehicle, service), []).append(replace(part.about(vehicle), service=service))
+            found.setdefault((vehicle, service), []).append(
+                replace(part.about(vehicle), service=service)
+            )
     return list(map(joined, found.values()))
 
 
-def _find(session: Session, selector: str, *, prefix: str, timeout: float) -> Iterator[tuple[str | None, str, object]]:
+def _find(
+    session: Session, selector: str, *, prefix: str, timeout: float
+) -> Iterator[tuple[str | None, str, object]]:
     """Yield vehicle, service and content of each reply on a status key.
 
     Beyond the limits of a query, the vehicle with the most replies loses some of them; no other vehicle does.
@@ -256,7 +278,9 @@ def _find(session: Session, selector: str, *, prefix: str, timeout: float) -> It
                 return vehicle
         return ""  # any vehicle may write such keys, so they share the part of one
 
-    for key, content in parse_replies(query(session, selector, timeout=timeout, group_of=vehicle_of)):
+    for key, content in parse_replies(
+        query(session, selector, timeout=timeout, group_of=vehicle_of)
+    ):
         try:
             vehicle, service = parse_status_key(key, prefix=prefix)
         except AddressError:
@@ -300,7 +324,9 @@ class Rejections:
     def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
         self._prefix, self._owner = prefix, owner  # the owner keeps the bus open
         with translate_zenoh_errors():
-            subscriber = session.declare_subscriber(f"{prefix}{REJECTED}/**", zenoh.handlers.RingChannel(_MAX_REPORTS))
+            subscriber = session.declare_subscriber(
+                f"{prefix}{REJECTED}/**", zenoh.handlers.RingChannel(_MAX_REPORTS)
+            )
         self._handler = subscriber.handler
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
@@ -312,7 +338,11 @@ class Rejections:
         for sample in samples:
             try:
                 address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
-                content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT_BYTES else None
+                content = (
+                    json.loads(sample.payload.to_bytes())
+                    if len(sample.payload) <= _MAX_REPORT_BYTES
+                    else None
+                )
             except (AddressError, ValueError, RecursionError):
                 continue
             if isinstance(content, dict) and (reason := content.get("reason")):
@@ -332,7 +362,9 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
         # Upper bound of the memory of a parsed reply, measured with CPython 3.11.
-        size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
+        size = (
+            4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
+        )
         if len(text) > MAX_REPLY_BYTES or size > free:
             oversized += 1
             continue
@@ -347,4 +379,8 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
         warning = "ignored replies over %d bytes or over the memory limit (%d in total): the result is incomplete"
         _log.warning(warning, MAX_REPLY_BYTES, oversized, extra=about("incomplete"))
     if invalid:
-        _log.warning("%r: ignored a reply that is not JSON", invalid, extra=about("invalid", reason="not JSON"))
+        _log.warning(
+            "%r: ignored a reply that is not JSON",
+            invalid,
+            extra=about("invalid", reason="not JSON"),
+        )

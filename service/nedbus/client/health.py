@@ -33,23 +33,31 @@ from nedbus_msgs.text import counted
 
 StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"]  # worst first
 
-_REBOOT_STEP: Final = 1_000_000  # us; PX4's time steps back by more in a reboot, by less if a message is out of order
+# us; PX4's time steps back by more in a reboot, by less if a message is out of order
+_REBOOT_STEP: Final = 1_000_000
 _FACTOR: Final = 3.0  # times the usual interval, after which there is a gap, or the stream is stale
 _MIN_STEPS: Final = 5  # intervals before the usual one is known
-_USUAL: Final = 15  # latest intervals, whose median is the usual one: half as many long ones are a lasting change
+# latest intervals, whose median is the usual one: half as many long ones are a lasting change
+_USUAL: Final = 15
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual rate
 _MAX_MEASURED: Final = 1000  # latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
-_BATCH: Final = 32  # messages that wait to be measured together, which takes half the time of one after the other
-_MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
-_MAX_IRREGULAR: Final = 0.2  # share of intervals over three times or under a third of the usual one; more: on change
+# messages that wait to be measured together, which takes half the time of one after the other
+_BATCH: Final = 32
+# Hz; below it, a topic without a nominal rate may be published on change
+_MIN_PERIODIC_RATE: Final = 1.0
+# share of intervals over three times or under a third of the usual one; more: on change
+_MAX_IRREGULAR: Final = 0.2
 _RECENT: Final = 60.0  # s after a reboot until a description no longer mentions it
-_LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
+# s, bucket limits
+_LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
 _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
 ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token counts as gone
-_QUEUED: Final = "log_message"  # PX4's queue may hold old ones, so their timestamps reveal no reboot
-_FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
+# PX4's queue may hold old ones, so their timestamps reveal no reboot
+_QUEUED: Final = "log_message"
+# evaluated fields of a position
+_FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())
 _COUNTERS: Final = 1 + len(DOUBT_FLAGS)  # index of the first counter in _FIELDS
 
 
@@ -93,10 +101,14 @@ class Health:
     @property
     def stale_after(self) -> float:
         """Seconds without a message until this stream is stale: 3 intervals, at least 3 s; infinity if it may pause."""
-        return _stale_after(self.nominal, self.usual_rate, self.usual_interval, on_change=self.on_change)
+        return _stale_after(
+            self.nominal, self.usual_rate, self.usual_interval, on_change=self.on_change
+        )
 
 
-def _stale_after(nominal: float, rate: float | None, interval: float | None, *, on_change: bool) -> float:
+def _stale_after(
+    nominal: float, rate: float | None, interval: float | None, *, on_change: bool
+) -> float:
     if not nominal and (on_change or (rate or 0) < _MIN_PERIODIC_RATE):
         return math.inf
     if interval is None:
@@ -104,7 +116,8 @@ def _stale_after(nominal: float, rate: float | None, interval: float | None, *, 
     return max(TIMINGS.stale, _FACTOR * interval)
 
 
-_FlagCounts = Counter[tuple[bool | None, ...]]  # messages by the values of all flags, None for unknown ones
+# messages by the values of all flags, None for unknown ones
+_FlagCounts = Counter[tuple[bool | None, ...]]
 
 
 def _flag_shares(counts: _FlagCounts) -> dict[str, float]:
@@ -132,7 +145,8 @@ class _Window:
 
     start: int
     messages: int = 0
-    intervals: tuple[int, float, float] = (0, 0.0, 0.0)  # number, mean [s], sum of squared differences from the mean
+    # number, mean [s], sum of squared differences from the mean
+    intervals: tuple[int, float, float] = (0, 0.0, 0.0)
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
     flags: _FlagCounts = field(default_factory=Counter)
     _sorted: list[float] | None = None  # the latencies; None after a new one
@@ -152,7 +166,10 @@ class _Window:
         """Add intervals [s] by Chan's method."""
         (number, mean, squares), added = self.intervals, len(intervals)
         own, total = fmean(intervals), number + added
-        squares += sum([(interval - own) ** 2 for interval in intervals]) + (own - mean) ** 2 * number * added / total
+        squares += (
+            sum([(interval - own) ** 2 for interval in intervals])
+            + (own - mean) ** 2 * number * added / total
+        )
         self.intervals = total, mean + (own - mean) * added / total, squares
 
 
@@ -195,12 +212,16 @@ class StreamHealth:
         self._usual_interval: float | None = None  # their median; None after a new one
         self._usual_rate: float | None = None
         self._flags: _FlagCounts = Counter()
-        self._seen: tuple[tuple[int | None, ...], Collection[str]] = (), ()  # counters of the last, and missing fields
+        # counters of the last, and missing fields
+        self._seen: tuple[tuple[int | None, ...], Collection[str]] = (), ()
         self._counters: dict[Quantity, int] = {}  # the last known ones
-        self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
+        self._resets: dict[Quantity, int] = dict.fromkeys(
+            RESET_COUNTERS if self._is_position else (), 0
+        )
         self._latencies = Histogram(_LATENCY_BUCKETS)
         self._window = self._last_window = _Window(0)
-        self._waiting = deque[tuple[tuple[Any, ...], int, float | None, int, Collection[str]]]()  # at most _BATCH
+        # at most _BATCH
+        self._waiting = deque[tuple[tuple[Any, ...], int, float | None, int, Collection[str]]]()
         self._window_end = _WINDOW  # of those that wait
         self._lock = threading.Lock()
 
@@ -270,12 +291,20 @@ class StreamHealth:
         self._window = _Window(received)
 
     def _add_position(
-        self, flags: tuple[Any, ...], counters: tuple[Any, ...], missing: Collection[str], *, rebooted: bool
+        self,
+        flags: tuple[Any, ...],
+        counters: tuple[Any, ...],
+        missing: Collection[str],
+        *,
+        rebooted: bool,
     ) -> None:
         if rebooted or counters != self._seen[0] or missing != self._seen[1]:
             self._add_counters(counters, missing, rebooted=rebooted)
         if missing:
-            flags = tuple(None if name in missing else flag for name, flag in zip(DOUBT_FLAGS, flags, strict=True))
+            flags = tuple(
+                None if name in missing else flag
+                for name, flag in zip(DOUBT_FLAGS, flags, strict=True)
+            )
         self._window.flags[flags] += 1
         self._flags[flags] += 1
 
@@ -301,7 +330,9 @@ class StreamHealth:
     def stale_after(self) -> float:
         """As in Health."""
         interval = self.usual_interval
-        return _stale_after(self._topic.rate, self._usual_rate, interval, on_change=self._is_on_change)
+        return _stale_after(
+            self._topic.rate, self._usual_rate, interval, on_change=self._is_on_change
+        )
 
     @property
     def _is_on_change(self) -> bool:
@@ -341,8 +372,11 @@ class StreamHealth:
             reboot_age=None if self._rebooted is None else (now - self._rebooted) / 1e9,
         )
 
-    def _add_counters(self, counters: tuple[int | None, ...], missing: Collection[str], *, rebooted: bool) -> None:
-        self._seen, known = (counters, missing), {} if rebooted else self._counters  # a reboot restarts them
+    def _add_counters(
+        self, counters: tuple[int | None, ...], missing: Collection[str], *, rebooted: bool
+    ) -> None:
+        # a reboot restarts them
+        self._seen, known = (counters, missing), {} if rebooted else self._counters
         for (quantity, name), count in zip(RESET_COUNTERS.items(), counters, strict=True):
             if name not in missing and count is not None:
                 self._resets[quantity] += (count - known.get(quantity, count)) % 256
@@ -372,8 +406,13 @@ class StreamHealth:
 
     def _step_back(self, timestamp: int, last: int | None, received: int) -> bool:
         step = None if last is None else timestamp - last
-        if step is not None and step < -_REBOOT_STEP and 0 < timestamp - self._earlier <= _REBOOT_STEP:
-            self._out_of_order, self._time = self._out_of_order + 1, timestamp  # only the time of the last was wild
+        if (
+            step is not None
+            and step < -_REBOOT_STEP
+            and 0 < timestamp - self._earlier <= _REBOOT_STEP
+        ):
+            # only the time of the last was wild
+            self._out_of_order, self._time = self._out_of_order + 1, timestamp
             return False
         self._earlier = last or 0
         if step is None or step < -_REBOOT_STEP:
@@ -413,7 +452,9 @@ class StreamState:
         return f"{self.name}: {self.reason}" if self.reason else self.name
 
 
-def silence_of(age: float, stale_after: float, *, publishers: int | None, connected: bool) -> StateName | None:
+def silence_of(
+    age: float, stale_after: float, *, publishers: int | None, connected: bool
+) -> StateName | None:
     """Return why no messages arrive on a stream, by the age of the last one [s]; None while they do."""
     if not connected:
         return "disconnected"
@@ -422,13 +463,17 @@ def silence_of(age: float, stale_after: float, *, publishers: int | None, connec
     return "stale" if age > stale_after else None
 
 
-def stream_state(health: Health, *, publishers: int | None = None, connected: bool = True) -> StreamState:
+def stream_state(
+    health: Health, *, publishers: int | None = None, connected: bool = True
+) -> StreamState:
     """Return the state of a stream with the given health.
 
     `publishers`: the number of publishers with a liveliness token; None if unknown.
     `connected`: True if there is a link to the router.
     """
-    match silence_of(health.age or 0.0, health.stale_after, publishers=publishers, connected=connected):
+    match silence_of(
+        health.age or 0.0, health.stale_after, publishers=publishers, connected=connected
+    ):
         case "disconnected":
             return StreamState("disconnected", "no link")
         case "gone":
@@ -436,12 +481,15 @@ def stream_state(health: Health, *, publishers: int | None = None, connected: bo
         case "stale":
             return StreamState("stale", f"nothing for {format_duration(health.age or 0.0)}")
     if publishers is not None and publishers > 1:
-        return StreamState("duplicate", f"{publishers} publishers: stop one, or give it another vehicle")
+        return StreamState(
+            "duplicate", f"{publishers} publishers: stop one, or give it another vehicle"
+        )
     reasons = []
     usual = None if health.on_change else health.usual_rate
     if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
         reasons.append(f"{health.rate:.1f} Hz, usually {usual:.0f}")
-    is_current = health.age is None or health.age < TIMINGS.stale  # else it is the latency of an old message
+    # else it is the latency of an old message
+    is_current = health.age is None or health.age < TIMINGS.stale
     if health.latency is not None and health.latency > _LATE and is_current:
         reasons.append(f"{format_duration(health.latency)} late, or clocks differ")
     return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")
@@ -464,7 +512,9 @@ def describe_stream(health: Health, state: StreamState) -> str:
     return ", ".join(texts) or "ok"
 
 
-def health_of_last(sample: Sample[Message], *, age: float | None = None, measured: Health | None = None) -> Health:
+def health_of_last(
+    sample: Sample[Message], *, age: float | None = None, measured: Health | None = None
+) -> Health:
     """Return the health of a stream from its last message; its age is by default measured by the wall clock.
 
     `measured`: its health as measured by the service that publishes it, from which the usual rate and interval are

@@ -42,8 +42,11 @@ class Job:
         self._call = call
         self._running = threading.RLock()  # a job may end itself
         self._due = 0.0
-        self._requested: set[float] = set()  # ticks; changed by single atomic calls, because any thread may add one
-        self._errors = UnexpectedErrors(_log, "unexpected error in an I/O job, retrying (logged once)")
+        # ticks; changed by single atomic calls, because any thread may add one
+        self._requested: set[float] = set()
+        self._errors = UnexpectedErrors(
+            _log, "unexpected error in an I/O job, retrying (logged once)"
+        )
         self._ended = False
         _jobs[self] = None
         _thread.start()
@@ -78,7 +81,11 @@ class Job:
         except BaseException as exc:  # noqa: BLE001 - not even SystemExit may end this thread
             self._errors.survives(exc)
             pause = _RETRY_PAUSE
-        self._due = now + pause if pause < TICK or pause == math.inf else math.floor((now + pause) / TICK) * TICK
+        self._due = (
+            now + pause
+            if pause < TICK or pause == math.inf
+            else math.floor((now + pause) / TICK) * TICK
+        )
 
 
 class CallThread:
@@ -86,7 +93,8 @@ class CallThread:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._calls: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # `put` must be reentrant
+        # `put` must be reentrant
+        self._calls: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._errors = UnexpectedErrors(_log, "unexpected error in thread %s (logged once)", name)
 
@@ -123,7 +131,8 @@ def _run_jobs() -> None:
         for job in tuple(_jobs):
             if job.runs_at <= now:
                 job.run(now)
-        _sleeps_until = math.inf  # from here `wake` puts an item; after the next line only for an earlier time
+        # from here `wake` puts an item; after the next line only for an earlier time
+        _sleeps_until = math.inf
         _sleeps_until = due = min((job.runs_at for job in tuple(_jobs)), default=math.inf)
         with suppress(queue.Empty):
             _woken.get(timeout=None if due == math.inf else max(0.0, due - time.monotonic()))

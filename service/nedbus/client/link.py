@@ -56,7 +56,9 @@ class LinkWatch:
         self._session = session
         self.callbacks: set[LinkCallback] = set()  # changed by single atomic calls
         with translate_zenoh_errors():
-            changes: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(MAX_LINK_CHANGES)
+            changes: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(
+                MAX_LINK_CHANGES
+            )
             self._listener = session.info.declare_transport_events_listener(changes, history=False)
         _calls.start()
         self._job = Job(self._poll)

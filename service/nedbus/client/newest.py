@@ -69,7 +69,8 @@ class NewestMessage(Generic[M_co]):
 
     sample: Sample[M_co]
     _view: _View
-    _arrived: float = -math.inf  # on the monotonic clock [ns]; a retained message when it was sent, -inf if unknown
+    # on the monotonic clock [ns]; a retained message when it was sent, -inf if unknown
+    _arrived: float = -math.inf
     _number: int = 0  # of the update in which it arrived
     _measured: StreamHealth | None = None  # None before the first message that is not retained
 
@@ -100,19 +101,33 @@ class NewestMessage(Generic[M_co]):
             return True
         connected, publishers = self._view.network(self.sample.address)
         measured = self._measured or StreamHealth(self.sample.topic)
-        return silence_of(age, measured.stale_after, publishers=publishers, connected=connected) is None
+        return (
+            silence_of(age, measured.stale_after, publishers=publishers, connected=connected)
+            is None
+        )
 
     @property
     def health(self) -> Health:
         """The health of the stream, measured on the messages that its view has received."""
-        return health_of_last(self.sample, age=self.age) if self._measured is None else self._measured.snapshot()
+        return (
+            health_of_last(self.sample, age=self.age)
+            if self._measured is None
+            else self._measured.snapshot()
+        )
 
     def _put(self, sample: Sample[Any], arrived: float) -> None:
         """Replace the message, except by a retained one that is older."""
         if not sample.retained:
-            measured, missing = self._measured or StreamHealth(sample.topic), sample.provenance.missing
+            measured = self._measured or StreamHealth(sample.topic)
+            missing = sample.provenance.missing
             received, latency = int(arrived), sample.latency
-            measured.add(sample.message, received=received, latency=latency, lost=sample.lost, missing=missing)
+            measured.add(
+                sample.message,
+                received=received,
+                latency=latency,
+                lost=sample.lost,
+                missing=missing,
+            )
             self._measured = measured
         elif self._measured is not None or arrived < self._arrived:
             return
@@ -139,7 +154,8 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         self._to_utc = clock.utc_ns() - self._latest  # from the monotonic to the wall clock [ns]
         self._streams: dict[Address, NewestMessage[Any]] = {}  # least recently updated first
         self._by_topic: defaultdict[str, dict[Address, NewestMessage[Any]]] = defaultdict(dict)
-        self._sorted: list[Address] | None = None  # addresses of the streams; None after a new or removed one
+        # addresses of the streams; None after a new or removed one
+        self._sorted: list[Address] | None = None
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
         """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`.
@@ -160,11 +176,15 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
                 return self._streams[key]
             topic = topic_of(key)
             if not self._wanted & {ANY, topic}:
-                raise ArgumentError("topic", topic, f"one of this view: {', '.join(sorted(self._wanted))}")
+                raise ArgumentError(
+                    "topic", topic, f"one of this view: {', '.join(sorted(self._wanted))}"
+                )
             streams = self._by_topic.get(topic, {})
             if len(streams) > 1:
                 names = ", ".join(map(str, islice(sorted(streams), _MAX_NAMED)))
-                raise ArgumentError("topic", topic, f"an address, such as {names}", problem="has several streams")
+                raise ArgumentError(
+                    "topic", topic, f"an address, such as {names}", problem="has several streams"
+                )
             return streams[next(iter(streams))] if streams else self._streams[key]
 
     @overload  # type: ignore[override] # a class selects the type of the message
@@ -193,12 +213,20 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         """Return the health of each measured stream, by address, now or at `now` [ns] of the clock used in `add`."""
         with self._lock:
             streams = [self._streams[address] for address in self._sorted_addresses()]
-        return {stream.sample.address: stream._measured.snapshot(now) for stream in streams if stream._measured}
+        return {
+            stream.sample.address: stream._measured.snapshot(now)
+            for stream in streams
+            if stream._measured
+        }
 
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latency histogram of a stream since the start [s]; None if it is not measured."""
         stream = self._streams.get(address)
-        return stream._measured.latencies if stream is not None and stream._measured is not None else None
+        return (
+            stream._measured.latencies
+            if stream is not None and stream._measured is not None
+            else None
+        )
 
     def forget(self, address: Address, *, silence: float = 0.0) -> None:
         """Remove a stream unless it has been silent for less than `silence` s; its next sample starts a new one."""
@@ -263,7 +291,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
 class NewestBase(Monitor):
     """The view of a bus, blocking or asynchronous."""
 
-    def __init__(self, inbox: Inbox, topics: Iterable[str], ask: Callable[[], tuple[bool, Publishers]]) -> None:
+    def __init__(
+        self, inbox: Inbox, topics: Iterable[str], ask: Callable[[], tuple[bool, Publishers]]
+    ) -> None:
         super().__init__()
         self._inbox, self._wanted, self._view.ask = inbox, frozenset(topics), ask
 
@@ -290,7 +320,8 @@ class NewestBase(Monitor):
         arrived = [*samples, *(each for each in popped if each is not None)]
         if ended and not arrived:
             raise self._inbox.end_error
-        streams = dict.fromkeys(map(self._add, arrived))  # two samples of a stream are one piece of news
+        # two samples of a stream are one piece of news
+        streams = dict.fromkeys(map(self._add, arrived))
         return [stream for stream in streams if stream.updated]
 
 
@@ -300,9 +331,12 @@ class Newest(NewestBase, AbstractContextManager["Newest"]):
     It needs no thread unless `update` has a timeout. Call `update` from one thread; any thread may read the messages.
     """
 
-    def __init__(self, receiver: Receiver, inbox: Inbox, topics: Iterable[str], *, owner: Bus) -> None:
+    def __init__(
+        self, receiver: Receiver, inbox: Inbox, topics: Iterable[str], *, owner: Bus
+    ) -> None:
         super().__init__(inbox, topics, owner._network)
-        self._receiver, self._subscription = receiver, Subscription[Message](receiver, inbox, owner=owner)
+        self._receiver = receiver
+        self._subscription = Subscription[Message](receiver, inbox, owner=owner)
 
     def update(self, timeout: float | None = 0.0) -> list[NewestMessage[Message]]:
         """Read what has arrived, if nothing wait up to `timeout` seconds (None: without limit) for a message.

@@ -6,5 +6,7 @@ A lossless publisher requests acknowledgements from readers in mode `every` with
 
 from typing import Final
 
-LIVE: Final = b"live"  # attachment of a publisher's reply with its last message; a storage's reply has none
-CLOSED: Final = b"closed"  # payload of an acknowledgement from a closed reader; other acknowledgements are empty
+# attachment of a publisher's reply with its last message; a storage's reply has none
+LIVE: Final = b"live"
+# payload of an acknowledgement from a closed reader; other acknowledgements are empty
+CLOSED: Final = b"closed"

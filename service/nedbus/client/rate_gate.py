@@ -3,7 +3,8 @@
 import math
 from typing import Final
 
-RATES: Final = (1, 2, 5, 10, 20, 50, 100)  # Hz to which publishers downsample a stream, each on its own key
+# Hz to which publishers downsample a stream, each on its own key
+RATES: Final = (1, 2, 5, 10, 20, 50, 100)
 
 
 class RateGate:

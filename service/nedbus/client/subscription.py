@@ -73,7 +73,9 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
         """
         return self._next(self._inbox.pop, timeout)
 
-    def receive_batch(self, timeout: float | None = None, *, max_messages: int | None = None) -> Batch:
+    def receive_batch(
+        self, timeout: float | None = None, *, max_messages: int | None = None
+    ) -> Batch:
         """Wait for at least one message and return unread ones as arrays, as `batches` does.
 
         Raises the errors of `receive`.
@@ -127,7 +129,9 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
                 return item
             if ended:
                 raise self._inbox.end_error
-            if not self._receiver.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
+            if not self._receiver.wait(
+                None if deadline is None else max(0.0, deadline - time.monotonic())
+            ):
                 raise NoDataError(self.name, timeout or 0.0)
 
     def _each(self, pop: Callable[[], _T | None]) -> Iterator[_T]:

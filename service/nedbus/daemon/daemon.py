@@ -34,7 +34,9 @@ SOURCE_FORMS: Final = tuple(f"{name}:{kind.target or ''}" for name, kind in SOUR
 _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 
-def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[PlannedSource], list[ConfigError]]:
+def plan_sources(
+    settings: Settings, endpoints: Sequence[str]
+) -> tuple[list[PlannedSource], list[ConfigError]]:
     """Return the planned sources and the configuration errors, at most one per source; `endpoints`: of the service."""
     plan: list[PlannedSource] = []
     mistakes: list[ConfigError] = []
@@ -47,18 +49,27 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
     except ConfigError as exc:
         if not settings.left_out.intersection(_TLS):
             mistakes.append(
-                locate_setting(settings, next(name for name in _TLS if getattr(settings, name)), exc.reason)
+                locate_setting(
+                    settings, next(name for name in _TLS if getattr(settings, name)), exc.reason
+                )
             )
     routers = tuple(map(dial_endpoint, endpoints))
     for index, given in enumerate(settings.source):
         try:
             spec = parse_source(given)
-            source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls, prefix=settings.prefix)
+            source = spec.open_source(
+                vehicle=settings.vehicle, routers=routers, tls=tls, prefix=settings.prefix
+            )
         except ConfigError as exc:
             mistakes.append(locate_source(settings, index, exc))
         else:
             plan.append(PlannedSource(index, spec.text, settings.vehicle, source))
-    if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
+    if (
+        settings.until_done
+        and plan
+        and not mistakes
+        and not any(is_finite(planned.source) for planned in plan)
+    ):
         reason = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
         mistakes.append(ConfigError("until_done", reason))
     return plan, mistakes
@@ -88,12 +99,16 @@ class Daemon:
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
-        self._refused_at_end: list[str] = []  # vehicles of finite sources whose messages reached no reader
+        # vehicles of finite sources whose messages reached no reader
+        self._refused_at_end: list[str] = []
         self.event_log = EventLog(reader="service")
         # Random, because services in containers may all be PID 1 on hosts of the same name.
-        self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
+        self.id = re.sub(
+            r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
+        )
         self.max_sessions: int | None = None  # session limit of the embedded router, once open
-        self.ready, self.closing = threading.Event(), threading.Event()  # closing: only the session is still open
+        # closing: only the session is still open
+        self.ready, self.closing = threading.Event(), threading.Event()
         self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
         self._plan = self._make_plan(settings)
@@ -149,24 +164,34 @@ class Daemon:
         measures = self.measures if measures is None else measures
         for source in measures:
             measured |= source.states
-        dropped, is_behind = (
-            sum(each.status.dropped for each in measures),
-            any(each.status.overload for each in measures),
-        )
-        mains = [vehicle.main for vehicle in list(self.event_log.vehicles.values()) if vehicle.main is not None]
+        dropped = sum(each.status.dropped for each in measures)
+        is_behind = any(each.status.overload for each in measures)
+        mains = [
+            vehicle.main
+            for vehicle in list(self.event_log.vehicles.values())
+            if vehicle.main is not None
+        ]
         shared = set() if self._registry is None else self._registry.shared_vehicles()
-        present = set() if self._registry is None else {each.vehicle for each in tuple(self._registry.publishers)}
+        present = (
+            set()
+            if self._registry is None
+            else {each.vehicle for each in tuple(self._registry.publishers)}
+        )
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         states |= {main: "duplicate" for main in states if main.vehicle in shared}
         is_link_lost = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_link_lost else ""
-        self.event_log.update(clock.steady(), states, link=link, dropped=dropped, is_behind=is_behind, present=present)
+        self.event_log.update(
+            clock.steady(), states, link=link, dropped=dropped, is_behind=is_behind, present=present
+        )
         return self.event_log
 
     def report(self, *, within: float = 0.0) -> AccountReport:
         """Return the events of the last `within` seconds and the current state of each vehicle."""
         event_log, host = self.update_events(), socket.gethostname()
-        return report_of(event_log, self.id, host, clock.steady(), within=within, to_utc=clock.to_utc())
+        return report_of(
+            event_log, self.id, host, clock.steady(), within=within, to_utc=clock.to_utc()
+        )
 
     def stop(self) -> None:
         """Stop `run`; safe to call from any thread and from signal handlers."""
@@ -181,7 +206,9 @@ class Daemon:
         """
         for name in type(settings).model_fields:
             if name not in _RELOADABLE and getattr(settings, name) != getattr(self._settings, name):
-                raise locate_setting(settings, name, f"{name} cannot be changed by a reload: restart the service")
+                raise locate_setting(
+                    settings, name, f"{name} cannot be changed by a reload: restart the service"
+                )
         plan = self._make_plan(settings)
         with self._workers_lock:
             self._settings, self._plan = settings, plan
@@ -189,7 +216,9 @@ class Daemon:
                 return "no source is running yet"
             before, unchanged = len(self._workers), self._apply_plan(self._registry)
         self._changed.set()
-        return f"{len(plan) - unchanged} started, {before - unchanged} stopped, {unchanged} unchanged"
+        return (
+            f"{len(plan) - unchanged} started, {before - unchanged} stopped, {unchanged} unchanged"
+        )
 
     def run(self) -> bool:
         """Publish until done or stopped; return False if a source failed, or the router refused what was published.
@@ -219,7 +248,11 @@ class Daemon:
             replies.add(settings.vehicle)  # reports sources that have not published a vehicle yet
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
-            self._wait(registry, replies, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
+            self._wait(
+                registry,
+                replies,
+                Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls),
+            )
         finally:
             self._stop.set()
             stop_workers(self._workers, _GRACE)
@@ -229,7 +262,9 @@ class Daemon:
             session.close()
             if self._permission is not None:
                 self._permission.close()
-        return not self._refused_at_end and not any(source.state == "failed" for source in self.sources)
+        return not self._refused_at_end and not any(
+            source.state == "failed" for source in self.sources
+        )
 
     def _apply_plan(self, registry: PublisherRegistry) -> int:
         """Stop removed sources and start new ones, in the order of the plan; return the number of unchanged sources."""
@@ -243,7 +278,14 @@ class Daemon:
                 removed.remove(worker)
             else:
                 retry, on_end = not self.until_done, self._changed.set
-                worker = Worker(planned, registry, router=router, event_log=self.event_log, retry=retry, on_end=on_end)
+                worker = Worker(
+                    planned,
+                    registry,
+                    router=router,
+                    event_log=self.event_log,
+                    retry=retry,
+                    on_end=on_end,
+                )
                 new.append(worker)
             ordered.append(worker)
         stop_workers(removed, _RETIRE_TIMEOUT, release=True)
@@ -251,8 +293,10 @@ class Daemon:
             if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
                 text = "%s: still stopping after %.0f s, possibly because of a slow reader"
                 _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
-        self._workers = ordered  # before the first message, whose readers may query the status of its source
-        for worker in new:  # after the removed workers have stopped, because both may use the same addresses
+        # before the first message, whose readers may query the status of its source
+        self._workers = ordered
+        # after the removed workers have stopped, because both may use the same addresses
+        for worker in new:
             worker.thread.start()
         return len(ordered) - len(new)
 
@@ -277,7 +321,11 @@ class Daemon:
             _log.info("router on %s%s", endpoints, joining, extra=about("router"))
             return session
         setter = settings.set_by("connect")  # NEDBUS_CONNECT may have been set for scripts
-        hint = "" if setter == "connect" else f", set by {setter}; use --listen to run a router instead"
+        hint = (
+            ""
+            if setter == "connect"
+            else f", set by {setter}; use --listen to run a router instead"
+        )
         _log.info("connecting to a router at %s%s", endpoints, hint, extra=about("client"))
         logged = False
         while not self._stop.is_set():
@@ -296,7 +344,11 @@ class Daemon:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status().ended for worker in finite):
                     # Heartbeats let readers detect the loss of the last message.
-                    speeds = [each.source.options.speed for each in finite if isinstance(each.source, ReplaySource)]
+                    speeds = [
+                        each.source.options.speed
+                        for each in finite
+                        if isinstance(each.source, ReplaySource)
+                    ]
                     self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
                     registry.flush(tuple(registry.publishers.values()), stop=self._stop)
                     if self._permission is not None:

@@ -64,16 +64,24 @@ class SourceOutput:
     """Publish the messages of a source, called `name` in the log and configured as `text`; `now`: monotonic clock."""
 
     def __init__(
-        self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], event_log: EventLog
+        self,
+        name: str,
+        text: str,
+        registry: PublisherRegistry,
+        now: Callable[[], float],
+        event_log: EventLog,
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
-        self.unavailable = UnavailableTopics()  # topics that vehicles publish but a live source does not deliver now
+        # topics that vehicles publish but a live source does not deliver now
+        self.unavailable = UnavailableTopics()
         self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
-        self.positions: dict[str, PositionStatus] = {}  # by address of the positions that are sent into a vehicle
+        # by address of the positions that are sent into a vehicle
+        self.positions: dict[str, PositionStatus] = {}
         self.load = LinkLoad()  # of a live source
         self.copies = 0  # messages that a live source left out
-        self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message, of every 16th one
+        # s to validate, encode and send a message, of every 16th one
+        self.durations = Histogram(_DURATIONS)
         self._name = name
         self._text = text
         self._kind = text.partition(":")[0]
@@ -89,18 +97,28 @@ class SourceOutput:
     @property
     def addresses(self) -> list[Address]:
         """Currently published addresses."""
-        return [address for address, stream in list(self._streams.items()) if stream.publisher is not None]
+        return [
+            address
+            for address, stream in list(self._streams.items())
+            if stream.publisher is not None
+        ]
 
     @property
     def stale(self) -> list[Address]:
         """Addresses of a live source that are no longer published."""
         streams = list(self._streams.items())
-        return [address for address, stream in streams if stream.publisher is None and stream.last_received is not None]
+        return [
+            address
+            for address, stream in streams
+            if stream.publisher is None and stream.last_received is not None
+        ]
 
     def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
         """Return the health of all streams, or of the first `limit`."""
         streams, now = list(self._streams.items())[:limit], round(self._now() * 1e9)
-        return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
+        return tuple(
+            StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -118,7 +136,9 @@ class SourceOutput:
         for address, definition in islice(run.addresses.items(), _MAX_REPLAYED):
             self.claim(address, definition, lossless=lossless)
 
-    def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> _Stream:
+    def claim(
+        self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False
+    ) -> _Stream:
         """Open a publisher, or keep one with this definition; raise AddressInUseError if another source has one."""
         stream = self._streams.get(address)
         if stream is None:
@@ -146,7 +166,11 @@ class SourceOutput:
         if stream is None and len(self._streams) >= _MAX_REPLAYED:
             self._reject_excess(message.address, _MAX_REPLAYED)
             return
-        if stream is None or stream.publisher is None or definition is not stream.publisher.definition:
+        if (
+            stream is None
+            or stream.publisher is None
+            or definition is not stream.publisher.definition
+        ):
             try:
                 stream = self.claim(message.address, definition, lossless=lossless)
             except AddressInUseError as exc:
@@ -154,7 +178,9 @@ class SourceOutput:
                 return
         self._publish(message, stream)
 
-    def _publish(self, message: SourceMessage, stream: _Stream, received: float | None = None) -> None:
+    def _publish(
+        self, message: SourceMessage, stream: _Stream, received: float | None = None
+    ) -> None:
         """Validate a message of a claimed address, and publish or reject it; `received`: time, by default now."""
         address = message.address
         publisher = stream.publisher
@@ -172,17 +198,23 @@ class SourceOutput:
             publisher.publish_encoded(payload, provided)
         except InvalidMessageError as exc:
             field, violation = exc.violations[0]
-            self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)  # without values
+            # without values
+            self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)
             return
         now = self._now()
         if start is not None:
             self.durations.add(now - start)
         self.published += 1
         received = now if received is None else received
-        latency = now - received if now - received > TIMINGS.lateness else None  # it waited in this service
-        stream.health.add(row, received=round(received * 1e9), latency=latency, lost=lost, missing=missing)
+        # it waited in this service
+        latency = now - received if now - received > TIMINGS.lateness else None
+        stream.health.add(
+            row, received=round(received * 1e9), latency=latency, lost=lost, missing=missing
+        )
         if message.dropout:
-            self._event_log.add_dropout(address.vehicle, message.dropout, clock.steady() - message.dropout)
+            self._event_log.add_dropout(
+                address.vehicle, message.dropout, clock.steady() - message.dropout
+            )
         is_estimate = message.source == _ULOG_STREAM
         self._event_log.add(
             address,
@@ -201,7 +233,11 @@ class SourceOutput:
         address = message.address
         stream = self._streams.get(address)
         publisher = stream.publisher if stream is not None else None
-        if stream is None or publisher is None or _differs(message.definition, publisher.definition):
+        if (
+            stream is None
+            or publisher is None
+            or _differs(message.definition, publisher.definition)
+        ):
             resumed = stream is not None and stream.last_received is not None
             if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._evict_stale():
                 self._reject_excess(address, _MAX_ADDRESSES)
@@ -214,7 +250,9 @@ class SourceOutput:
             if not stream.flaps:
                 text = f"{address} is published{' again' if resumed else ''}"
                 event = "stream_resumed" if resumed else "published"
-                _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
+                _log.info(
+                    "%s: %s", self._name, text, extra=about(event, address, source=self._name)
+                )
             self._republish_retained(message)
         stream.last_received, stream.last = message.arrived or self._now(), message
         self._publish(message, stream, stream.last_received)
@@ -232,19 +270,32 @@ class SourceOutput:
             if stream.last_received is not None and now - stream.last_received < stream.patience
         }
         vehicles = {address.vehicle for address in fresh}
-        fresh |= {each for each in self._streams if each.vehicle in vehicles and not get_topic(each.topic).rate}
+        fresh |= {
+            each
+            for each in self._streams
+            if each.vehicle in vehicles and not get_topic(each.topic).rate
+        }
         for address in [each for each in self.addresses if each not in fresh]:
             stream = self._streams[address]
-            stream.flaps, stream.settled = stream.flaps + 1 if now < stream.settled else 0, now + _UNSETTLED
+            stream.flaps = stream.flaps + 1 if now < stream.settled else 0
+            stream.settled = now + _UNSETTLED
             if stream.flaps < 2:
                 text = f"{address} is stale: no message for {now - (stream.last_received or 0.0):.0f} s"
-                text += f"; it flaps, logged again once stable for {_UNSETTLED:.0f} s" * stream.flaps
-                _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
+                text += (
+                    f"; it flaps, logged again once stable for {_UNSETTLED:.0f} s" * stream.flaps
+                )
+                _log.warning(
+                    "%s: %s", self._name, text, extra=about("stale", address, source=self._name)
+                )
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
             stream.flaps *= now < stream.settled
-            is_known = address.vehicle in self._event_log.vehicles and stream.last_received is not None
-            if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
+            is_known = (
+                address.vehicle in self._event_log.vehicles and stream.last_received is not None
+            )
+            if stream.publisher is None and not (
+                is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten
+            ):
                 del self._streams[address]
         self._is_full = False
         return bool(fresh)
@@ -268,7 +319,9 @@ class SourceOutput:
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
             self._event_log.reject(rejection.address, reason, clock.steady())
-            self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
+            self._registry.reject(
+                rejection.address, {"source": self._text, "where": where, "reason": reason}
+            )
 
     def _reject_excess(self, address: Address, limit: int) -> None:
         reason = f"the limit is {limit}, and {address} is the first one ignored"
@@ -293,8 +346,14 @@ class SourceOutput:
     def _republish_retained(self, message: SourceMessage) -> None:
         """After an outage, republish the last messages of topics without a rate, unless the vehicle has rebooted."""
         vehicle = message.address.vehicle
-        streams = [(address, stream) for address, stream in self._streams.items() if address.vehicle == vehicle]
-        known = [(address, stream, stream.last) for address, stream in streams if stream.last is not None]
+        streams = [
+            (address, stream)
+            for address, stream in self._streams.items()
+            if address.vehicle == vehicle
+        ]
+        known = [
+            (address, stream, stream.last) for address, stream in streams if stream.last is not None
+        ]
         newest = max((last.timestamp or 0 for *_, last in known), default=0)
         rebooted = message.rebooted or (message.timestamp or 0) < newest
         for address, stream, last in known:
@@ -311,13 +370,19 @@ class SourceOutput:
 
     def _count_rejected(self, rule: str, count: int = 1) -> None:
         self.rejected += count
-        self.rejections[rule if rule in self.rejections or len(self.rejections) < _MAX_RULES else "other"] += count
+        self.rejections[
+            rule if rule in self.rejections or len(self.rejections) < _MAX_RULES else "other"
+        ] += count
 
     def _reject_invalid(self, message: SourceMessage, rule: str, reason: str) -> None:
         self._count_rejected(rule)
         self._invalid += 1
         if self._invalid <= _MAX_LOGGED:
-            last = "; further rejections are counted but not logged" if self._invalid == _MAX_LOGGED else ""
+            last = (
+                "; further rejections are counted but not logged"
+                if self._invalid == _MAX_LOGGED
+                else ""
+            )
             text = f"{message.address} rejected: {reason}{last}"
             extra = about("rejected", message.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)

@@ -39,8 +39,10 @@ class StatusReplies:
         self._make_status, self._make_report = status, report
         self._lock = threading.Lock()
         self._vehicles: set[str] = set()
-        self._status: tuple[float, ServiceStatus] | None = None  # with the time until which it is fresh
-        self._report: tuple[float, float, AccountReport] | None = None  # with that time, and the period it covers
+        # with the time until which it is fresh
+        self._status: tuple[float, ServiceStatus] | None = None
+        # with that time, and the period it covers
+        self._report: tuple[float, float, AccountReport] | None = None
 
     def add(self, vehicle: str) -> None:
         """Reply for this vehicle, too, until the service ends; do nothing beyond MAX_VEHICLES."""

@@ -35,8 +35,10 @@ from .output import TOO_MANY, SourceOutput
 
 _log = logging.getLogger(__name__)
 
-_MIN_RUN: Final = 0.1  # s per run of a loop: a log of one message must not be read thousands of times a second
-_MAX_DELAY: Final = 1.0  # s; a replay that falls further behind shifts its schedule instead of catching up
+# s per run of a loop: a log of one message must not be read thousands of times a second
+_MIN_RUN: Final = 0.1
+# s; a replay that falls further behind shifts its schedule instead of catching up
+_MAX_DELAY: Final = 1.0
 _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
 _MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
@@ -64,7 +66,10 @@ class PlannedSource:
         """
         spec = parse_source(self.text)
         if isinstance(self.source, LiveSource):
-            named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
+            named = {
+                getattr(spec.options, "vehicle", None),
+                *getattr(spec.options, "vehicles", {}).values(),
+            }
             return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
         if offline and SOURCE_KINDS[spec.kind].target == "FILE":
             return ()
@@ -91,7 +96,10 @@ class SourceMeasures:
         if self.status.ended:
             return {stream.address: "ok" for stream in self.status.streams}
         alive, streams = frozenset(self.status.addresses), self.status.streams
-        return {each.address: stream_state(each.health, publishers=each.address in alive).name for each in streams}
+        return {
+            each.address: stream_state(each.health, publishers=each.address in alive).name
+            for each in streams
+        }
 
 
 class Clock(threading.Event):
@@ -119,7 +127,8 @@ class Worker:
         on_end: Callable[[], object],
     ) -> None:
         self.planned, self.source = planned, planned.source
-        self.text = planned.text.encode(errors="backslashreplace").decode()  # file names may be invalid UTF-8
+        # file names may be invalid UTF-8
+        self.text = planned.text.encode(errors="backslashreplace").decode()
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
         self._name = self.text.rstrip(":")  # name in the log
         self._registry = registry
@@ -132,7 +141,8 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._message_start: float | None = None  # when publishing of the current message began; None while waiting
+        # when publishing of the current message began; None while waiting
+        self._message_start: float | None = None
         self._release = False
         self._warned: set[str] = set()
 
@@ -181,7 +191,11 @@ class Worker:
         try:
             self._run_until_done()
         except BaseException as exc:  # noqa: BLE001 - the state must not stay "running" when the thread ends
-            _log.exception("%s: stopped by an unexpected error", self._name, extra=about("failed", source=self._name))
+            _log.exception(
+                "%s: stopped by an unexpected error",
+                self._name,
+                extra=about("failed", source=self._name),
+            )
             self._state, self._error = "failed", _describe(exc)
         finally:
             self._on_end()
@@ -196,7 +210,9 @@ class Worker:
         self._clock.wait(None)
         if self._release:
             self._output.release()
-            _log.info("%s: stopped, because it is no longer configured", self.text, extra=about("reload"))
+            _log.info(
+                "%s: stopped, because it is no longer configured", self.text, extra=about("reload")
+            )
 
     def _run_until_done(self) -> None:
         failures = 0
@@ -234,16 +250,25 @@ class Worker:
         last = self._run
         speed = source.options.speed
         if last is None or last.summary != run.summary:
-            _log.info("%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name))
+            _log.info(
+                "%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name)
+            )
             self._warned.clear()
         else:
-            run.addresses.update(last.addresses)  # so a loop keeps the publishers of streams that start later
+            # so a loop keeps the publishers of streams that start later
+            run.addresses.update(last.addresses)
         self._warn(run)
         self._run, self._done = run, 0
         if source.options.wait and last is None:
             self._state = "waiting"
-            _log.info("%s: waiting for a subscriber", self._name, extra=about("replay_waiting", source=self._name))
-            while not self._registry.has_subscriber(run.addresses) and not self._clock.wait(_READER_POLL):
+            _log.info(
+                "%s: waiting for a subscriber",
+                self._name,
+                extra=about("replay_waiting", source=self._name),
+            )
+            while not self._registry.has_subscriber(run.addresses) and not self._clock.wait(
+                _READER_POLL
+            ):
                 pass
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=speed is None)
@@ -268,7 +293,10 @@ class Worker:
             self._message_start = None
             self._done += 1
         if pace.skipped:
-            run.warnings = *run.warnings, f"skipped pauses of more than {MAX_PAUSE:.0f} s ({pace.skipped})"
+            run.warnings = (
+                *run.warnings,
+                f"skipped pauses of more than {MAX_PAUSE:.0f} s ({pace.skipped})",
+            )
         self._warn(run)
         self._error = run.damage
 
@@ -276,11 +304,17 @@ class Worker:
         for warning in run.warnings:
             if warning not in self._warned:
                 self._warned.add(warning)
-                _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
+                _log.warning(
+                    "%s: %s",
+                    self._name,
+                    warning,
+                    extra=about("damaged", source=self._name, reason=warning),
+                )
 
     def _listen(self, source: LiveSource) -> None:
         """Publish the messages of a live source, which yields None several times a second while no message arrives."""
-        with closing(cast("Generator[LiveItem]", source.listen(self._router))) as items:  # live sources are generators
+        # live sources are generators
+        with closing(cast("Generator[LiveItem]", source.listen(self._router))) as items:
             next_poll = 0.0
             for item in items:
                 now = self._message_start = self._clock.now()
@@ -317,7 +351,9 @@ class Worker:
             self._state, self._error = state, reason
             text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
             event = "failed" if state == "failed" else "done"
-            _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
+            _log.info(
+                "%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason)
+            )
 
     def _fail(self, error: BaseException) -> None:
         """Log and store the reason; release all addresses, because another source may use them during the backoff."""
@@ -332,7 +368,11 @@ class Worker:
 
 
 def _describe(error: BaseException) -> str:
-    return str(error) if isinstance(error, NedbusError) else f"unexpected {type(error).__name__}: {error}"
+    return (
+        str(error)
+        if isinstance(error, NedbusError)
+        else f"unexpected {type(error).__name__}: {error}"
+    )
 
 
 def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:

@@ -18,7 +18,15 @@ from nedbus.errors import NedbusError
 from nedbus.log_event import UnexpectedErrors, about
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import CONFIRMED, Session, Tls, Verdict, probe_at_router, routers_of, secure_endpoints
+from nedbus.transport import (
+    CONFIRMED,
+    Session,
+    Tls,
+    Verdict,
+    probe_at_router,
+    routers_of,
+    secure_endpoints,
+)
 from nedbus_msgs.text import plural
 
 _log = logging.getLogger(__name__)
@@ -27,7 +35,9 @@ _GRACE: Final = 5.0  # s for the thread to end
 _MAX_NAMED: Final = 20  # vehicles named in a log line
 
 
-def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
+def watch_permission(
+    session: Session, settings: Settings, registry: PublisherRegistry
+) -> WritePermission | None:
     """Start the checks if the service uses a client certificate, else return None."""
     endpoints = secure_endpoints(settings.connect, settings.tls)
     if settings.tls is None or not endpoints:
@@ -36,7 +46,9 @@ def watch_permission(session: Session, settings: Settings, registry: PublisherRe
     def vehicles() -> set[str]:
         return {address.vehicle for address in tuple(registry.publishers)}
 
-    permission = WritePermission(session, endpoints, tls=settings.tls, prefix=settings.prefix, vehicles=vehicles)
+    permission = WritePermission(
+        session, endpoints, tls=settings.tls, prefix=settings.prefix, vehicles=vehicles
+    )
     permission.start()
     return permission
 
@@ -48,7 +60,13 @@ class WritePermission:
     """
 
     def __init__(
-        self, session: Session, endpoints: Sequence[str], *, tls: Tls, prefix: str, vehicles: Callable[[], set[str]]
+        self,
+        session: Session,
+        endpoints: Sequence[str],
+        *,
+        tls: Tls,
+        prefix: str,
+        vehicles: Callable[[], set[str]],
     ) -> None:
         self._session = session
         self._endpoints = endpoints
@@ -57,7 +75,8 @@ class WritePermission:
         self._vehicles = vehicles
         self._stop = threading.Event()
         self._checking = threading.Lock()
-        self._denials: dict[str, int] = {}  # consecutive denials by vehicle; 0 if allowed, no entry if unknown
+        # consecutive denials by vehicle; 0 if allowed, no entry if unknown
+        self._denials: dict[str, int] = {}
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
         self.start = self._thread.start
 
@@ -83,7 +102,9 @@ class WritePermission:
         due = 0.0
         routers = frozenset[str]()
         vehicles = set[str]()
-        errors = UnexpectedErrors(_log, "unexpected error while probing the write permission (logged once)")
+        errors = UnexpectedErrors(
+            _log, "unexpected error while probing the write permission (logged once)"
+        )
         while not self._stop.wait(TIMINGS.probe_poll):
             now = time.monotonic()
             last_routers = routers
@@ -91,7 +112,9 @@ class WritePermission:
             with errors:
                 routers, vehicles = routers_of(self._session), self._vehicles()
                 if routers != last_routers:
-                    self._denials = {vehicle: CONFIRMED * refused for vehicle, refused in self.refused.items()}
+                    self._denials = {
+                        vehicle: CONFIRMED * refused for vehicle, refused in self.refused.items()
+                    }
                     due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
                 elif vehicles - last_vehicles:
                     due = min(due, now + TIMINGS.probe_first[0])
@@ -112,32 +135,55 @@ class WritePermission:
         except NedbusError as exc:  # link or session closed, or a TLS file being replaced
             _log.debug("write permission unknown: %s", exc)
         before = self.refused
-        self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
+        self._denials = {
+            vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles
+        }
         for vehicle, verdict in verdicts.items():
             number = self._denials.get(vehicle, 0)
             if verdict == "allowed":
                 self._denials[vehicle] = 0
             elif verdict == "denied":
                 self._denials[vehicle] = number + 1
-            elif not number:  # else keep the count: the router was slow, and rules do not change while a link is up
+            elif not number:
+                # else keep the count: the router was slow, and rules do not change while a link is up
                 self._denials.pop(vehicle, None)
         now = self.refused
-        if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
+        if new := [
+            vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)
+        ]:
             text = (
                 "the router refuses messages of %s, so they reach no reader: check that its access rules allow them for"
                 " the certificate %s ('nedbus pki rules', docs/security.md); nedbus probes again every minute"
             )
-            _log.warning(text, _list_vehicles(new), self._tls.certificate, extra=about("access_denied"))
-        if accepted := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router now accepts messages of %s", _list_vehicles(accepted), extra=about("access_granted"))
-        if any(verdict == "denied" and self._denials[vehicle] < CONFIRMED for vehicle, verdict in verdicts.items()):
+            _log.warning(
+                text, _list_vehicles(new), self._tls.certificate, extra=about("access_denied")
+            )
+        if accepted := [
+            vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False
+        ]:
+            _log.info(
+                "the router now accepts messages of %s",
+                _list_vehicles(accepted),
+                extra=about("access_granted"),
+            )
+        if any(
+            verdict == "denied" and self._denials[vehicle] < CONFIRMED
+            for vehicle, verdict in verdicts.items()
+        ):
             return TIMINGS.probe_confirm
-        return TIMINGS.probe_pause if set(verdicts.values()) == {"allowed"} else TIMINGS.probe_unsure
+        return (
+            TIMINGS.probe_pause if set(verdicts.values()) == {"allowed"} else TIMINGS.probe_unsure
+        )
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
         """Return the verdict for each vehicle, or no verdicts if the two sessions share no router."""
         return probe_at_router(
-            self._session, self._endpoints, vehicles, tls=self._tls, prefix=self._prefix, stop=self._stop
+            self._session,
+            self._endpoints,
+            vehicles,
+            tls=self._tls,
+            prefix=self._prefix,
+            stop=self._stop,
         )
 
 

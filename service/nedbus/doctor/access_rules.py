@@ -58,13 +58,23 @@ def find_rule_mistakes(access: AccessControl) -> list[RuleMistake]:
     for prefix in dict.fromkeys(permission.prefix for permission in permissions):
         example = next(each for each in permissions if each.prefix == prefix)
         for certificate in access.certificates:
-            if _reads(access, certificate, prefix) and not _reads_status(access, certificate, example):
-                found[f"may read messages, but not the status of services: {_COMMON}"].append(certificate)
-        for key in (f"{prefix}/@rejected/{example.vehicle}/{DEFAULT_TOPIC}", _heartbeat_key(example)):
+            if _reads(access, certificate, prefix) and not _reads_status(
+                access, certificate, example
+            ):
+                found[f"may read messages, but not the status of services: {_COMMON}"].append(
+                    certificate
+                )
+        for key in (
+            f"{prefix}/@rejected/{example.vehicle}/{DEFAULT_TOPIC}",
+            _heartbeat_key(example),
+        ):
             if not access.limits_size(key):
                 reason = f"may put messages of any size on {key}, which fill the memory of readers: {_FILTER}"
                 found[reason].append(example.certificate)
-    return [RuleMistake(names[0], f"{_list_certificates(names)} {reason}") for reason, names in found.items()]
+    return [
+        RuleMistake(names[0], f"{_list_certificates(names)} {reason}")
+        for reason, names in found.items()
+    ]
 
 
 def _permissions(access: AccessControl) -> Iterator[_Permission]:
@@ -75,7 +85,9 @@ def _permissions(access: AccessControl) -> Iterator[_Permission]:
             if rule.is_allowed and rule.is_for("put", "ingress"):
                 for key_expr in rule.key_exprs:
                     if vehicle := _OF_VEHICLE.fullmatch(str(key_expr)):
-                        vehicles[_Permission(certificate, vehicle["prefix"], vehicle["vehicle"])] = None
+                        vehicles[
+                            _Permission(certificate, vehicle["prefix"], vehicle["vehicle"])
+                        ] = None
         yield from vehicles
 
 
@@ -83,7 +95,9 @@ def _mistakes_of_vehicle(access: AccessControl, permission: _Permission) -> Iter
     certificate, prefix, vehicle = permission
     own_status = status_key("1a", vehicle=vehicle, prefix=prefix)
     may_report = access.decide(certificate, "reply", "ingress", own_status).is_allowed
-    is_asked = access.decide(certificate, "query", "egress", all_status_keys(prefix=prefix)).is_allowed
+    is_asked = access.decide(
+        certificate, "query", "egress", all_status_keys(prefix=prefix)
+    ).is_allowed
     if not (may_report and is_asked):
         yield (
             "may publish a vehicle, but not report about it under a key that names the vehicle; one vehicle can speak"
@@ -94,7 +108,10 @@ def _mistakes_of_vehicle(access: AccessControl, permission: _Permission) -> Iter
         verb
         for message, key, verb in _OWN_KEYS
         if access.decide(
-            certificate, message, "ingress", key.format(prefix=prefix, vehicle=other, topic=DEFAULT_TOPIC)
+            certificate,
+            message,
+            "ingress",
+            key.format(prefix=prefix, vehicle=other, topic=DEFAULT_TOPIC),
         ).is_allowed
     ]
     if allowed and len(allowed) < len(_OWN_KEYS):  # one that may do everything is a router
@@ -127,7 +144,12 @@ def _list_certificates(names: list[str]) -> str:
 
 
 def explain_permissions(
-    access: AccessControl, certificate: str, *, vehicle: str | None, prefix: str, verdict: Verdict | None
+    access: AccessControl,
+    certificate: str,
+    *,
+    vehicle: str | None,
+    prefix: str,
+    verdict: Verdict | None,
 ) -> Iterator[Finding]:
     """Yield which rule decides about the messages of a client: those of a vehicle, if given, else of a reader.
 
@@ -138,12 +160,23 @@ def explain_permissions(
         yield _explain(access, certificate, "query", all_status_keys(prefix=prefix))
         return
     for message, key, _ in _OWN_KEYS:
-        yield _explain(access, certificate, message, key.format(prefix=prefix, vehicle=vehicle, topic=DEFAULT_TOPIC))
+        yield _explain(
+            access,
+            certificate,
+            message,
+            key.format(prefix=prefix, vehicle=vehicle, topic=DEFAULT_TOPIC),
+        )
     key = f"{prefix}/{vehicle}/{DEFAULT_TOPIC}"
     is_allowed = access.decide(certificate, "put", "ingress", key).is_allowed
     if verdict in {"allowed", "denied"} and (verdict == "allowed") != is_allowed:
         seen = f"a probe of vehicle {vehicle} was {verdict}, against this file"
-        yield Finding("rules", certificate, "warning", seen, "the router reads its rules only at startup: restart it")
+        yield Finding(
+            "rules",
+            certificate,
+            "warning",
+            seen,
+            "the router reads its rules only at startup: restart it",
+        )
 
 
 def _explain(access: AccessControl, certificate: str, message: str, key: str) -> Finding:
@@ -151,6 +184,9 @@ def _explain(access: AccessControl, certificate: str, message: str, key: str) ->
     if decision.is_allowed:
         return Finding("rules", certificate, "ok", f"{message} on {key} is allowed: {decision}")
     advice = (
-        "needed only to publish this vehicle, or to read: use its certificate, or add a rule with 'nedbus pki rules'"
+        "needed only to publish this vehicle, or to read: use its certificate, "
+        "or add a rule with 'nedbus pki rules'"
     )
-    return Finding("rules", certificate, "warning", f"{message} on {key} is denied: {decision}", advice)
+    return Finding(
+        "rules", certificate, "warning", f"{message} on {key} is denied: {decision}", advice
+    )

@@ -21,7 +21,10 @@ _log = logging.getLogger(__name__)
 
 
 def check_service(
-    file: str | Path | None = None, given: Mapping[str, object] | None = None, *, offline: bool = False
+    file: str | Path | None = None,
+    given: Mapping[str, object] | None = None,
+    *,
+    offline: bool = False,
 ) -> list[ConfigError]:
     """Return all mistakes in the settings of a service; `file` and `given` as in `load_settings`.
 
@@ -45,7 +48,9 @@ def check_service(
         *(("listen", finding) for finding in map(_try_listen, settings.listen)),
         ("http", _try_listen(f"tcp/{settings.http}") if settings.http else None),
     ]
-    return mistakes + [locate_setting(settings, name, reason) for name, each in found if (reason := _reason(each))]
+    return mistakes + [
+        locate_setting(settings, name, reason) for name, each in found if (reason := _reason(each))
+    ]
 
 
 def check_router_file(
@@ -74,10 +79,14 @@ def check_router_file(
 def _check_router_access(config: RouterConfig, replaced: Collection[str]) -> list[tuple[str, str]]:
     """Return endpoints and TLS files of a router, each with its mistake, or "" if it is usable."""
     found = list[tuple[str, str]]()
-    for name, endpoints, probe in (("listen", config.listen, _try_listen), ("connect", config.connect, reach_endpoint)):
+    for name, endpoints, probe in (
+        ("listen", config.listen, _try_listen),
+        ("connect", config.connect, reach_endpoint),
+    ):
         for endpoint in endpoints if name not in replaced else ():
             try:
-                if endpoint.partition("/")[0] in {"tcp", "tls", "udp", "ws", "quic"}:  # the others have no HOST:PORT
+                # the others have no HOST:PORT
+                if endpoint.partition("/")[0] in {"tcp", "tls", "udp", "ws", "quic"}:
                     check_endpoints([endpoint], where=name)
                 found.append((endpoint, _reason(probe(endpoint))))
             except ConfigError as exc:
@@ -88,7 +97,9 @@ def _check_router_access(config: RouterConfig, replaced: Collection[str]) -> lis
     return found
 
 
-def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
+def check_sources(
+    settings: Settings, endpoints: Iterable[str], *, offline: bool = False
+) -> Iterator[ConfigError]:
     """Yield a mistake for each source that cannot be opened, or that publishes the same address as another source."""
     plan, mistakes = plan_sources(settings, tuple(endpoints))
     yield from mistakes
@@ -101,9 +112,13 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
         same = next((address for address in addresses if address in publishers), None)
         if same is not None and "vehicle" not in settings.left_out:
             other = publishers[same].text
-            reason = f"publishes {same}, as does source {other!r}: set another vehicle for one of them"
+            reason = (
+                f"publishes {same}, as does source {other!r}: set another vehicle for one of them"
+            )
         if reason:
-            yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
+            yield locate_source(
+                settings, planned.index, ConfigError(f"source {planned.text!r}", reason)
+            )
         for address in addresses:
             publishers.setdefault(address, planned)
 
@@ -126,7 +141,9 @@ def _reason(finding: Finding | None) -> str:
     """Return the text of a mistake, "" for none; only log an unknown state, for example if a package is missing."""
     if finding is None or finding.state == "ok":
         return ""
-    subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""
+    subject = (
+        f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""
+    )
     text = f"{subject}{finding.seen}" + (f"; {finding.advice}" if finding.advice else "")
     if finding.state == "unknown":
         _log.warning("%s", text, extra=about("notice"))

@@ -75,4 +75,6 @@ def brief(value: object) -> str:
 def list_names(names: Iterable[object], limit: int = 5) -> str:
     """Join the first names, and append the number of the others."""
     every = [brief(name) for name in names]
-    return ", ".join(every[:limit]) + (f" and {len(every) - limit} more" if len(every) > limit else "")
+    return ", ".join(every[:limit]) + (
+        f" and {len(every) - limit} more" if len(every) > limit else ""
+    )

@@ -71,7 +71,9 @@ def check_mavlink(link: str) -> Iterator[Finding]:
     )
     ordered = sorted(systems.items())
     yield from limit_findings(_check_system(link, number, messages) for number, messages in ordered)
-    yield from limit_findings(_check_log(link, number, each) for number, each in ordered if any(map(_is_px4, each)))
+    yield from limit_findings(
+        _check_log(link, number, each) for number, each in ordered if any(map(_is_px4, each))
+    )
 
 
 def _check_ignored(link: str, traffic: _Traffic) -> Iterator[Finding]:
@@ -81,7 +83,9 @@ def _check_ignored(link: str, traffic: _Traffic) -> Iterator[Finding]:
         if not (system and component) or not traffic.systems:
             yield Finding("mavlink", subject, "wrong", seen)
         elif system in traffic.systems and component == AUTOPILOT:
-            advice = "another program uses the ids of the autopilot; give it a component id of its own"
+            advice = (
+                "another program uses the ids of the autopilot; give it a component id of its own"
+            )
             yield Finding("mavlink", subject, "warning", f"some HEARTBEATs are {seen}", advice)
         elif component == AUTOPILOT:
             advice = f"only autopilots should use component id {AUTOPILOT}; give this program another one"
@@ -98,10 +102,16 @@ def _listen(link: Link) -> _Traffic:
     parser = None
     sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
     heartbeat = dialect.MAVLink_heartbeat_message(
-        dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
+        dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+        dialect.MAV_AUTOPILOT_INVALID,
+        0,
+        0,
+        dialect.MAV_STATE_ACTIVE,
+        3,
     )
     while (now := time.monotonic()) < end:
-        if link.peer is not None and now >= next_heartbeat:  # some peers send only to addresses that they received from
+        # some peers send only to addresses that they received from
+        if link.peer is not None and now >= next_heartbeat:
             next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
         for data, peer, _ in link.read(_READ_TIMEOUT):
@@ -112,7 +122,8 @@ def _listen(link: Link) -> _Traffic:
                 parser = dialect.MAVLink(None)
                 parser.robust_parsing = True
             for message in parser.parse_buffer(data) or []:
-                if message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these types have no header
+                # these types have no header
+                if message.get_type().startswith(("BAD_DATA", "UNKNOWN")):
                     continue
                 ids = message.get_srcSystem(), message.get_srcComponent()
                 if reason := senders.ignore_reason(message, *ids):
@@ -124,16 +135,22 @@ def _listen(link: Link) -> _Traffic:
                     traffic.duplicates[ids[0]] = duplicate
                 traffic.systems.setdefault(ids[0], []).append(message)
                 if _is_px4(message):
-                    request = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
+                    request = dialect.MAVLink_param_request_read_message(
+                        *ids, _BACKEND.encode(), -1
+                    )
                     link.send(request.pack(sender), peer)
-                    link.send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()).pack(sender), peer)
+                    link.send(
+                        dialect.MAVLink_timesync_message(0, time.monotonic_ns()).pack(sender), peer
+                    )
                 elif message.get_type() == "TIMESYNC" and message.tc1:
                     message.round_trip = (time.monotonic_ns() - message.ts1) / 1e9
     return traffic
 
 
 def _is_px4(message: Any) -> bool:
-    return bool(message.get_type() == "HEARTBEAT" and message.autopilot == dialect.MAV_AUTOPILOT_PX4)
+    return bool(
+        message.get_type() == "HEARTBEAT" and message.autopilot == dialect.MAV_AUTOPILOT_PX4
+    )
 
 
 def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
@@ -142,7 +159,11 @@ def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
     types = list_names(type_ for type_, _ in counts.most_common())
     if counts[_POSITION]:
         seen = f"{_POSITION} at {counts[_POSITION] / TIMINGS.listen:.0f} Hz; messages: {types}"
-        advice = "" if counts["ODOMETRY"] else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
+        advice = (
+            ""
+            if counts["ODOMETRY"]
+            else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
+        )
         return Finding("mavlink", name, "ok", seen, advice)
     if set(counts) == {HIGH_LATENCY}:
         advice = "'nedbus serve' publishes global position, status and battery, and sends nothing to the vehicle"
@@ -159,21 +180,33 @@ def _check_log(link: str, number: int, messages: Sequence[Any]) -> Finding:
     """Check whether PX4 can send its ULog stream on this link, without requesting it."""
     name = f"{link} system {number}"
     data = [message for message in messages if message.get_type().startswith("LOGGING_DATA")]
-    if clients := {f"system {each.target_system} component {each.target_component}" for each in data}:
+    if clients := {
+        f"system {each.target_system} component {each.target_component}" for each in data
+    }:
         seen = f"sends its ULog stream to {list_names(sorted(clients))}"
         advice = "PX4 streams to one client: it refuses 'nedbus serve' while another one receives, unless log=take"
-        return Finding("mavlink", name, "ok" if f"system {_SYSTEM} " in seen else "warning", seen, advice)
+        return Finding(
+            "mavlink", name, "ok" if f"system {_SYSTEM} " in seen else "warning", seen, advice
+        )
     values = [each.param_value for each in messages if getattr(each, "param_id", "") == _BACKEND]
     backend = _TO_MAVLINK
     if values:  # PX4 sends integers as the bytes of a float
         (backend,) = struct.unpack("<i", struct.pack("<f", values[-1]))
     if not backend & _TO_MAVLINK:
         seen = f"{_BACKEND} is {backend}: PX4 refuses to send its ULog stream"
-        return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 (file and MAVLink), and restart PX4")
+        return Finding(
+            "mavlink",
+            name,
+            "warning",
+            seen,
+            f"set {_BACKEND} to 3 (file and MAVLink), and restart PX4",
+        )
     size = sum(len(message.get_msgbuf()) for message in messages)
     seen = f"PX4 found; the link carries {size / TIMINGS.listen / 1000:.0f} kB/s"
     options = "log=1"
-    round_trips = [trip for each in messages if 0 <= (trip := getattr(each, "round_trip", -1)) < TIMINGS.listen]
+    round_trips = [
+        trip for each in messages if 0 <= (trip := getattr(each, "round_trip", -1)) < TIMINGS.listen
+    ]
     if round_trips:
         trip = min(round_trips)
         few, most = expected_header(trip, topics=16), expected_header(trip)

@@ -11,8 +11,20 @@ from typing import Final, TypeVar
 import zenoh
 
 from nedbus import Bus, Newest, Session, clock
-from nedbus.health import AccountReport, Publishers, RouterState, ServiceStatus, SourceStatus, query_routers
-from nedbus.rmw_zenoh import PublisherToken, px4_publishers_key_expr, token_keys, translate_zenoh_errors
+from nedbus.health import (
+    AccountReport,
+    Publishers,
+    RouterState,
+    ServiceStatus,
+    SourceStatus,
+    query_routers,
+)
+from nedbus.rmw_zenoh import (
+    PublisherToken,
+    px4_publishers_key_expr,
+    token_keys,
+    translate_zenoh_errors,
+)
 from nedbus.timings import TIMINGS
 from nedbus.transport import Verdict
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
@@ -22,7 +34,8 @@ T = TypeVar("T")
 _POLL: Final = 0.02  # s; also the error of measured delays
 _QUERY_TIMEOUT: Final = 1.0  # s
 _LIST_TIMEOUT: Final = 4.0  # s for the router to list all streams
-_MAX_SERVICES: Final = 100  # peers may claim to be services; a service has one status for each vehicle
+# peers may claim to be services; a service has one status for each vehicle
+_MAX_SERVICES: Final = 100
 _MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
 _RING: Final = 16_384  # samples buffered per subscription
@@ -77,7 +90,8 @@ class Observation:
         self.alive = bus.publishers(timeout=_LIST_TIMEOUT)
         tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
-        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges
+        # without nedbus's bridges
+        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]
         tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add(newest)
@@ -86,8 +100,17 @@ class Observation:
         while time.monotonic() < end:
             time.sleep(_POLL)
             self._add(newest)
-            keys = (key for sample in take_others() if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}"))
-            others.update(islice((key for key in keys if len(key) < _MAX_KEY_LENGTH), max(0, _MAX_KEYS - len(others))))
+            keys = (
+                key
+                for sample in take_others()
+                if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}")
+            )
+            others.update(
+                islice(
+                    (key for key in keys if len(key) < _MAX_KEY_LENGTH),
+                    max(0, _MAX_KEYS - len(others)),
+                )
+            )
         ages = islice(((address, each.age) for address, each in newest.items()), _MAX_KEYS)
         self.ages = {address: age if math.isfinite(age) else None for address, age in ages}
         self.listened = time.monotonic() - start
@@ -96,10 +119,18 @@ class Observation:
     def _add(self, newest: Newest) -> None:
         for each in newest.update():
             address = each.sample.address
-            if not each.sample.retained and (address in self.delays or len(self.delays) < _MAX_KEYS):
+            if not each.sample.retained and (
+                address in self.delays or len(self.delays) < _MAX_KEYS
+            ):
                 known = (self.delays.get(address), each.sample.latency)
-                self.delays[address] = min((delay for delay in known if delay is not None), default=None)
-        self.errors = {address: reason for address, reason in newest.invalid.items() if address.topic in BY_TOPIC}
+                self.delays[address] = min(
+                    (delay for delay in known if delay is not None), default=None
+                )
+        self.errors = {
+            address: reason
+            for address, reason in newest.invalid.items()
+            if address.topic in BY_TOPIC
+        }
         self.delays |= {address: None for address in newest.invalid if address not in self.delays}
 
 

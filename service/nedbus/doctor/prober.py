@@ -45,7 +45,8 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
         open_client([endpoint], timeout=TIMINGS.doctor_open, tls=tls).close()
     except NedbusError:
         if protocol == "tcp" and read_certificate(host, port, TIMINGS.handshake):
-            seen, advice = "it speaks TLS", "use tls/ instead of tcp/, with --tls-ca and a client certificate if needed"
+            seen = "it speaks TLS"
+            advice = "use tls/ instead of tcp/, with --tls-ca and a client certificate if needed"
         else:
             seen = "cannot open a Zenoh session"
             advice = "check that it is a Zenoh router (default port: 7447) below its max_sessions; see its log"
@@ -69,22 +70,28 @@ def reach_endpoint(endpoint: str) -> Finding | None:
         seen, advice = f"cannot resolve host name {host}", "correct the name, or use the IP address"
     except ConnectionRefusedError:
         seen = "connection refused, probably because nothing listens on this port"
-        advice = "start 'nedbus serve' or a Zenoh router there, or pass another endpoint with --connect"
+        advice = (
+            "start 'nedbus serve' or a Zenoh router there, or pass another endpoint with --connect"
+        )
     except TimeoutError:
         seen = f"no answer within {_CONNECT_TIMEOUT:g} s"
         advice = "check that the host is on, the address is correct, and no firewall drops the port"
     except OSError as exc:
-        seen, advice = f"cannot connect: {(exc.strerror or str(exc)).lower()}", "check the cable, address and route"
+        seen = f"cannot connect: {(exc.strerror or str(exc)).lower()}"
+        advice = "check the cable, address and route"
     else:
         return None
     return Finding("endpoint", endpoint, "wrong", seen, advice)
 
 
-def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | None) -> Iterator[Finding]:
+def _check_router_certificate(
+    endpoint: str, host: str, port: int, tls: Tls | None
+) -> Iterator[Finding]:
     """Yield the validity of the router's certificate, and a finding if either side rejects the other's."""
     pem = read_certificate(host, port, TIMINGS.handshake)
     if not pem:
-        seen, advice = "it does not speak TLS", "use tcp/ instead of tls/, or the endpoint of a Zenoh router with TLS"
+        seen = "it does not speak TLS"
+        advice = "use tcp/ instead of tls/, or the endpoint of a Zenoh router with TLS"
         yield Finding("endpoint", endpoint, "wrong", seen, advice)
         return
     validity, certificate = _check_validity("tls", endpoint, "the router presents", pem.encode())
@@ -103,7 +110,11 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
             connection.recv(1)  # with TLS 1.3 an alert arrives after the handshake
     except ssl.SSLCertVerificationError as exc:
         if exc.verify_code in _OTHER_HOST:
-            names = f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}" if certificate else ""
+            names = (
+                f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}"
+                if certificate
+                else ""
+            )
             seen = f"the router's certificate is not for {host}{names}"
             advice = f"connect to one of its hosts, or create a certificate: 'nedbus pki cert' with --host {host}"
         elif exc.verify_code in UNKNOWN_CA:
@@ -149,10 +160,16 @@ def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
         check_pem(path, kind)
     except ConfigError as exc:
         return Finding("certificate", str(path), "wrong", exc.reason)
-    return _check_validity("certificate", str(path), whose, path.read_bytes())[0] if kind == "CERTIFICATE" else None
+    return (
+        _check_validity("certificate", str(path), whose, path.read_bytes())[0]
+        if kind == "CERTIFICATE"
+        else None
+    )
 
 
-def _check_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[Finding, Certificate | None]:
+def _check_validity(
+    check: str, subject: str, whose: str, pem: bytes
+) -> tuple[Finding, Certificate | None]:
     """Return the validity of a certificate, and the certificate if readable."""
     try:
         certificate = Certificate.decode(pem, pem=True)

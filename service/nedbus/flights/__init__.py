@@ -21,23 +21,48 @@ if TYPE_CHECKING:
     )
     from .flight import Flight, FlightSamples, open_flight, open_messages
     from .merge import no_utc, require_files
-    from .readers import FlightReader, ReadOptions, check_recording, find_format, format_of, open_reader
+    from .readers import (
+        FlightReader,
+        ReadOptions,
+        check_recording,
+        find_format,
+        format_of,
+        open_reader,
+    )
     from .sample_events import detect_sample_events
-    from .selection import absent_topics, matching, parse_topics, require_one_vehicle, single_match, topics_of
+    from .selection import (
+        absent_topics,
+        matching,
+        parse_topics,
+        require_one_vehicle,
+        single_match,
+        topics_of,
+    )
     from .utc import find_utc, utc_of
     from .writer import RecordingWriter
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "conversion"): "Conversion convert convert_files convert_flight",
-        ("", "events"): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events"
+        (
+            "",
+            "events",
+        ): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events"
         " read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",
         ("", "merge"): "no_utc require_files",
-        ("", "readers"): "FlightReader ReadOptions check_recording find_format format_of open_reader",
+        (
+            "",
+            "readers",
+        ): "FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "sample_events"): "detect_sample_events",
-        ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
+        (
+            "",
+            "selection",
+        ): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
         ("mcap", "writer"): "RecordingWriter",
     }
-    __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
+    __getattr__ = lazy_exports(
+        __name__, {name: place for place, names in _NAMES.items() for name in names.split()}
+    )

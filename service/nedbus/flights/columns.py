@@ -56,7 +56,8 @@ class Columns:
         self.times = array("q")
         self.reason = self.skipped = ""
         self._parts: dict[FileStream, _Part] = {}
-        self._runs = array("q"), array("q")  # the number of the part, and of the messages, of each run
+        # the number of the part, and of the messages, of each run
+        self._runs = array("q"), array("q")
         self._decoded: Decoded | None = None
 
     def __len__(self) -> int:
@@ -76,12 +77,16 @@ class Columns:
     def decode(self, definition: Definition[Any]) -> Decoded:
         """Return the messages as those of a definition, once decoded."""
         if self._decoded is None:
-            found = [each.decode(definition) for each in self._parts.values()] or [Decoded.empty(definition, 0)]
+            found = [each.decode(definition) for each in self._parts.values()] or [
+                Decoded.empty(definition, 0)
+            ]
             if len(found) == 1:
                 self._decoded = found[0]
             else:
                 order = np.argsort(np.argsort(np.repeat(*self._runs), kind="stable"))
-                self._decoded = Decoded(*(np.concatenate(columns)[order] for columns in zip(*found, strict=True)))
+                self._decoded = Decoded(
+                    *(np.concatenate(columns)[order] for columns in zip(*found, strict=True))
+                )
         return self._decoded
 
 
@@ -104,7 +109,9 @@ class _Part:
         reason = ""
         if not size:
             self._fields += payloads
-        elif not head or ({*map(len, payloads)} == {size} and all(each.startswith(head) for each in payloads)):
+        elif not head or (
+            {*map(len, payloads)} == {size} and all(each.startswith(head) for each in payloads)
+        ):
             self._data += b"".join(payloads)  # records without a head have exactly this size
         else:
             for payload in payloads:
@@ -121,12 +128,16 @@ class _Part:
         """Return the messages as those of a definition."""
         if not self._size:
             return _decode_rows(definition, self._fields)
-        decoded = _decode_table(self._stream, np.frombuffer(self._data, np.dtype(self._stream.dtype)), definition)
+        decoded = _decode_table(
+            self._stream, np.frombuffer(self._data, np.dtype(self._stream.dtype)), definition
+        )
         decoded.valid[self._unusable] = False
         return decoded
 
 
-def _decode_table(stream: FileStream, table: npt.NDArray[np.void], definition: Definition[Any]) -> Decoded:
+def _decode_table(
+    stream: FileStream, table: npt.NDArray[np.void], definition: Definition[Any]
+) -> Decoded:
     """Decode records, vectorized; fields whose type must be converted one by one."""
     columns = {name: table[name] for name in table.dtype.names or ()}
     plan = definition.plan(tuple(columns))
@@ -135,7 +146,9 @@ def _decode_table(stream: FileStream, table: npt.NDArray[np.void], definition: D
         absent[name] = True
     rows = [stream.decode(row.tobytes()) for row in table] if stream.converted else []
     for name, kind in stream.converted.items():
-        values = np.array([row.get(name, kind.absent) for row in rows], str if kind.is_text else kind.form[-1])
+        values = np.array(
+            [row.get(name, kind.absent) for row in rows], str if kind.is_text else kind.form[-1]
+        )
         columns[name] = np.char.encode(values, "utf-8") if kind.is_text else values
         if name in plan.names:
             absent[name] = [name not in row for row in rows]
@@ -143,7 +156,9 @@ def _decode_table(stream: FileStream, table: npt.NDArray[np.void], definition: D
         messages[name] = columns[old]
     for name, (olds, convert) in plan.converted.items():
         parts = [np.full(len(table), np.nan) if old is None else columns[old] for old in olds]
-        messages[name] = [convert(*values) for values in zip(*(part.tolist() for part in parts), strict=True)]
+        messages[name] = [
+            convert(*values) for values in zip(*(part.tolist() for part in parts), strict=True)
+        ]
     valid[:] = arrays_of(definition).valid_mask(messages)
     for name, old in plan.names.items():
         if messages[name].dtype.kind in "iu" and messages[name].dtype != columns[old].dtype:
@@ -160,7 +175,8 @@ def _decode_rows(definition: Definition[Any], rows: Collection[Mapping[str, Any]
     for index, fields in enumerate(rows):
         with suppress(ValidationError):
             message = upgrade_with(definition, fields)
-            decoded.messages[index], decoded.valid[index] = arrays_of(definition).of([message])[0], True
+            decoded.messages[index] = arrays_of(definition).of([message])[0]
+            decoded.valid[index] = True
             for name in definition.all_fields - message.model_fields_set:
                 decoded.absent[name][index] = True
     return decoded
@@ -204,4 +220,6 @@ def make_batches(messages: Iterable[_Message]) -> Iterator[FlightBatch]:
         arrays, _ = arrays_of(definition).decode(b"".join(each.payload for each in encoded))
         indices = {address: index for index, address in enumerate(dict.fromkeys(addresses))}
         index = np.fromiter(map(indices.__getitem__, addresses), np.intp, len(own))
-        yield FlightBatch(arrays, definition.model, tuple(indices), index, 0, received, list(provenances))
+        yield FlightBatch(
+            arrays, definition.model, tuple(indices), index, 0, received, list(provenances)
+        )

@@ -81,7 +81,9 @@ def convert_files(
     name = None if vehicle is None else check_vehicle(vehicle_name(vehicle))
     with open_messages(paths, ReadOptions(topics_of(names), name)) as flight:
         summary = convert_flight(flight, Path(output).expanduser(), on_progress=on_progress)
-        absent = absent_topics(names, {address.topic for address in flight.definitions}, "this file")
+        absent = absent_topics(
+            names, {address.topic for address in flight.definitions}, "this file"
+        )
     warnings = (*flight.warnings, *(f"{paths[0]}: {text}" for text in absent))
     return Conversion(summary, warnings, flight.damaged)
 
@@ -126,13 +128,22 @@ def convert(
     try:
         with (
             atomic_write(path) as part,
-            _load_writer()(part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts) as writer,
+            _load_writer()(
+                part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts
+            ) as writer,
         ):
-            rejected, reason = _write(messages, writer, starts or {}, source=source, on_progress=on_progress)
+            rejected, reason = _write(
+                messages, writer, starts or {}, source=source, on_progress=on_progress
+            )
             if rejected and not writer.messages:
-                raise SourceError(str(path), f"not written, because all {rejected} messages are rejected: {reason}")
+                raise SourceError(
+                    str(path),
+                    f"not written, because all {rejected} messages are rejected: {reason}",
+                )
     except OSError as exc:  # an OutputError names the temporary file
-        raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
+        raise OutputError(
+            path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc
+        ) from exc
     written = counted(writer.messages, "message")
     return f"{written}, {rejected} rejected" if rejected else written
 
@@ -171,7 +182,9 @@ def _write(
         if start is None:
             first = starts.get(each.address.vehicle, message.timestamp)
             start = min(first * 1000, _MAX_START)
-        provenance = Provenance(each.source or source, definition.all_fields - message.model_fields_set)
+        provenance = Provenance(
+            each.source or source, definition.all_fields - message.model_fields_set
+        )
         pending.append((message, each.address, provenance, start + round(each.at * 1e9)))
         if len(pending) == _CHUNK:
             writer.write_messages(pending)

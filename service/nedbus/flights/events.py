@@ -22,9 +22,11 @@ MAX_FILE_EVENTS: Final = 100_000
 EVENT_OPTIONS: Final = ReadOptions(topics={*EVENT_TOPICS})
 """Options to read the messages from which events are derived."""
 
-_CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
+# s of flight time between checks for silent streams and settled events
+_CHECK_INTERVAL: Final = 0.5
 _MAX_CHECKED: Final = 120.0  # s of a pause that are checked; by then all events have settled
-_SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
+# s after the last message; events that have not settled by then are reported as they are
+_SETTLE_TIME: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +42,10 @@ class FileEvents:
         """Return the retained events and the state of each vehicle at the end."""
         events, total = self.event_log.events_since(0)
         report = report_of(self.event_log, "", "", self.end, within=math.inf)
-        held = {name: vehicle.held_from_start for name, vehicle in sorted(self.event_log.vehicles.items())}
+        held = {
+            name: vehicle.held_from_start
+            for name, vehicle in sorted(self.event_log.vehicles.items())
+        }
         return EventHistory(
             events=tuple(sorted(events, key=lambda event: event.time)),
             reports=by_vehicle([report]),
@@ -87,13 +92,17 @@ def times_of(flight: Flight) -> Times:
         if not isinstance(utc, str):
             offsets[name] = utc.offset_us / 1e6
             seconds = utc.corrected_us / 1e6
-            remark = f"{utc.source} corrected its UTC by {seconds:+.1f} s in flight" if seconds else ""
+            remark = (
+                f"{utc.source} corrected its UTC by {seconds:+.1f} s in flight" if seconds else ""
+            )
         if remark:
             remarks[name] = str(remark)
     return Times(offsets=offsets, remarks=remarks)
 
 
-def follow_flight(flight: Flight, event_log: EventLog) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
+def follow_flight(
+    flight: Flight, event_log: EventLog
+) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
     """Detect the events in a flight; yield each message with its rejection reason or its payload."""
     return follow(flight._messages(), event_log, ended=flight._ended)
 

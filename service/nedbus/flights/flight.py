@@ -75,7 +75,9 @@ def open_flight(
     """
     paths = [path] if isinstance(path, str | Path) else path
     options = ReadOptions(topics=None, layout=layout)
-    flight = Flight([Path(each).expanduser() for each in paths], options, vehicle=vehicle_name(vehicle))
+    flight = Flight(
+        [Path(each).expanduser() for each in paths], options, vehicle=vehicle_name(vehicle)
+    )
     flight._begin(watches_utc=True)
     return flight
 
@@ -97,14 +99,17 @@ class Flight(AbstractContextManager["Flight"]):
     # All readers of files in nedbus use a Flight, through the functions of this package. The first pass over the files
     # yields messages or columns, as the caller needs; what it has shown is kept.
 
-    def __init__(self, paths: Sequence[Path], options: ReadOptions = _BUILT_IN, *, vehicle: str = ANY) -> None:
+    def __init__(
+        self, paths: Sequence[Path], options: ReadOptions = _BUILT_IN, *, vehicle: str = ANY
+    ) -> None:
         self._readers: list[FlightReader] = []  # of the first pass, one for each file
         self._paths = require_files(paths)
         self._options = options
         self._vehicle = vehicle
         self._selection = Selection(vehicle=vehicle)
         self._watches: list[FileUtc] = []  # the UTC of each file, from the first pass
-        self._columns: list[dict[Address, Columns]] = []  # of each file, if the first pass is one of columns
+        # of each file, if the first pass is one of columns
+        self._columns: list[dict[Address, Columns]] = []
         self._ended: set[str] = set()  # vehicles without further messages in the first pass
         self._samples = WeakSet[FlightSamples[Any]]()  # open ones, which `close` closes
         self._is_complete = self._is_closed = False
@@ -141,7 +146,9 @@ class Flight(AbstractContextManager["Flight"]):
         name. Iterating raises SourceError if a file has none of these topics.
         """
         names = [topic_of(message, topic), *(topic_of(each) for each in more)]
-        chosen: VehicleNames = self._vehicle if Selection(vehicle=vehicle).vehicles == (ANY,) else vehicle
+        chosen: VehicleNames = (
+            self._vehicle if Selection(vehicle=vehicle).vehicles == (ANY,) else vehicle
+        )
         selection = Selection(names, chosen, instance)
         topics = None if selection.topics == (ANY,) else set(selection.topics)
         period = self._seconds(start, "start"), None if end is None else self._seconds(end, "end")
@@ -159,7 +166,11 @@ class Flight(AbstractContextManager["Flight"]):
         """The definition of each address."""
         self._complete()
         known = self._definitions_of(self._readers)
-        return {address: definition for address, definition in known.items() if self._selection.matches(address)}
+        return {
+            address: definition
+            for address, definition in known.items()
+            if self._selection.matches(address)
+        }
 
     @property
     def duration(self) -> float:
@@ -272,7 +283,9 @@ class Flight(AbstractContextManager["Flight"]):
             raise
         return readers
 
-    def _merge(self, readers: Sequence[FlightReader], on_end: Callable[[Names], object]) -> Iterator[SourceMessage]:
+    def _merge(
+        self, readers: Sequence[FlightReader], on_end: Callable[[Names], object]
+    ) -> Iterator[SourceMessage]:
         """Return the messages of a pass in chronological order; raise SourceError if one of several has no UTC."""
         if len(readers) == 1:
             return readers[0].messages()
@@ -284,10 +297,17 @@ class Flight(AbstractContextManager["Flight"]):
     def _utc(self) -> list[Mapping[str, UtcOffset | str]]:
         """The UTC offset of each vehicle of each file, by its own name, or why it is unknown."""
         if self._columns:
-            return [utc_of_columns(own, reader) for own, reader in zip(self._columns, self._readers, strict=True)]
+            return [
+                utc_of_columns(own, reader)
+                for own, reader in zip(self._columns, self._readers, strict=True)
+            ]
         if self._watches and self._is_complete:
-            return [watch.results(reader) for watch, reader in zip(self._watches, self._readers, strict=True)]
-        topics = None if self._options.topics is None else _BUILT_IN.topics  # a file may have other topics only
+            return [
+                watch.results(reader)
+                for watch, reader in zip(self._watches, self._readers, strict=True)
+            ]
+        # a file may have other topics only
+        topics = None if self._options.topics is None else _BUILT_IN.topics
         found: list[Mapping[str, UtcOffset | str]] = []
         for path in self._paths:
             with open_reader(path, replace(self._options, topics=topics)) as reader:
@@ -309,13 +329,17 @@ class Flight(AbstractContextManager["Flight"]):
             return [{}]
         files = []
         for reader, utc in zip(self._readers, self._utc, strict=True):
-            files.append((reader.path, utc.keys() | {address.vehicle for address in reader.definitions}))
+            files.append(
+                (reader.path, utc.keys() | {address.vehicle for address in reader.definitions})
+            )
         return [*distinct_names(files)]
 
     @cached_property
     def _starts(self) -> list[float]:
         """The Unix time of the first message of each file [s]; raise SourceError if it is unknown."""
-        return [_start_of(reader, utc) for reader, utc in zip(self._readers, self._utc, strict=True)]
+        return [
+            _start_of(reader, utc) for reader, utc in zip(self._readers, self._utc, strict=True)
+        ]
 
     def _find(self, address: Address) -> tuple[int, Address]:
         """Return the number of the file that has an address, and the address in this file."""
@@ -340,7 +364,9 @@ class Flight(AbstractContextManager["Flight"]):
         """Return the definition of each stream that a pass has met so far."""
         found = dict[Address, Definition[Any]]()
         for reader, names in zip(readers, self._names, strict=True):
-            found |= {renamed(address, names): known for address, known in [*reader.definitions.items()]}
+            found |= {
+                renamed(address, names): known for address, known in [*reader.definitions.items()]
+            }
         return found
 
     def _warnings_of(self, readers: Sequence[FlightReader]) -> tuple[str, ...]:
@@ -350,7 +376,9 @@ class Flight(AbstractContextManager["Flight"]):
             texts = []
             for own, name in names.items():
                 if own != name:
-                    texts.append(f"vehicle {own} is named {name} here, because several files have a vehicle {own}")
+                    texts.append(
+                        f"vehicle {own} is named {name} here, because several files have a vehicle {own}"
+                    )
             texts += [*reader.warnings, *reader.remarks]
             found += [f"{reader.path}: {text}" for text in texts]
         return tuple(found)
@@ -361,7 +389,9 @@ class Flight(AbstractContextManager["Flight"]):
             return time
         if time.tzinfo is None:
             expected = "seconds, or a datetime with a time zone, such as datetime(2025, 10, 9, 8, 53, tzinfo=UTC)"
-            raise ArgumentError(name, str(time), expected, problem="has no time zone, so it names no moment")
+            raise ArgumentError(
+                name, str(time), expected, problem="has no time zone, so it names no moment"
+            )
         self._complete()
         try:
             start = min(self._starts)
@@ -402,7 +432,8 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         """Damage, omissions and invalid messages so far."""
         count = self.skipped
         invalid = [
-            f"skipped {count[each]} messages of {each} as invalid ({text})" for each, text in self._reasons.items()
+            f"skipped {count[each]} messages of {each} as invalid ({text})"
+            for each, text in self._reasons.items()
         ]
         return [*self._flight._warnings_of(self._readers), *invalid]
 
@@ -482,12 +513,19 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
                     continue
                 definition = message.definition or BY_TOPIC[address.topic]
                 time = to_unix_ns(message.time, boot_utc_of(readers))
-                yield address, definition, encoded, time, _provenance(message.source, encoded.missing)
+                yield (
+                    address,
+                    definition,
+                    encoded,
+                    time,
+                    _provenance(message.source, encoded.missing),
+                )
         finally:
             close_all(readers)
         if not is_found:
             where = readers[0].path if len(readers) == 1 else f"any of the {len(readers)} files"
-            matching(where, sorted(flight._definitions_of(readers)), self._selection)  # raises an AddressError
+            # raises an AddressError
+            matching(where, sorted(flight._definitions_of(readers)), self._selection)
 
 
 def _provenance(source: str | None, missing: frozenset[str]) -> Provenance:

@@ -68,7 +68,11 @@ def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict
         base = re.sub(r"[^A-Za-z0-9_-]", "_", path.name.partition(".")[0])[:60] or "flight"
         names = {}
         for vehicle in sorted(vehicles):
-            free = (each for each in (base, *(f"{base}_{number}" for number in range(2, 999))) if each not in taken)
+            free = (
+                each
+                for each in (base, *(f"{base}_{number}" for number in range(2, 999)))
+                if each not in taken
+            )
             names[vehicle] = vehicle if counts[vehicle] == 1 else next(free)
             taken.add(names[vehicle])
         found.append(names)

@@ -48,11 +48,17 @@ def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
         sample, due = each.sample, each.at
         checks.advance(due)
         event_log.add(
-            sample.address, sample.message, due, missing=sample.missing, lost=sample.lost, source=sample.source
+            sample.address,
+            sample.message,
+            due,
+            missing=sample.missing,
+            lost=sample.lost,
+            source=sample.source,
         )
         if is_unix_time(each.time) and not is_unix_time(each.timestamp):
             offset = (each.time - each.timestamp) / 1e6
-            offsets[sample.vehicle] = min(offset, offsets.get(sample.vehicle, math.inf))  # with the least delay
+            # with the least delay
+            offsets[sample.vehicle] = min(offset, offsets.get(sample.vehicle, math.inf))
     checks.end(due)
     event_log.label_first_events()
     return FileEvents(event_log, Times(offsets=offsets), due, ())
@@ -62,7 +68,10 @@ def _received(samples: Iterable[Sample[Any]]) -> Iterator[_Received]:
     topics, streams = {*EVENT_TOPICS}, dict[Address, Address]()
     for sample in samples:
         if not isinstance(sample, Sample):
-            raise ArgumentError("source", sample, "a sample; a list of files contains only str and Path")
+            raise ArgumentError(
+                "source", sample, "a sample; a list of files contains only str and Path"
+            )
         if sample.topic in topics and not sample.retained:
-            stream = streams.setdefault(sample.address, sample.address)  # one object, which identifies the stream
+            # one object, which identifies the stream
+            stream = streams.setdefault(sample.address, sample.address)
             yield _Received(sample, stream, sample.received // 1000, stream)

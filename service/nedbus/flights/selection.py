@@ -21,7 +21,11 @@ def parse_topics(text: str) -> tuple[str, ...]:
 
 def topics_of(names: Collection[str]) -> Set[str] | None:
     """Return the topics of names from `parse_topics`, by default the built-in ones; None means all."""
-    return None if ANY in names else {topic for name in names for topic in _topics_of(name)} or TOPICS.keys()
+    return (
+        None
+        if ANY in names
+        else {topic for name in names for topic in _topics_of(name)} or TOPICS.keys()
+    )
 
 
 def absent_topics(names: Collection[str], topics: Collection[str], where: str) -> list[str]:
@@ -34,7 +38,9 @@ def _topics_of(name: str) -> Set[str]:
     return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 
-def matching(where: Path | str, addresses: Sequence[Address], selection: Selection) -> list[Address]:
+def matching(
+    where: Path | str, addresses: Sequence[Address], selection: Selection
+) -> list[Address]:
     """Return the selected addresses of a flight; raise AddressError if there are none."""
     topics, vehicles = selection.topics, selection.vehicles
     steps: list[tuple[str, object, Selection]] = [
@@ -44,7 +50,9 @@ def matching(where: Path | str, addresses: Sequence[Address], selection: Selecti
     ]
     for part, value, step in steps:
         if not any(map(step.matches, addresses)):
-            raise AddressError(part, value, f"one of {_list(addresses)}", problem=f"is not in {where}")
+            raise AddressError(
+                part, value, f"one of {_list(addresses)}", problem=f"is not in {where}"
+            )
     return list(filter(selection.matches, addresses))
 
 
@@ -55,8 +63,16 @@ def single_match(path: Path, addresses: Sequence[Address], selection: Selection)
     """
     found = matching(path, addresses, selection)
     plain = [address for address in found if address.instance is None]
-    found = plain if len(plain) == 1 and len({(each.vehicle, each.topic) for each in found}) == 1 else found
-    lacking = [part for part in ("topic", "vehicle", "instance") if len({getattr(each, part) for each in found}) > 1]
+    found = (
+        plain
+        if len(plain) == 1 and len({(each.vehicle, each.topic) for each in found}) == 1
+        else found
+    )
+    lacking = [
+        part
+        for part in ("topic", "vehicle", "instance")
+        if len({getattr(each, part) for each in found}) > 1
+    ]
     if lacking:
         problem = f"one stream of {path}, but several match; set {' and '.join(lacking)} to one of {_list(found)}"
         given = {
@@ -72,7 +88,9 @@ def require_one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle
     """Raise AddressError if these addresses, selected by `vehicle`, belong to several vehicles."""
     vehicles = sorted({address.vehicle for address in addresses})
     if len(vehicles) > 1:
-        raise AddressError("vehicle", vehicle, f"one vehicle of {where}: {', '.join(vehicles[:_MAX_NAMED])}")
+        raise AddressError(
+            "vehicle", vehicle, f"one vehicle of {where}: {', '.join(vehicles[:_MAX_NAMED])}"
+        )
 
 
 def _list(addresses: Sequence[Address]) -> str:

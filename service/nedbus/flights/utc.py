@@ -28,7 +28,9 @@ _READ: Final = FieldReader(UTC_COLUMNS)
 
 
 def utc_of(
-    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
+    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]],
+    *,
+    vehicle: str | int = ANY,
 ) -> UtcOffset | None:
     """Return the UTC offset of a log or recording, arrays from `read`, or samples; None if it is unknown.
 
@@ -53,7 +55,9 @@ def utc_of(
 
 
 def find_utc(
-    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
+    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]],
+    *,
+    vehicle: str | int = ANY,
 ) -> UtcOffset | str:
     """Return what `utc_of` returns, or why it is unknown, "" if no message contains UTC."""
     from nedbus.timeline import UtcEstimate
@@ -63,14 +67,20 @@ def find_utc(
         for name, messages in flight.items():
             lacking = (messages.dtype.metadata or {}).get("missing", ())
             provided = set(messages.dtype.names or ()).difference(lacking)
-            estimate.add(name, {each: messages[each] for each in provided.intersection(UTC_COLUMNS)})
+            estimate.add(
+                name, {each: messages[each] for each in provided.intersection(UTC_COLUMNS)}
+            )
         return estimate.result()
     if not isinstance(flight, str | Path):
         samples = [each for each in flight if vehicle in (ANY, each.vehicle)]
         require_one_vehicle("the samples", (each.address for each in samples), vehicle)
         for sample in samples:
             values = zip(UTC_COLUMNS, _READ(sample.message), strict=True)
-            known = {each: [value] for each, value in values if value is not None and each not in sample.missing}
+            known = {
+                each: [value]
+                for each, value in values
+                if value is not None and each not in sample.missing
+            }
             estimate.add(sample.address.stream, known)
         return estimate.result()
     path = Path(flight).expanduser()
@@ -89,7 +99,9 @@ def read_utc(reader: FlightReader) -> dict[str, UtcOffset | str]:
     return found.results(reader)
 
 
-def utc_of_columns(columns: Mapping[Address, Columns], reader: FlightReader) -> dict[str, UtcOffset | str]:
+def utc_of_columns(
+    columns: Mapping[Address, Columns], reader: FlightReader
+) -> dict[str, UtcOffset | str]:
     """Return the UTC offset of each vehicle of a file from columns that were read, or why it is unknown."""
     from nedbus.timeline import UtcEstimate
 
@@ -108,7 +120,8 @@ class FileUtc:
 
         self._estimates = defaultdict[str, UtcEstimate](UtcEstimate)
         self._columns: dict[Address, Columns] = {}  # messages with UTC, not yet in the estimate
-        self._payloads = defaultdict[FileStream, list[Any]](list)  # of records that `watch` has seen
+        # of records that `watch` has seen
+        self._payloads = defaultdict[FileStream, list[Any]](list)
 
     def watch(self, records: Iterable[Record]) -> Iterator[Record]:
         """Yield records on their way to another reader, and add them."""
@@ -129,14 +142,20 @@ class FileUtc:
         if address.topic not in TOPICS:
             return
         if not provides_utc(stream.definition):
-            stamps = [stream.timestamp(payload)[0] or 0 for payload in payloads if not stream.check(payload)]
+            stamps = [
+                stream.timestamp(payload)[0] or 0
+                for payload in payloads
+                if not stream.check(payload)
+            ]
             self._estimates[address.vehicle].add(address.stream, {"timestamp": stamps})
             return
         columns = self._columns.setdefault(address, Columns())
         columns.add(Run(stream, payloads, []))
         if len(columns) >= _BATCH:
             del self._columns[address]
-            self._estimates[address.vehicle].add(address.stream, columns.decode(stream.definition).utc_columns())
+            self._estimates[address.vehicle].add(
+                address.stream, columns.decode(stream.definition).utc_columns()
+            )
 
     def results(self, reader: FlightReader) -> dict[str, UtcOffset | str]:
         """Return the UTC offset of each vehicle, or why it is unknown, at the end of a file."""

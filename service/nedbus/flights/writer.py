@@ -31,10 +31,13 @@ _log = logging.getLogger(__name__)
 _CHUNK: Final = 2**23  # bytes; flushing every second makes smaller chunks
 _MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
 _MAX_CHANNELS: Final = 1000  # per vehicle, so none uses up those of a file; a PX4 has 300 topics
-_MAX_ALL_CHANNELS: Final = 60_000  # of at most 65,535 in an MCAP file, which also has a log channel per vehicle
+# of at most 65,535 in an MCAP file, which also has a log channel per vehicle
+_MAX_ALL_CHANNELS: Final = 60_000
 _MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have larger timestamps
 _END: Final = (
-    struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
+    struct.pack("<BQI", Opcode.DATA_END, 4, 0)
+    + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0)
+    + MCAP0_MAGIC
 )
 
 _ROS2: Final = "offered_qos_profiles"  # metadata that ROS 2 tools expect in a bag
@@ -51,11 +54,14 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-_LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # FATAL, ERROR, WARN, INFO, DEBUG, by PX4's severity
+# FATAL, ERROR, WARN, INFO, DEBUG, by PX4's severity
+_LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)
 
-_Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
+# log time [ns], channel, payload, publish time [ns], sequence number
+_Encoded = tuple[int, int, bytes, int, int]
 _Streams = Iterable[tuple[Address, Provenance]]  # of each message
-_Times = Iterable[tuple[int, int, int]]  # log time [ns], publish time [ns] and sequence number of each message
+# log time [ns], publish time [ns] and sequence number of each message
+_Times = Iterable[tuple[int, int, int]]
 
 
 class RecordingWriter(AbstractContextManager["RecordingWriter"]):
@@ -74,7 +80,12 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     """
 
     def __init__(
-        self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0, starts: Mapping[str, int] | None = None
+        self,
+        path: str | Path,
+        *,
+        chunk_size: int = _CHUNK,
+        boot_utc: int = 0,
+        starts: Mapping[str, int] | None = None,
     ) -> None:
         self.path = Path(path)
         self._boot_utc = boot_utc
@@ -94,7 +105,9 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
             self.path.unlink(missing_ok=True)
             raise
         self._schemas: dict[tuple[str, str], int] = {}  # by type and text
-        self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
+        self._channels: dict[
+            Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]
+        ] = {}
         self._numbers: Counter[str] = Counter()  # of channels, by vehicle
         self._log_channels = dict[str, int]()  # by vehicle; RecordingReader ignores these
 
@@ -109,7 +122,11 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         sequence: Iterable[int] = repeat(0),
     ) -> None:
         """Write messages of one type, each with its stream, log and publish time [ns], and sequence number."""
-        self._add(self._encode(messages, definition, streams, zip(logged, published, sequence, strict=False)))
+        self._add(
+            self._encode(
+                messages, definition, streams, zip(logged, published, sequence, strict=False)
+            )
+        )
 
     def write_messages(self, messages: Iterable[tuple[Message, Address, Provenance, int]]) -> None:
         """Write messages of any types, each with address, provenance and log time [ns], sorted by log time.
@@ -123,7 +140,9 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         for definition, own in by_kind.items():
             array = arrays_of(definition).of([message for message, *_ in own])
             streams = ((address, provenance) for _, address, provenance, _ in own)
-            times = ((logged, min(message.timestamp * 1000, _MAX_TIME), 0) for message, *_, logged in own)
+            times = (
+                (logged, min(message.timestamp * 1000, _MAX_TIME), 0) for message, *_, logged in own
+            )
             encoded += self._encode(array, definition, streams, times)
         self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file sequentially
 
@@ -132,7 +151,9 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
     ) -> Iterator[_Encoded]:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
         channels = self._channels.setdefault(definition, {})
-        for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
+        for index, stream, (logged, published, number) in zip(
+            range(len(messages)), streams, times, strict=False
+        ):
             found = channels.get(stream) or self._new_channel(definition, *stream)
             if found is None:
                 self.omitted += 1
@@ -142,13 +163,27 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
                 payloads = arrays_of(definition).encode_cdr(messages, layout)
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
             size, data = encoded[layout]
-            yield logged, channel, data[index * size : (index + 1) * size], published, max(0, number) % 2**32
+            yield (
+                logged,
+                channel,
+                data[index * size : (index + 1) * size],
+                published,
+                max(0, number) % 2**32,
+            )
             self.messages += 1
             if definition is LogMessage.DEFINITION:
                 text, vehicle = arrays_of(definition).to_message(messages[index]), stream[0].vehicle
                 if vehicle not in self._log_channels:
-                    self._log_channels[vehicle] = self._register(f"/{vehicle}/log", _LOG_TYPE, _LOG_DEFINITION, {})
-                yield logged, self._log_channels[vehicle], _encode_log(vehicle, text, logged), published, 0
+                    self._log_channels[vehicle] = self._register(
+                        f"/{vehicle}/log", _LOG_TYPE, _LOG_DEFINITION, {}
+                    )
+                yield (
+                    logged,
+                    self._log_channels[vehicle],
+                    _encode_log(vehicle, text, logged),
+                    published,
+                    0,
+                )
 
     def _add(self, encoded: Iterable[_Encoded]) -> None:
         with _writing(self.path):
@@ -179,10 +214,19 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self, definition: Definition[Any], address: Address, provenance: Provenance
     ) -> tuple[int, Layout] | None:
         """Return the id and layout of a new channel, None beyond the limit of a vehicle or of the file."""
-        if self._numbers[address.vehicle] >= _MAX_CHANNELS or self._numbers.total() >= _MAX_ALL_CHANNELS:
+        if (
+            self._numbers[address.vehicle] >= _MAX_CHANNELS
+            or self._numbers.total() >= _MAX_ALL_CHANNELS
+        ):
             if not self.omitted:
                 text = "%s: not recording some messages of vehicle %s, which has more than %d topics and provenances"
-                _log.warning(text, self.path, address.vehicle, _MAX_CHANNELS, extra=about("incomplete", address))
+                _log.warning(
+                    text,
+                    self.path,
+                    address.vehicle,
+                    _MAX_CHANNELS,
+                    extra=about("incomplete", address),
+                )
             return None
         self._numbers[address.vehicle] += 1
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
@@ -194,14 +238,18 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
             "missing": " ".join(sorted(provenance.missing)),
         }  # fmt: skip
         metadata = {name: value for name, value in known.items() if value}
-        channel = self._register(f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata)
+        channel = self._register(
+            f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata
+        )
         self._channels[definition][address, provenance] = channel, layout
         return channel, layout
 
     def _register(self, topic: str, name: str, text: str, metadata: dict[str, str]) -> int:
         if (name, text) not in self._schemas:
             self._schemas[name, text] = self._writer.register_schema(name, "ros2msg", text.encode())
-        return self._writer.register_channel(topic, "cdr", self._schemas[name, text], {_ROS2: "", **metadata})
+        return self._writer.register_channel(
+            topic, "cdr", self._schemas[name, text], {_ROS2: "", **metadata}
+        )
 
 
 def _encode_log(vehicle: str, message: LogMessage, time_ns: int) -> bytes:

@@ -11,7 +11,8 @@ EV_BITS: Final = {"position": 1, "height": 2, "velocity": 4, "yaw": 8}
 """Bits of EKF2_EV_CTRL, by quantity."""
 
 _MIN_RATE: Final = 5.0  # Hz; EKF2 starts to fuse if two samples are less than 200 ms apart
-_OLD: Final = 0.2  # s between time_usec and its arrival, beyond which EKF2's buffer does not take a message
+# s between time_usec and its arrival, beyond which EKF2's buffer does not take a message
+_OLD: Final = 0.2
 _MAX_ERROR: Final = 1e-5  # of the norm of q
 USELESS_VARIANCE: Final = 1e4  # m^2; such a measurement has no effect
 _LARGE_RATIO: Final = 20.0  # of a yaw in another order or frame; noise has less
@@ -22,7 +23,9 @@ class Cause:
 
     MOCAP = "estimator_type is MOCAP, which EKF2 does not read (vehicle_mocap_odometry): send VISION (2)"
     TYPE = "PX4 does not support the estimator_type: send VISION (2)"
-    NO_ECHO = "PX4 does not publish what is sent: check the link, and that estimator_type is VISION (2)"
+    NO_ECHO = (
+        "PX4 does not publish what is sent: check the link, and that estimator_type is VISION (2)"
+    )
     STOPPED = "no message arrives any more: the sender has stopped"
     POSE_FRAME = (
         "PX4 does not know the frame of the position: frame_id must be LOCAL_NED (1) or LOCAL_FRD (20), and no"
@@ -34,9 +37,15 @@ class Cause:
     )
     NO_VELOCITY = "the message has no velocity"
     NO_ATTITUDE = "the message has no attitude: q is NaN"
-    QUATERNION = "q is not a unit quaternion within 1e-5: normalise it in double precision, order w, x, y, z"
-    QUATERNION_ORDER = "q is in another order than w, x, y, z, or its heading is of another frame than NED"
-    RATE = "less than 5 messages per second: EKF2 starts only if two are within 200 ms; send 20 to 50"
+    QUATERNION = (
+        "q is not a unit quaternion within 1e-5: normalise it in double precision, order w, x, y, z"
+    )
+    QUATERNION_ORDER = (
+        "q is in another order than w, x, y, z, or its heading is of another frame than NED"
+    )
+    RATE = (
+        "less than 5 messages per second: EKF2 starts only if two are within 200 ms; send 20 to 50"
+    )
     COUNTER = "reset_counter changes with each message: raise it only when the position jumps"
     OLD = (
         "time_usec is {0:.1f} s old: after time synchronisation it counts; use one monotonic clock for it and for the"
@@ -98,7 +107,8 @@ def cause_of(name: str, states: Mapping[str, State], ratio: float, echo: Echo) -
 def _cause_of_disuse(name: str, states: Mapping[str, State], echo: Echo) -> str:
     """Return why EKF2 neither fuses nor rejects a quantity whose fields are right."""
     is_received = states[name] != "not received"
-    is_velocity = name == "velocity" and states["position"] != "not received"  # EKF2 reports it only while it fuses it
+    # EKF2 reports it only while it fuses it
+    is_velocity = name == "velocity" and states["position"] != "not received"
     if echo.ahead:
         cause = Cause.AHEAD.format(echo.ahead)
     elif not is_received and echo.age > _OLD:

@@ -53,7 +53,9 @@ _LARGE_BIAS: Final = 1.0  # m
 _MAX_MESSAGES: Final = 400  # in the window
 _UNSUPPORTED: Final = "ODOMETRY: unsupported"  # PX4's text
 
-_read_aid: Final = FieldReader(("timestamp", "fused", "innovation_rejected", "test_ratio", "estimator_instance"))
+_read_aid: Final = FieldReader(
+    ("timestamp", "fused", "innovation_rejected", "test_ratio", "estimator_instance")
+)
 _FLAG_NAMES: Final = {name: f"cs_ev_{short}" for name, short in QUANTITIES.items()}
 _read_flags: Final = FieldReader(("timestamp", *_FLAG_NAMES.values()))
 _read_estimate: Final = FieldReader(("timestamp", "eph", "xy_valid"))
@@ -84,7 +86,9 @@ _read_received: Final = FieldReader(_Received._fields)
 class _Aid:
     """Messages of one quantity in the window: (time, fused, rejected); and its state."""
 
-    recent: deque[tuple[int, bool, bool]] = field(default_factory=lambda: deque(maxlen=_MAX_MESSAGES))
+    recent: deque[tuple[int, bool, bool]] = field(
+        default_factory=lambda: deque(maxlen=_MAX_MESSAGES)
+    )
     ratio: float = math.nan
     first: int = 0  # of the messages that follow a silence [us]
     state: State = "unknown"
@@ -270,7 +274,8 @@ class FusionTracker:
         return cause.partition(": ")[0]
 
     def _describe_echo(self, sent: PositionStatus | None) -> Echo:
-        is_mocap, is_unsupported = self._is_recent(self._mocap), self._is_recent(self._unsupported, _TEXT_TIME)
+        is_mocap = self._is_recent(self._mocap)
+        is_unsupported = self._is_recent(self._unsupported, _TEXT_TIME)
         is_sent = None if sent is None else sent.rate > 0
         received = self._received
         if received is None or not self._is_recent(self._echo_times[-1]):
@@ -279,7 +284,11 @@ class FusionTracker:
         if received.timestamp_sample:
             age = (received.timestamp - received.timestamp_sample) / 1e6
         times = [each for each in self._echo_times if each >= self.now - _WINDOW - _SILENCE]
-        rate = (len(times) - 1) / max(1e-6, (times[-1] - times[0]) / 1e6) if len(times) > 1 else math.nan
+        rate = (
+            (len(times) - 1) / max(1e-6, (times[-1] - times[0]) / 1e6)
+            if len(times) > 1
+            else math.nan
+        )
         is_ahead = self._newest_sample > self.now + _AHEAD
         is_counting = len(self._changes) == _CONFIRMED and self._changes[0] > self.now - _WINDOW
         return Echo(
@@ -297,7 +306,9 @@ class FusionTracker:
             remarks.append(Cause.VARIANCES)
         bias = math.hypot(*self._bias)
         if states["position"] == "fused" and bias > _LARGE_BIAS:
-            remarks.append(f"with GNSS, EKF2 gives vision a bias of {bias:.1f} m: the estimate follows GNSS")
+            remarks.append(
+                f"with GNSS, EKF2 gives vision a bias of {bias:.1f} m: the estimate follows GNSS"
+            )
         return remarks
 
     def _missing(self, echo: Echo) -> list[str]:
@@ -317,7 +328,9 @@ def _number(value: object) -> float:
 
 def _largest(ratio: object) -> float:
     """Return the largest test ratio of all axes; NaN if one is NaN."""
-    values = [_number(each) for each in ratio] if isinstance(ratio, tuple | list) else [_number(ratio)]
+    values = (
+        [_number(each) for each in ratio] if isinstance(ratio, tuple | list) else [_number(ratio)]
+    )
     if any(map(math.isnan, values)):
         return math.nan
     return max(values, default=math.nan)

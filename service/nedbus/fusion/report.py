@@ -61,7 +61,9 @@ class Fusion:
     @property
     def causes(self) -> tuple[str, ...]:
         """The causes of all quantities, each once."""
-        return tuple(dict.fromkeys(quantity.cause for quantity in self.quantities if quantity.cause))
+        return tuple(
+            dict.fromkeys(quantity.cause for quantity in self.quantities if quantity.cause)
+        )
 
     @property
     def lines(self) -> Sequence[str]:
@@ -70,7 +72,12 @@ class Fusion:
         if self.sent is not None:
             lines.append(f"sent: {self.sent.text}{self._delay_to_set}")
         lines += self._states
-        return [*lines, self._numbers, *self.remarks, *(f"not in the data: {each}" for each in self.missing)]
+        return [
+            *lines,
+            self._numbers,
+            *self.remarks,
+            *(f"not in the data: {each}" for each in self.missing),
+        ]
 
     @property
     def _delay_to_set(self) -> str:

@@ -24,5 +24,7 @@ else:
         "parser": "Received new_parser parse", "senders": "AUTOPILOT NO_HEARTBEAT Senders",
         "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",
     }  # fmt: skip
-    _MODULES = {name: ("mavlink", module) for module, names in _NAMES.items() for name in names.split()}
+    _MODULES = {
+        name: ("mavlink", module) for module, names in _NAMES.items() for name in names.split()
+    }
     __getattr__ = lazy_exports(__name__, _MODULES)

@@ -22,10 +22,13 @@ UNKNOWN_VARIANCE: Final = 1e6
 _EXACT_NORM: Final = 1e-5  # error of the norm of q that EKF2 accepts
 _REPAIRED_NORM: Final = 1e-2  # ... that is normalised, as of quaternions with few decimals
 _EARLY: Final = 0.3  # share of an interval by which a message may be early
-_MAX_SENSOR_AGE: Final = 10.0  # s between timestamp_sample and timestamp; more means that their clocks differ
-_MAX_DELAY: Final = 1.0  # s by which the way on the bus may vary; a larger change is a step of the publisher's clock
+# s between timestamp_sample and timestamp; more means that their clocks differ
+_MAX_SENSOR_AGE: Final = 10.0
+# s by which the way on the bus may vary; a larger change is a step of the publisher's clock
+_MAX_DELAY: Final = 1.0
 _STEADY: Final = 0.05  # s by which it varies after such a step ...
-_STEADY_TIME: Final = 0.3  # s ... for this time, until the step counts: a backlog does not last as long
+# s ... for this time, until the step counts: a backlog does not last as long
+_STEADY_TIME: Final = 0.3
 _WINDOW: Final = 30.0  # s after which the shortest delay is measured anew, because clocks drift
 _TAKEOVER: Final = 1.0  # s of silence of a sender until another one is used
 _JUMP: Final = 1.0  # m
@@ -210,7 +213,8 @@ class ExternalPosition:
         delay = self._delay.add(timestamp / 1e6, now)
         if delay is None:
             text = (
-                f"timestamp {timestamp} is not the expected time: the clock of the sender has been stepped, or stalled"
+                f"timestamp {timestamp} is not the expected time: "
+                "the clock of the sender has been stepped, or stalled"
             )
             raise _RefusedError("clock", f"{text}; use a monotonic clock")
         if self._delay.was_stepped:
@@ -246,11 +250,16 @@ class ExternalPosition:
         self._changes.append(has_changed)
         if len(self._changes) == _COUNTS_MESSAGES and all(self._changes):
             text = (
-                f"reset_counter {odometry.reset_counter} changes with each message: raise it only when position jumps"
+                f"reset_counter {odometry.reset_counter} changes with each message: "
+                "raise it only when position jumps"
             )
             raise _RefusedError("reset_counter", text)
         distance = math.dist(before.position, odometry.position)
-        if has_changed or distance <= _JUMP or not _is_jump(before, odometry, distance, (timestamp - then) / 1e6):
+        if (
+            has_changed
+            or distance <= _JUMP
+            or not _is_jump(before, odometry, distance, (timestamp - then) / 1e6)
+        ):
             self.warnings.pop("jump", None)
             return
         self.warnings["jump"] = (
@@ -261,7 +270,9 @@ class ExternalPosition:
     def _check_rate(self, now: float) -> None:
         interval = 1 / MAX_RATE
         if now < self._due - _EARLY * interval:
-            raise _RefusedError("rate", f"more than {MAX_RATE:.0f} per second: the others are left out")
+            raise _RefusedError(
+                "rate", f"more than {MAX_RATE:.0f} per second: the others are left out"
+            )
         self._due = max(self._due, now - interval) + interval
 
     def _warn_of_rate(self) -> None:
@@ -274,7 +285,10 @@ class ExternalPosition:
 
 def _is_jump(before: Odometry, odometry: Odometry, distance: float, seconds: float) -> bool:
     """Return whether a vehicle cannot have moved by this distance [m] between two known positions."""
-    if before.pose_variances[0] >= UNKNOWN_VARIANCE or odometry.pose_variances[0] >= UNKNOWN_VARIANCE:
+    if (
+        before.pose_variances[0] >= UNKNOWN_VARIANCE
+        or odometry.pose_variances[0] >= UNKNOWN_VARIANCE
+    ):
         return False
     speed = _MAX_SPEED
     for each in (before, odometry):
@@ -291,7 +305,8 @@ class _Delay:
 
     def __init__(self) -> None:
         self.was_stepped = False
-        self._shortest = self._previous = math.inf  # offset between the clocks, in this and the previous window
+        # offset between the clocks, in this and the previous window
+        self._shortest = self._previous = math.inf
         self._window = -math.inf
         self._candidate, self._since = math.inf, 0.0
 
@@ -357,7 +372,8 @@ def _of_local_position(position: VehicleLocalPosition) -> Odometry:
     """Convert a position in NED, with the attitude of a level vehicle; what is not valid gets UNKNOWN_VARIANCE."""
     if not (position.xy_valid or position.z_valid or position.v_xy_valid or position.v_z_valid):
         raise _RefusedError(
-            "validity", "xy_valid, z_valid, v_xy_valid and v_z_valid are false: there is nothing to send"
+            "validity",
+            "xy_valid, z_valid, v_xy_valid and v_z_valid are false: there is nothing to send",
         )
     horizontal, vertical = _square("eph", position.eph) / 2, _square("epv", position.epv)
     where, variances = _valid(
@@ -393,7 +409,10 @@ def _valid(
     values, variances = list[float](), list[float]()
     for name, value, variance, is_valid in axes:
         if is_valid and not math.isfinite(value):
-            raise _RefusedError(name, f"{name} is {value} although it is valid: mark it as not valid, or leave it out")
+            raise _RefusedError(
+                name,
+                f"{name} is {value} although it is valid: mark it as not valid, or leave it out",
+            )
         values.append(value if math.isfinite(value) else 0.0)
         variances.append(variance if is_valid else UNKNOWN_VARIANCE)
     return (values[0], values[1], values[2]), (variances[0], variances[1], variances[2])
@@ -432,7 +451,9 @@ def _variances(name: str, values: Sequence[float]) -> Sequence[float]:
 def _square(name: str, deviation: float) -> float:
     """Return the variance of a standard deviation."""
     if deviation < 0:
-        raise _RefusedError("variance", f"{name} is {deviation:g}: set a standard deviation above 0, or NaN")
+        raise _RefusedError(
+            "variance", f"{name} is {deviation:g}: set a standard deviation above 0, or NaN"
+        )
     return min(deviation * deviation, UNKNOWN_VARIANCE) if math.isfinite(deviation) else math.nan
 
 

@@ -11,12 +11,17 @@ from nedbus_msgs.frames import euler_to_quaternion, quaternion_to_euler, wrap
 
 _U8: Final = 2**8 - 1  # "unknown", or more
 _U16: Final = 2**16 - 1  # "unknown" in most fields of this type
-_WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # MAV_BATTERY_CHARGE_STATE to `warning`
-_FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: standby, active, critical
+# MAV_BATTERY_CHARGE_STATE to `warning`
+_WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}
+# MAV_STATE to `failsafe`: standby, active, critical
+_FAILSAFE: Final = {3: False, 4: False, 5: True}
 _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # 12: body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
-_TRANSITIONS: Final = {dialect.MAV_VTOL_STATE_TRANSITION_TO_FW, dialect.MAV_VTOL_STATE_TRANSITION_TO_MC}
+_TRANSITIONS: Final = {
+    dialect.MAV_VTOL_STATE_TRANSITION_TO_FW,
+    dialect.MAV_VTOL_STATE_TRANSITION_TO_MC,
+}
 _VTOL_STATES: Final = {*_TRANSITIONS, dialect.MAV_VTOL_STATE_FW, dialect.MAV_VTOL_STATE_MC}
 _MULTICOPTERS: Final = {
     dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_COAXIAL, dialect.MAV_TYPE_HELICOPTER, dialect.MAV_TYPE_HEXAROTOR,
@@ -71,7 +76,8 @@ def _gps(message: Any) -> dict[str, object]:
     course = _number(message.cog, 100, _U16)
     heading = _number(message.yaw, 100, 0, _U16)
     return {
-        "fix_type": message.fix_type if message.fix_type <= 6 else None,  # above 6 MAVLink and PX4 differ
+        # above 6 MAVLink and PX4 differ
+        "fix_type": message.fix_type if message.fix_type <= 6 else None,
         "latitude_deg": message.lat / 1e7, "longitude_deg": message.lon / 1e7, "altitude_msl_m": message.alt / 1e3,
         "altitude_ellipsoid_m": _number(message.alt_ellipsoid, 1e3, 0),
         "eph": _number(message.h_acc, 1e3, 0), "epv": _number(message.v_acc, 1e3, 0),
@@ -115,7 +121,9 @@ def vtol_status(state: int) -> dict[str, object]:
     is_fixed_wing = state == dialect.MAV_VTOL_STATE_FW
     return {
         "is_vtol": True,
-        "vehicle_type": model.VEHICLE_TYPE_FIXED_WING if is_fixed_wing else model.VEHICLE_TYPE_ROTARY_WING,
+        "vehicle_type": model.VEHICLE_TYPE_FIXED_WING
+        if is_fixed_wing
+        else model.VEHICLE_TYPE_ROTARY_WING,
         "in_transition_mode": state in _TRANSITIONS,
         "in_transition_to_fw": state == dialect.MAV_VTOL_STATE_TRANSITION_TO_FW,
     }
@@ -136,7 +144,8 @@ def _battery(message: Any) -> dict[str, object]:
 
 def _odometry(message: Any) -> dict[str, object]:
     """Convert ODOMETRY; pose and velocity only in frames that PX4 supports."""
-    pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
+    pose = _POSE_FRAMES.get(message.frame_id)
+    velocity = _VELOCITY_FRAMES.get(message.child_frame_id)
     of_pose = {
         "pose_frame": pose, "position": (message.x, message.y, message.z), "q": _quaternion(*message.q),
         "position_variance": _variances(message.pose_covariance, 0, 6, 11),
@@ -173,7 +182,9 @@ def _status_of_high_latency(message: Any) -> dict[str, object]:
     if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
         model = MESSAGES["VehicleStatus"].model
         is_armed = message.custom0 & _ARMED
-        fields["arming_state"] = model.ARMING_STATE_ARMED if is_armed else model.ARMING_STATE_DISARMED
+        fields["arming_state"] = (
+            model.ARMING_STATE_ARMED if is_armed else model.ARMING_STATE_DISARMED
+        )
     return fields
 
 
@@ -188,7 +199,10 @@ CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]]
     ),
     "GLOBAL_POSITION_INT": ("vehicle_global_position", _global_position),
     "ATTITUDE_QUATERNION": ("vehicle_attitude", _attitude),
-    "ATTITUDE": ("vehicle_attitude", lambda each: {"q": euler_to_quaternion(each.roll, each.pitch, each.yaw)}),
+    "ATTITUDE": (
+        "vehicle_attitude",
+        lambda each: {"q": euler_to_quaternion(each.roll, each.pitch, each.yaw)},
+    ),
     "ODOMETRY": ("vehicle_odometry", _odometry),
     "HOME_POSITION": ("home_position", _home),
     "EXTENDED_SYS_STATE": (

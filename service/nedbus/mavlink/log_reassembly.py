@@ -11,7 +11,8 @@ _NO_RECORD_BEGINS: Final = 255  # first_message_offset
 _MODULUS: Final = 2**16  # modulus of the sequence
 _MAX_STEP: Final = 2**15  # a larger sequence step means a duplicate
 _MARGIN: Final = 100  # messages that may be lost at once; PX4 loses up to 65 in a burst
-_BUFFERED: Final = 1.0  # s of messages that a full buffer on the way may drop without a visible pause
+# s of messages that a full buffer on the way may drop without a visible pause
+_BUFFERED: Final = 1.0
 _OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _MAX_STEP
 
 Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
@@ -51,7 +52,8 @@ class Reassembly:
 
     def __init__(self) -> None:
         self._old_next = self._old_run = 0
-        self._first = b""  # data of the first message, to distinguish its retransmission from a new stream
+        # data of the first message, to distinguish its retransmission from a new stream
+        self._first = b""
         self._last: int | None = None  # last sequence; None before the first stream
         self._synchronised = False
         self._rate = PacketRate()
@@ -66,14 +68,21 @@ class Reassembly:
         self._last, self._synchronised = sequence, False
 
     def add(
-        self, sequence: int, length: int, first_message_offset: int, data: Sequence[int], now: float | None = None
+        self,
+        sequence: int,
+        length: int,
+        first_message_offset: int,
+        data: Sequence[int],
+        now: float | None = None,
     ) -> Chunk:
         """Add the next message; `data` may lack trailing zeros, which MAVLink 2 does not transmit.
 
         `now`: time of arrival [s]; without it, each loss is taken as the sequence shows it.
         """
         content = bytes(data[:length]).ljust(length, b"\0")
-        if length > _MAX_LENGTH or (first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS):
+        if length > _MAX_LENGTH or (
+            first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS
+        ):
             return Chunk("malformed")
         if sequence == 0 and content.startswith(_MAGIC) and content != self._first:
             self._first = content

@@ -42,7 +42,14 @@ class Received(NamedTuple):
         Acknowledged data is never joined, because it may wait longer.
         """
         one, two = before.chunk, self.chunk
-        if one is None or two is None or two.begins or two.lost or self.lost or self.peer != before.peer:
+        if (
+            one is None
+            or two is None
+            or two.begins
+            or two.lost
+            or self.lost
+            or self.peer != before.peer
+        ):
             return False
         if not one.verdict == two.verdict == "delivered":
             return False
@@ -50,7 +57,9 @@ class Received(NamedTuple):
         return kinds == ("LOGGING_DATA", "LOGGING_DATA")
 
 
-def parse(parser: Any, data: bytes, name: str, peer: Any, now: float) -> Iterator[Received | Rejection]:
+def parse(
+    parser: Any, data: bytes, name: str, peer: Any, now: float
+) -> Iterator[Received | Rejection]:
     """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival.
 
     The sender is looked at before the checksum: a damaged message of an ignored component is ignored, too.
@@ -103,12 +112,18 @@ class _Layout(NamedTuple):
 def _layout_of(message: Any) -> _Layout:
     """Return the layout of a message; without fields, as if the dialect lacked it, if nedbus does not use it."""
     # Pymavlink would raise an AttributeError for absent times, which takes longer than to read present ones.
-    fields: dict[str, Any] = {"time_boot_ms": (lambda _: (None,), False), "time_usec": (lambda _: (0,), False)}
+    fields: dict[str, Any] = {
+        "time_boot_ms": (lambda _: (None,), False),
+        "time_usec": (lambda _: (0,), False),
+    }
     if message.msgname not in DECODED:
         return _Layout(f"UNKNOWN_{message.id}", bytes([message.crc_extra]), None, 0, fields)
     offset = 0
     for name, code, length in zip(
-        message.ordered_fieldnames, message.native_format.decode()[1:], message.array_lengths, strict=True
+        message.ordered_fieldnames,
+        message.native_format.decode()[1:],
+        message.array_lengths,
+        strict=True,
     ):
         unpack = struct.Struct(f"<{offset}x{length or 1}{'s' if code == 'c' else code}")
         key = f"_{name}_raw" if code == "c" else name  # pymavlink's name of the bytes of a text
@@ -116,11 +131,17 @@ def _layout_of(message: Any) -> _Layout:
         offset = unpack.size
     if message.msgname == HIGH_LATENCY:
         fields["time_boot_ms"] = fields["timestamp"]
-    return _Layout(message.msgname, bytes([message.crc_extra]), message.instance_field, offset, fields)
+    return _Layout(
+        message.msgname, bytes([message.crc_extra]), message.instance_field, offset, fields
+    )
 
 
-_LAYOUTS: Final[Mapping[int, _Layout]] = {number: _layout_of(each) for number, each in dialect.mavlink_map.items()}
-_LOG_DATA: Final = {number for number, each in _LAYOUTS.items() if each.name.startswith("LOGGING_DATA")}
+_LAYOUTS: Final[Mapping[int, _Layout]] = {
+    number: _layout_of(each) for number, each in dialect.mavlink_map.items()
+}
+_LOG_DATA: Final = {
+    number for number, each in _LAYOUTS.items() if each.name.startswith("LOGGING_DATA")
+}
 
 
 class _Frame:
@@ -174,7 +195,14 @@ class _Frame:
 class _LogData(_Frame):
     """LOGGING_DATA or LOGGING_DATA_ACKED, of which all fields are read."""
 
-    __slots__ = ("data", "first_message_offset", "length", "sequence", "target_component", "target_system")
+    __slots__ = (
+        "data",
+        "first_message_offset",
+        "length",
+        "sequence",
+        "target_component",
+        "target_system",
+    )
 
     def __init__(self, number: int, layout: _Layout, frame: bytes, payload: bytes) -> None:
         self._number = number
@@ -182,7 +210,13 @@ class _LogData(_Frame):
         self._frame = frame
         payload = payload.ljust(_LOG_HEADER.size, b"\0")  # zeros are not sent
         fields = _LOG_HEADER.unpack_from(payload)
-        self.sequence, self.target_system, self.target_component, self.length, self.first_message_offset = fields
+        (
+            self.sequence,
+            self.target_system,
+            self.target_component,
+            self.length,
+            self.first_message_offset,
+        ) = fields
         self.data = payload[_LOG_HEADER.size :]
 
 
@@ -192,7 +226,12 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
     def parse_buffer(self, data: bytes) -> Any:
         """Return the messages that these bytes complete, None without any."""
         size = len(data) - _HEADER - 2
-        if size < 0 or data[:3] != bytes([dialect.PROTOCOL_MARKER_V2, size % 256, 0]) or size > 255 or self.buf_len():
+        if (
+            size < 0
+            or data[:3] != bytes([dialect.PROTOCOL_MARKER_V2, size % 256, 0])
+            or size > 255
+            or self.buf_len()
+        ):
             return super().parse_buffer(data)
         try:
             return (self.decode(data),)
@@ -208,10 +247,14 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
         end = len(msgbuf) - _CHECKSUM
         if is_v2 and msgbuf[2] & dialect.MAVLINK_IFLAG_SIGNED:
             end -= _SIGNATURE
-        if dialect.x25crc(msgbuf[1:end] + layout.extra).crc != int.from_bytes(msgbuf[end : end + _CHECKSUM], "little"):
+        if dialect.x25crc(msgbuf[1:end] + layout.extra).crc != int.from_bytes(
+            msgbuf[end : end + _CHECKSUM], "little"
+        ):
             raise dialect.MAVError("invalid CRC")
         kind = _LogData if number in _LOG_DATA else _Frame
-        return kind(number, layout, bytes(msgbuf), bytes(msgbuf[_HEADER if is_v2 else _OLD_HEADER : end]))
+        return kind(
+            number, layout, bytes(msgbuf), bytes(msgbuf[_HEADER if is_v2 else _OLD_HEADER : end])
+        )
 
 
 def new_parser(senders: Senders | None = None) -> Any:

@@ -11,7 +11,9 @@ from .fields import DECODED, HIGH_LATENCY
 
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations should have others
 
-_BROADCAST: Final = "id 0 is for broadcast only; an autopilot has system id 1 to 255 and component id 1"
+_BROADCAST: Final = (
+    "id 0 is for broadcast only; an autopilot has system id 1 to 255 and component id 1"
+)
 _OTHER_COMPONENT: Final = f"not an autopilot, which has component id {AUTOPILOT}"
 NO_HEARTBEAT: Final = "not known to be an autopilot, because no HEARTBEAT has arrived"
 """Why a message of a sender is ignored that may identify itself later."""

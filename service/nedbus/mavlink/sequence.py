@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from typing import Final
 
 _MODULUS: Final = 256  # of MAVLink's sequence
-_FACTOR: Final = 4.0  # times the usual rate; a faster jump of the sequence is a restart of the sender's counter
+# times the usual rate; a faster jump of the sequence is a restart of the sender's counter
+_FACTOR: Final = 4.0
 _MARGIN: Final = 20  # packets that may be lost at once, whatever the rate
 _MAX_OVERTAKEN: Final = 8  # packets that one packet of the same link overtakes
 _SILENCE: Final = 3.0  # s after which the sequence has no relation to the earlier one

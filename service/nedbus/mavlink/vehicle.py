@@ -30,13 +30,16 @@ _FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _UNKNOWN_HEADING: Final = 65535
 _MAX_LATITUDE: Final = 90e7  # 1e-7 deg
-_HEARTBEAT_TIMEOUT: Final = 10.0  # s without a HEARTBEAT until a link with HIGH_LATENCY2 is a satellite link
+# s without a HEARTBEAT until a link with HIGH_LATENCY2 is a satellite link
+_HEARTBEAT_TIMEOUT: Final = 10.0
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
 _DEBUG: Final = 7
-_HANDOVER: Final = 0.5  # s without a new message on the first link after which another one is the first
-_LINK_TIMEOUT: Final = 2.0  # s without a new message on the first link after which messages without a time are used
+# s without a new message on the first link after which another one is the first
+_HANDOVER: Final = 0.5
+# s without a new message on the first link after which messages without a time are used
+_LINK_TIMEOUT: Final = 2.0
 _SENT_ONCE: Final = frozenset({"sensor_gps", "vehicle_odometry"})  # their messages have `time_usec`
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -105,7 +108,12 @@ class Vehicle:
     """
 
     def __init__(
-        self, name: str, topics: Collection[str] | None = None, *, rate: float = 30.0, baud: int | None = None
+        self,
+        name: str,
+        topics: Collection[str] | None = None,
+        *,
+        rate: float = 30.0,
+        baud: int | None = None,
     ) -> None:
         self._name = name
         self._topics = topics or TOPICS
@@ -118,19 +126,24 @@ class Vehicle:
         self._first_link: int | None = None  # the link that delivers new messages first
         self._led = -math.inf  # time of its last new message
         self._last_message = 0.0
-        self._last_heartbeat = self._high_latency = -math.inf  # time of the last HEARTBEAT and HIGH_LATENCY2
-        self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
+        # time of the last HEARTBEAT and HIGH_LATENCY2
+        self._last_heartbeat = self._high_latency = -math.inf
+        # `_certain`: those before the last LOGGING_DATA, which are not of the stream
+        self.lost = self._certain = 0
         self.rebooted = False
         self._text_source: str | None = None  # of its log messages, if it is not PX4
-        self._kind: TimeKind | None = None  # what the time of the last message shows; None if it has none
+        # what the time of the last message shows; None if it has none
+        self._kind: TimeKind | None = None
         self._text_limit, self._text_address = RateLimit(), Address(name, LOG_MESSAGE.name)
         self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
         """Discard all state and request everything again, after silence or a reboot."""
-        self._stored: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
-        self._last: dict[Address, tuple[int, int]] = {}  # newest timestamps, and the links that delivered them
+        # fields of earlier messages, and their expiry
+        self._stored: dict[str, tuple[dict[str, object], float]] = {}
+        # newest timestamps, and the links that delivered them
+        self._last: dict[Address, tuple[int, int]] = {}
         self._delivered = RecentTimes()
         self._texts = _StatusTexts()
         self._started = now
@@ -138,7 +151,9 @@ class Vehicle:
         self._pending = [*self._rates] * _FIRST_ROUNDS
         self._next_round = now + _REQUEST_INTERVAL
 
-    def count_lost(self, lost: int, now: float, *, counted: int | None = None, link: int = 0) -> None:
+    def count_lost(
+        self, lost: int, now: float, *, counted: int | None = None, link: int = 0
+    ) -> None:
         """Count the messages of any type lost before one that arrived at `now`; a negative number corrects the count.
 
         `counted`: those that the ULog stream has counted, if this is one of its messages. `link`: its number, from 0,
@@ -172,11 +187,16 @@ class Vehicle:
             return None
         if not self._pending and now >= self._next_round:
             self._next_round = now + _REQUEST_INTERVAL
-            self._pending = [each for each in self._rates if now - self._arrivals.get(each, 0.0) > _SILENCE_TIMEOUT]
+            self._pending = [
+                each
+                for each in self._rates
+                if now - self._arrivals.get(each, 0.0) > _SILENCE_TIMEOUT
+            ]
             # No report for the origin, which the vehicle sends only once it has a global position.
             for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
                 self._reported.add(number)
-                name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
+                name = dialect.mavlink_map[number].msgname
+                address = Address(self._name, DEFAULT_TOPIC)
                 extra = about("unsupported", address)
                 _log.info("vehicle %s does not send %s on request", self._name, name, extra=extra)
         if not self._pending:
@@ -211,7 +231,9 @@ class Vehicle:
         ]
         return [item for item in items if item is not None]
 
-    def handle(self, message: Any, now: float, log: StreamedTopics | None = None) -> SourceMessage | Rejection | None:
+    def handle(
+        self, message: Any, now: float, log: StreamedTopics | None = None
+    ) -> SourceMessage | Rejection | None:
         """Convert a message; return a Rejection if it is out of order, or there are too many texts.
 
         Return None if no chosen topic needs it, or `log`, the vehicle's ULog stream, delivers that topic.
@@ -226,10 +248,17 @@ class Vehicle:
             return None
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
-        is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
+        is_redundant = (
+            kind == "ATTITUDE"
+            and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
+        )
         self._store_fields(kind, message, timestamp, now)
         address = self._text_address
-        if kind == "STATUSTEXT" and address.topic in self._topics and not (log and log.delivers(address)):
+        if (
+            kind == "STATUSTEXT"
+            and address.topic in self._topics
+            and not (log and log.delivers(address))
+        ):
             if not self._text_limit.admits(round(now * 1e6)):
                 return Rejection(str(address), "more than 100 log messages per second", address)
             self._texts.add(message, now)
@@ -241,7 +270,8 @@ class Vehicle:
         address = self._address(topic, message.id if kind == "BATTERY_STATUS" else 0)
         if kind in CONVERSIONS and log is not None and log.delivers(address):
             return None
-        return self._publish(address, fields_of(message), timestamp, now, log)  # a text is discarded only now
+        # a text is discarded only now
+        return self._publish(address, fields_of(message), timestamp, now, log)
 
     def _is_copy(self, now: float) -> bool:
         """Return whether the last message came before; one without a time did if it is of a link behind the first."""
@@ -262,7 +292,12 @@ class Vehicle:
         return Address(self._name, topic, instance if TOPICS[topic].instances else None)
 
     def _publish(
-        self, address: Address, fields: Mapping[str, object], timestamp: int, now: float, log: StreamedTopics | None
+        self,
+        address: Address,
+        fields: Mapping[str, object],
+        timestamp: int,
+        now: float,
+        log: StreamedTopics | None,
     ) -> SourceMessage | Rejection | None:
         """Return the message of an address, from which unknown fields are left out; see `handle`."""
         fields = {name: value for name, value in fields.items() if value is not None}
@@ -272,7 +307,8 @@ class Vehicle:
             self.copies += 1
             return None
         last, link = self._last.get(address, (0, self._link))
-        if timestamp < last and link != self._link:  # a second link's times need not be equal to those of the first
+        # a second link's times need not be equal to those of the first
+        if timestamp < last and link != self._link:
             self.copies += 1
             return None
         if timestamp < last and self.clock.is_doubtful:
@@ -292,7 +328,8 @@ class Vehicle:
             case "GLOBAL_POSITION_INT":
                 is_known = message.hdg != _UNKNOWN_HEADING
                 heading = {"heading": wrap(math.radians(message.hdg / 100))} if is_known else {}
-                self._store("heading", now + _VALUE_TIMEOUT, **heading)  # an unknown heading ends the earlier one
+                # an unknown heading ends the earlier one
+                self._store("heading", now + _VALUE_TIMEOUT, **heading)
             case "ATTITUDE":
                 yaw = {"heading": wrap(message.yaw)} if math.isfinite(message.yaw) else {}
                 self._store("yaw", now + _VALUE_TIMEOUT, **yaw)
@@ -320,15 +357,28 @@ class Vehicle:
                 self._store("velocity", now + _VALUE_TIMEOUT, **known)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
-                known = {name: value for name, value in deviations.items() if math.isfinite(value) and value > 0}
+                known = {
+                    name: value
+                    for name, value in deviations.items()
+                    if math.isfinite(value) and value > 0
+                }
                 valid = _validity(message.flags)
                 self._store("status", now + _STATUS_TIMEOUT, **valid, **known)
                 is_global = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS)
-                on_globe = {"lat_lon_valid": valid["xy_valid"] and is_global, "alt_valid": valid["z_valid"]}
+                on_globe = {
+                    "lat_lon_valid": valid["xy_valid"] and is_global,
+                    "alt_valid": valid["z_valid"],
+                }
                 self._store("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
-                names = [f"onboard_control_sensors_{part}" for part in ("present", "enabled", "health")]
-                self._store("sensors", now + _STATUS_TIMEOUT, **{name: getattr(message, name) for name in names})
+                names = [
+                    f"onboard_control_sensors_{part}" for part in ("present", "enabled", "health")
+                ]
+                self._store(
+                    "sensors",
+                    now + _STATUS_TIMEOUT,
+                    **{name: getattr(message, name) for name in names},
+                )
             case "EXTENDED_SYS_STATE":
                 self._store("vtol", now + _STATUS_TIMEOUT, **vtol_status(message.vtol_state))
             case "SYSTEM_TIME" if timestamp is not None and is_unix_time(message.time_unix_usec):
@@ -341,14 +391,18 @@ class Vehicle:
         fields, until = self._stored.get(name, ({}, 0.0))
         return fields if now <= until else {}
 
-    def _add_stored_fields(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
+    def _add_stored_fields(
+        self, topic: str, fields: dict[str, object], timestamp: int, now: float
+    ) -> None:
         match topic:
             case "vehicle_local_position":
                 for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
                     fields |= self._recall(name, now)
                 # The flags are from an earlier message; the fields may have become NaN since.
                 for flag, names in DEFAULT.flags.items():
-                    if fields.get(flag) and not all(math.isfinite(cast("float", fields[name])) for name in names):
+                    if fields.get(flag) and not all(
+                        math.isfinite(cast("float", fields[name])) for name in names
+                    ):
                         fields[flag] = False
             case "vehicle_global_position":
                 fields |= self._recall("global status", now)
@@ -440,5 +494,7 @@ class _StatusTexts:
         return self._waiting.popleft() if self._waiting else {}
 
     def _finish(self, end: str = "") -> None:
-        self._waiting.append({"severity": self._current[0], "text": to_log_text(decode_text(self._data) + end)})
+        self._waiting.append(
+            {"severity": self._current[0], "text": to_log_text(decode_text(self._data) + end)}
+        )
         self._data, self._next = b"", 0

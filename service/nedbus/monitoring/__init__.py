@@ -15,4 +15,12 @@ if TYPE_CHECKING:
 else:
     __getattr__ = lazy_exports(__name__, {"Exporter": ("metrics", "exporter")})
 
-__all__ = ["Exporter", "HttpServer", "Page", "Snapshot", "service_pages", "why_not_ready", "why_refused"]
+__all__ = [
+    "Exporter",
+    "HttpServer",
+    "Page",
+    "Snapshot",
+    "service_pages",
+    "why_not_ready",
+    "why_refused",
+]

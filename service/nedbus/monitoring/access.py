@@ -8,12 +8,17 @@ from contextlib import suppress
 from functools import cache
 from typing import Final
 
-_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # scrapers and probes may use any host name
+# scrapers and probes may use any host name
+_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}
 _HOST: Final = re.compile(r"(\[[^\]]*\]|[^:]*)(?::\d*)?")
 
 
 def why_refused(
-    path: str, values_of: Callable[[str], Sequence[str]], *, is_local: bool, origins: Collection[str] = ()
+    path: str,
+    values_of: Callable[[str], Sequence[str]],
+    *,
+    is_local: bool,
+    origins: Collection[str] = (),
 ) -> str:
     """Return why a request is refused, "" if it is accepted.
 
@@ -31,11 +36,15 @@ def why_refused(
     if len(hosts) > 1:
         return "more than one Host header"
     is_any_name = path in _ANY_NAME and not is_local
-    if not all(is_any_name or host in origins or _is_own_name(host, is_local=is_local) for host in hosts):
+    if not all(
+        is_any_name or host in origins or _is_own_name(host, is_local=is_local) for host in hosts
+    ):
         return f"{path[:100]} is only served under an IP address or a name of this host"
     if any(origin.partition("//")[2] not in (*hosts, *origins) for origin in values_of("Origin")):
         return "request of a page from another host"
-    if "cross-site" in values_of("Sec-Fetch-Site") and "document" not in values_of("Sec-Fetch-Dest"):
+    if "cross-site" in values_of("Sec-Fetch-Site") and "document" not in values_of(
+        "Sec-Fetch-Dest"
+    ):
         return "cross-site request"
     return ""
 
@@ -45,7 +54,9 @@ def _is_own_name(host: str, *, is_local: bool) -> bool:
     name = found[1].strip("[]").lower().removesuffix(".") if found else ""
     with suppress(ValueError):
         return bool(ipaddress.ip_address(name))
-    return name == "localhost" or name in _names() or (name != "" and "." not in name and not is_local)
+    return (
+        name == "localhost" or name in _names() or (name != "" and "." not in name and not is_local)
+    )
 
 
 @cache

@@ -19,7 +19,14 @@ from nedbus.vehicle_events import report_of
 from nedbus_msgs import Selection
 
 from .http_server import Page
-from .metrics import MeasuredStream, build_info, make_metrics, metrics_page, stream_metrics, vehicle_metrics
+from .metrics import (
+    MeasuredStream,
+    build_info,
+    make_metrics,
+    metrics_page,
+    stream_metrics,
+    vehicle_metrics,
+)
 from .observer import Observer
 from .pages import vehicles_page
 
@@ -67,7 +74,9 @@ class Exporter(Observer):
         counts = self.subscription.counts
         streams = [
             MeasuredStream(
-                (address.vehicle, address.stream, each.sample.source or ""), each.health, latencies=latencies
+                (address.vehicle, address.stream, each.sample.source or ""),
+                each.health,
+                latencies=latencies,
             )
             for address, each in self.monitor.items()
             if (latencies := self.monitor.latencies(address)) is not None
@@ -101,32 +110,54 @@ class Exporter(Observer):
             if time.monotonic() >= due:
                 states: list[RouterState] = []
                 with suppress(NedbusError):  # the router is full, or the link is down
-                    self._session = self._session or self._bus.open_session(timeout=TIMINGS.routers_session)
+                    self._session = self._session or self._bus.open_session(
+                        timeout=TIMINGS.routers_session
+                    )
                     if not stop.is_set():
                         states = query_routers(self._session, timeout=TIMINGS.routers_timeout)
                 self._routers = states[:_MAX_ROUTERS]
                 due = time.monotonic() + TIMINGS.routers_interval
             elif self._session is not None and self._has_mavlink():
                 with suppress(NedbusError):
-                    services = find_services(self._session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout)
+                    services = find_services(
+                        self._session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout
+                    )
                     sources = [source for each in services for source in each.sources]
-                    self.log_streams = {log.vehicle: log for source in sources for log in source.log_streams}
-                    self.positions = {sent.vehicle: sent for source in sources for sent in source.positions}
+                    self.log_streams = {
+                        log.vehicle: log for source in sources for log in source.log_streams
+                    }
+                    self.positions = {
+                        sent.vehicle: sent for source in sources for sent in source.positions
+                    }
         if self._session is not None:
             self._session.close()
 
     def _has_mavlink(self) -> bool:
-        return any((each.sample.source or "").startswith("mavlink") for each in self.monitor.values())
+        return any(
+            (each.sample.source or "").startswith("mavlink") for each in self.monitor.values()
+        )
 
     def _status(self) -> dict[str, Any]:
-        streams = {str(address): asdict(health) for address, health in self.monitor.snapshot().items()}
-        return {"connected": self._bus.connected, **asdict(self.subscription.counts), "streams": streams}
+        streams = {
+            str(address): asdict(health) for address, health in self.monitor.snapshot().items()
+        }
+        return {
+            "connected": self._bus.connected,
+            **asdict(self.subscription.counts),
+            "streams": streams,
+        }
 
     def _faults(self) -> list[str]:
-        return [] if self._bus.connected else [f"no router answers at {' or '.join(self._bus.routers)}"]
+        return (
+            []
+            if self._bus.connected
+            else [f"no router answers at {' or '.join(self._bus.routers)}"]
+        )
 
     def _vehicles(self) -> Page:
         if not self._bus.connected:
             return Page.verdict(self._faults(), "")
         host, now = socket.gethostname(), clock.steady()
-        return vehicles_page(report_of(self.event_log, "export", host, now, within=0.0, to_utc=clock.to_utc()))
+        return vehicles_page(
+            report_of(self.event_log, "export", host, now, within=0.0, to_utc=clock.to_utc())
+        )

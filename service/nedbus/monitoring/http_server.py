@@ -61,7 +61,8 @@ class HttpServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
-    request_queue_size = 2 * _MAX_REQUESTS  # with Python's default of 5, the sixth concurrent client waits 1 s
+    # with Python's default of 5, the sixth concurrent client waits 1 s
+    request_queue_size = 2 * _MAX_REQUESTS
 
     def __init__(self, where: str, pages: Mapping[str, Callable[[], Page]]) -> None:
         host, port = split_http(where)
@@ -74,9 +75,13 @@ class HttpServer(ThreadingHTTPServer):
             super().__init__((host, port), _Handler)
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
-            raise ListenError([f"http://{where}"], reason, hint="choose another address with --http") from exc
+            raise ListenError(
+                [f"http://{where}"], reason, hint="choose another address with --http"
+            ) from exc
         self.port: int = self.server_address[1]
-        threading.Thread(target=self.serve_forever, args=(_POLL,), name="nedbus-http", daemon=True).start()
+        threading.Thread(
+            target=self.serve_forever, args=(_POLL,), name="nedbus-http", daemon=True
+        ).start()
 
     def close(self) -> None:
         """Stop listening, and disconnect clients that are sending or reading; do not wait for queued clients."""
@@ -167,10 +172,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _make_page(self, path: str) -> Page:
         pages, headers = self.server.pages, self.headers
-        if refusal := why_refused(path, lambda name: headers.get_all(name, []), is_local=self.server.is_local):
+        if refusal := why_refused(
+            path, lambda name: headers.get_all(name, []), is_local=self.server.is_local
+        ):
             return Page.text(refusal, status=403)
         if path not in pages:
-            return Page.text(f"available pages: {', '.join(pages)}", status=200 if path == "/" else 404)
+            return Page.text(
+                f"available pages: {', '.join(pages)}", status=200 if path == "/" else 404
+            )
         try:
             return pages[path]()
         except BaseException:  # noqa: BLE001 - one page, even with a panic of Zenoh, must not break the server

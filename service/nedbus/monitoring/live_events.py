@@ -52,7 +52,9 @@ class LiveEvents(AbstractContextManager["LiveEvents"]):
     def from_start(self) -> dict[str, str]:
         """By vehicle whose position is known, the conditions that are active since its first message, as text."""
         vehicles = list(self._observer.event_log.vehicles.items())
-        return {name: vehicle.held_from_start for name, vehicle in vehicles if vehicle.main is not None}
+        return {
+            name: vehicle.held_from_start for name, vehicle in vehicles if vehicle.main is not None
+        }
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample of `subscription`."""

@@ -126,7 +126,11 @@ def metrics_page(metrics: Iterable[core.Metric]) -> Page:
 
 def build_info(version: str) -> core.Metric:
     """Return the info metric with the versions of nedbus, Python and Zenoh."""
-    versions = {"version": version, "python": platform.python_version(), "zenoh": version_of("eclipse-zenoh")}
+    versions = {
+        "version": version,
+        "python": platform.python_version(),
+        "zenoh": version_of("eclipse-zenoh"),
+    }
     return core.InfoMetricFamily("nedbus_build", "Versions", value=versions)
 
 
@@ -142,9 +146,13 @@ def make_metrics(series: Mapping[str, Iterable[tuple[Any, ...]]]) -> Iterator[co
 
 def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Iterator[core.Metric]:
     """Yield the stream metrics; `messages` is the name of the message counter."""
-    streams = sorted(streams, key=lambda stream: not stream.health.resets)  # only positions have resets
+    # only positions have resets
+    streams = sorted(streams, key=lambda stream: not stream.health.resets)
     named = streams[:MAX_STREAMS]
-    rest = [replace(stream, labels=("other", "other", stream.labels[2])) for stream in streams[MAX_STREAMS:]]
+    rest = [
+        replace(stream, labels=("other", "other", stream.labels[2]))
+        for stream in streams[MAX_STREAMS:]
+    ]
     active = [stream for stream in named if stream.active]
 
     def count(attribute: str) -> Iterable[tuple[tuple[str, ...], int]]:
@@ -153,7 +161,9 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
             totals[stream.labels] += getattr(stream.health, attribute)
         return totals.items()
 
-    def measure(attribute: str, of: Iterable[MeasuredStream] = active) -> Iterator[tuple[tuple[str, ...], float]]:
+    def measure(
+        attribute: str, of: Iterable[MeasuredStream] = active
+    ) -> Iterator[tuple[tuple[str, ...], float]]:
         values = ((stream.labels, getattr(stream.health, attribute)) for stream in of)
         return ((labels, value) for labels, value in values if value is not None)
 
@@ -178,12 +188,19 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
     })  # fmt: skip
 
 
-def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
+def vehicle_metrics(
+    event_log: EventLog, streams: Iterable[MeasuredStream]
+) -> Iterator[core.Metric]:
     """Yield the vehicle metrics; a vehicle without an active stream has event counts, but no state."""
     now, vehicles = clock.steady(), list(event_log.vehicles)
     active = {stream.labels[0] for stream in streams if stream.active}
-    states = {name: event_log.state(name, now) for name in active if name in vehicles or event_log.is_full}
-    kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
+    states = {
+        name: event_log.state(name, now) for name in active if name in vehicles or event_log.is_full
+    }
+    kinds = {
+        name: sorted({condition.kind for condition in state.conditions})
+        for name, state in states.items()
+    }
     yield from make_metrics({
         "nedbus_vehicle_state": [
             ((name, "ok" if severity == "info" else severity), severity == state.severity)
@@ -198,7 +215,8 @@ def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> I
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     """Yield all metrics of a service."""
     seen, sources = Counter[str](), dict[str, SourceMeasures]()
-    for measures in daemon.measures:  # equal sources are numbered, because time series must be unique
+    # equal sources are numbered, because time series must be unique
+    for measures in daemon.measures:
         text = measures.status.source
         seen[text] += 1
         sources[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures
@@ -210,7 +228,9 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
         "nedbus_vehicle_refused": [((vehicle,), is_refused) for vehicle, is_refused in daemon.refused.items()],
     })  # fmt: skip
     streams = [
-        MeasuredStream((*each.address.split("/", 1), label), each.health, active=not measures.status.ended)
+        MeasuredStream(
+            (*each.address.split("/", 1), label), each.health, active=not measures.status.ended
+        )
         for label, measures in sources.items()
         for each in measures.status.streams
     ]
@@ -238,21 +258,33 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
 
 
 def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any, ...]]]:
-    streams = [((each.vehicle, label), each) for label, status in of.items() for each in status.log_streams]
-    columns = {"bytes": "received", "messages_lost": "lost_messages", "unsaved_bytes": "unsaved"} | {
-        each: each for each in ("gaps", "lost", "undecodable")
-    }
+    streams = [
+        ((each.vehicle, label), each) for label, status in of.items() for each in status.log_streams
+    ]
+    columns = {
+        "bytes": "received",
+        "messages_lost": "lost_messages",
+        "unsaved_bytes": "unsaved",
+    } | {each: each for each in ("gaps", "lost", "undecodable")}
     seconds = {"delay_seconds": "delay", "header_seconds": "header_time"}
     rows: dict[str, list[tuple[Any, ...]]] = {
         f"nedbus_log_stream_{name}": [
-            (labels, value) for labels, each in streams if (value := getattr(each, attribute)) is not None
+            (labels, value)
+            for labels, each in streams
+            if (value := getattr(each, attribute)) is not None
         ]
         for name, attribute in (columns | seconds).items()
     }
-    rows["nedbus_log_stream_active"] = [(labels, each.state == "streaming") for labels, each in streams]
+    rows["nedbus_log_stream_active"] = [
+        (labels, each.state == "streaming") for labels, each in streams
+    ]
     return rows
 
 
 def _histogram_row(labels: Sequence[str], measured: Histogram) -> tuple[Any, ...]:
     limits = (*map(str, measured.limits), "+Inf")
-    return labels, list(zip(limits, accumulate(map(float, measured.counts)), strict=True)), measured.sum
+    return (
+        labels,
+        list(zip(limits, accumulate(map(float, measured.counts)), strict=True)),
+        measured.sum,
+    )

@@ -59,7 +59,12 @@ class Observer:
         if self.monitor.add(sample):
             missing, now = sample.provenance.missing, clock.steady()
             self.event_log.add(
-                sample.address, sample.message, now, missing=missing, lost=sample.lost, source=sample.source
+                sample.address,
+                sample.message,
+                now,
+                missing=missing,
+                lost=sample.lost,
+                source=sample.source,
             )
 
     def poll(self) -> Snapshot:
@@ -67,7 +72,9 @@ class Observer:
         now, connected = clock.steady(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
         healths = self.monitor.snapshot()
-        taken = [report for report in self._rejections.take() if self._selection.matches(report.address)]
+        taken = [
+            report for report in self._rejections.take() if self._selection.matches(report.address)
+        ]
         rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
             self.event_log.reject(report.address, report.reason, now)
@@ -80,17 +87,29 @@ class Observer:
             if main is not None and (main in healths or not settled)
         }
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"
-        paused, self._last_poll = self._last_poll is not None and now - self._last_poll > _MAX_PAUSE, now
+        paused = self._last_poll is not None and now - self._last_poll > _MAX_PAUSE
+        self._last_poll = now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
         present = {each.vehicle for each in alive}
-        self.event_log.update(now, states, link=link, dropped=dropped, is_behind=is_behind, present=present)
+        self.event_log.update(
+            now, states, link=link, dropped=dropped, is_behind=is_behind, present=present
+        )
         if settled:
             for address, each in self.monitor.items():
-                limit = min(TIMINGS.forgotten, math.inf if address.vehicle in self.event_log.vehicles else RECENT)
-                is_listed = alive.complete or not each.sample.retained  # a retained message does not come again
+                limit = min(
+                    TIMINGS.forgotten,
+                    math.inf if address.vehicle in self.event_log.vehicles else RECENT,
+                )
+                # a retained message does not come again
+                is_listed = alive.complete or not each.sample.retained
                 if not alive[address] and each.age > limit and is_listed:
-                    self.monitor.forget(address, silence=limit)  # unless a message has arrived in the meantime
-        behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped" if self.event_log.overload else ""
+                    # unless a message has arrived in the meantime
+                    self.monitor.forget(address, silence=limit)
+        behind = (
+            f"reader overloaded: {waiting} messages queued, {dropped} dropped"
+            if self.event_log.overload
+            else ""
+        )
         healths = {address: each for address, each in healths.items() if address in self.monitor}
         return Snapshot(now, healths, alive, rejected, link, behind)

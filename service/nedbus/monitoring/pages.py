@@ -32,7 +32,10 @@ def vehicles_page(report: AccountReport) -> Page:
     """Return the state of each vehicle, or status 503 with the faults."""
     faults = faults_of([report], Expectation(well=True))
     vehicles = ((name, report.vehicles[name]) for name in by_vehicle([report]))
-    lines = [f"{name} {vehicle.text}{format_since(vehicle.since, report.now)}" for name, vehicle in vehicles]
+    lines = [
+        f"{name} {vehicle.text}{format_since(vehicle.since, report.now)}"
+        for name, vehicle in vehicles
+    ]
     good = "\n".join(map(_one_line, lines)) or "no vehicles"
     return Page.verdict(list(map(_one_line, faults)), good)
 
@@ -47,7 +50,8 @@ def why_not_ready(daemon: Daemon) -> list[str]:
         reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
     reasons += _refusals(daemon)
     for source in daemon.sources:
-        silent = source.state == "waiting" and not source.addresses  # a replay that waits for a reader has addresses
+        # a replay that waits for a reader has addresses
+        silent = source.state == "waiting" and not source.addresses
         if silent or source.state in {"starting", "retrying", "failed"}:
             what = "nothing arrives" if silent else source.state
             reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")

@@ -19,7 +19,8 @@ from .certificate import CERTIFICATE_PREFIX, certificate_name
 _BEGIN: Final = "// BEGIN vehicles"
 _END: Final = "// END vehicles"
 _BLOCK: Final = re.compile(
-    rf"(?P<begin>^(?P<indent>[ \t]*){_BEGIN}[^\n]*\n)(?P<content>.*?)(?P<end>^[ \t]*{_END})", re.DOTALL | re.MULTILINE
+    rf"(?P<begin>^(?P<indent>[ \t]*){_BEGIN}[^\n]*\n)(?P<content>.*?)(?P<end>^[ \t]*{_END})",
+    re.DOTALL | re.MULTILINE,
 )
 _SUBJECT: Final = re.compile(
     rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE
@@ -46,7 +47,9 @@ def read_access_rules(file: Path) -> list[str]:
     return _SUBJECT.findall(_find_blocks(file)[1]["content"])
 
 
-def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX) -> None:
+def write_access_rules(
+    file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX
+) -> None:
     """Atomically replace the vehicle entries of a router's file; the rest of the file is unchanged.
 
     Raises AddressError for an invalid vehicle; ConfigError if no vehicle is given, or for a file that cannot be read or
@@ -58,7 +61,9 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
         raise ConfigError.in_file(file, "name at least one vehicle")
     text = _find_blocks(file)[0].string
     # A vehicle's certificate matches two subjects: "vehicles" for common permissions, and its own.
-    subjects = [f'{{ id: "vehicles", cert_common_names: {json.dumps(list(map(certificate_name, names)))} }},']
+    subjects = [
+        f'{{ id: "vehicles", cert_common_names: {json.dumps(list(map(certificate_name, names)))} }},'
+    ]
     rules, policies = list[str](), list[str]()
     for vehicle, name in zip(names, map(certificate_name, names), strict=True):
         keys = json.dumps([key.format(p=prefix, v=vehicle) for key in _KEYS])
@@ -72,21 +77,31 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
     sections = iter((rules, subjects, policies))  # in the order of the marked blocks in the file
 
     def fill(block: re.Match[str]) -> str:
-        return "".join([block["begin"], *(f"{block['indent']}{line}\n" for line in next(sections)), block["end"]])
+        return "".join(
+            [
+                block["begin"],
+                *(f"{block['indent']}{line}\n" for line in next(sections)),
+                block["end"],
+            ]
+        )
 
     try:
         with atomic_write(file, replace=True) as temporary:
             temporary.write_text(_BLOCK.sub(fill, text), encoding="utf-8")
             temporary.chmod(file.stat().st_mode)
     except OSError as exc:
-        raise ConfigError.in_file(file, f"cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
+        raise ConfigError.in_file(
+            file, f"cannot be written: {(exc.strerror or str(exc)).lower()}"
+        ) from exc
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
     try:
         blocks = list(_BLOCK.finditer(file.read_text(encoding="utf-8")))
     except OSError as exc:
-        raise ConfigError.in_file(file, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
+        raise ConfigError.in_file(
+            file, f"cannot be read: {(exc.strerror or str(exc)).lower()}"
+        ) from exc
     except UnicodeDecodeError as exc:
         raise ConfigError.in_file(file, "not UTF-8 text") from exc
     if len(blocks) != 3:

@@ -47,7 +47,9 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
     return _write_files(folder / "ca", _sign(_CA_NAME, key.public_key(), key, days), key)
 
 
-def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
+def make_certificate(
+    folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None
+) -> list[Path]:
     """Create `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
 
     `hosts`: names and addresses of a router, verified by clients. A certificate without hosts is for clients only.
@@ -55,10 +57,14 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
     Raises PkiError if the folder already has a certificate of that name, has no CA, or cannot be written.
     """
     if not name or len(name) > MAX_NAME or "/" in name or name.startswith("."):
-        raise PkiError(f"{name!r} is not a valid name: use 1 to {MAX_NAME} characters, without / or a leading dot")
+        raise PkiError(
+            f"{name!r} is not a valid name: use 1 to {MAX_NAME} characters, without / or a leading dot"
+        )
     authority = Authority.read(folder)
     key = new_key()
-    return _write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
+    return _write_files(
+        folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +94,16 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
         loaded = load_certificate(path)
         certificate = Certificate.read(path)
         problem = ""
-        with suppress(OSError, ValueError, TypeError):  # the key is missing, or not readable by this user
-            key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
-            problem = "" if key.public_key() == loaded.public_key() else "does not match the key next to it"
+        # the key is missing, or not readable by this user
+        with suppress(OSError, ValueError, TypeError):
+            key = serialization.load_pem_private_key(
+                path.with_suffix(".key").read_bytes(), password=None
+            )
+            problem = (
+                ""
+                if key.public_key() == loaded.public_key()
+                else "does not match the key next to it"
+            )
         try:
             loaded.verify_directly_issued_by(authority)
         except (ValueError, TypeError, InvalidSignature):
@@ -99,10 +112,14 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
         name = path.stem if is_authority else certificate.subject
         use = "authority" if is_authority else "router" if certificate.hosts else "client"
         found.append(CertificateEntry(path, name, use, certificate, problem))
-    return sorted(found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name))
+    return sorted(
+        found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name)
+    )
 
 
-def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None) -> list[Path]:
+def renew_certificate(
+    entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None
+) -> list[Path]:
     """Replace a certificate with one of the same name and hosts and a later expiry, and return the new files.
 
     The old certificate and its key stay valid until the certificate expires, even with `replace_key`.
@@ -139,11 +156,18 @@ class Authority(NamedTuple):
         except (ValueError, TypeError):
             key = None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise PkiError(f"{path} is not a key of 'nedbus pki ca': restore it, or create a new CA in another folder")
+            raise PkiError(
+                f"{path} is not a key of 'nedbus pki ca': restore it, or create a new CA in another folder"
+            )
         return cls(certificate, key)
 
     def sign(
-        self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
+        self,
+        name: str,
+        key: CertificatePublicKeyTypes,
+        *,
+        hosts: Sequence[str] = (),
+        days: int | None = None,
     ) -> x509.Certificate:
         """Return a certificate for a key, for a router if hosts are given; it expires no later than the CA."""
         return _sign(name, key, self.key, days, issuer=self.certificate, hosts=hosts)
@@ -170,11 +194,17 @@ def load_certificate(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(_read(path))
     except ValueError as exc:
-        raise PkiError(f"{path} is not a PEM certificate: move it away, or create a new one") from exc
+        raise PkiError(
+            f"{path} is not a PEM certificate: move it away, or create a new one"
+        ) from exc
 
 
 def _write_files(
-    stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey | None = None, *, replace: bool = False
+    stem: Path,
+    certificate: x509.Certificate,
+    key: ec.EllipticCurvePrivateKey | None = None,
+    *,
+    replace: bool = False,
 ) -> list[Path]:
     """Atomically write `STEM.key`, if a key is given, and `STEM.crt`, and return their paths."""
     items = {Path(f"{stem}.key"): key, Path(f"{stem}.crt"): certificate}
@@ -182,7 +212,9 @@ def _write_files(
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            temporary = [stack.enter_context(atomic_write(path, replace=replace)) for path in written]
+            temporary = [
+                stack.enter_context(atomic_write(path, replace=replace)) for path in written
+            ]
             for path, item in zip(temporary, written.values(), strict=True):
                 write_new(path, item)
     except FileExistsError as exc:
@@ -197,8 +229,14 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as exc:
-        hint = "run 'nedbus pki ca' first" if path.name == "ca.crt" else "check that this user may read it"
-        raise PkiError(f"{path} cannot be read ({(exc.strerror or str(exc)).lower()}): {hint}") from exc
+        hint = (
+            "run 'nedbus pki ca' first"
+            if path.name == "ca.crt"
+            else "check that this user may read it"
+        )
+        raise PkiError(
+            f"{path} cannot be read ({(exc.strerror or str(exc)).lower()}): {hint}"
+        ) from exc
 
 
 def _sign(
@@ -223,16 +261,26 @@ def _sign(
         .not_valid_after(until if issuer is None else min(until, issuer.not_valid_after_utc))
         # Required by Python 3.13 and later, though not by Zenoh.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
-        .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
-        .add_extension(x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES}), critical=True)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
+        )
+        .add_extension(
+            x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True
+        )
+        .add_extension(
+            x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES}), critical=True
+        )
     )
 
     if issuer is not None:  # a router is also a client of other routers
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + (
+            [ExtendedKeyUsageOID.SERVER_AUTH] if hosts else []
+        )
         builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if hosts:
-        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_general_name, hosts))), critical=False)
+        builder = builder.add_extension(
+            x509.SubjectAlternativeName(list(map(_general_name, hosts))), critical=False
+        )
     return builder.sign(signer, hashes.SHA256())
 
 

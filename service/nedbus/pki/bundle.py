@@ -17,7 +17,9 @@ from .certificate import certificate_name
 
 _TARGET: Final = Path("/etc/nedbus")  # where the systemd unit and the image expect nedbus.toml
 _IN_WHEEL: Final = Path(__file__).with_name("fleet")
-_TEMPLATES: Final = _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[3] / "packaging" / "fleet"
+_TEMPLATES: Final = (
+    _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[3] / "packaging" / "fleet"
+)
 
 
 class _Template(string.Template):
@@ -52,7 +54,9 @@ def make_bundle(
     authority = Authority.read(folder)
     for path in (output, folder / f"{name}.key", folder / f"{name}.crt"):
         if path.exists():
-            raise PkiError(f"{path} exists and is not overwritten: move it away to enroll {name} again")
+            raise PkiError(
+                f"{path} exists and is not overwritten: move it away to enroll {name} again"
+            )
     key = new_key()
     certificate = authority.sign(name, key.public_key(), days=days)
     target = target or _TARGET
@@ -78,10 +82,16 @@ def make_bundle(
             write_new(copy, certificate)
             (temporary / "pki").mkdir(parents=True)
             (temporary / "pki").chmod(0o700)
-            for file, item in ((f"{name}.key", key), (f"{name}.crt", certificate), ("ca.crt", authority.certificate)):
+            for file, item in (
+                (f"{name}.key", key),
+                (f"{name}.crt", certificate),
+                ("ca.crt", authority.certificate),
+            ):
                 write_new(temporary / "pki" / file, item)
             for file in ("nedbus.toml", "compose.yml", "README.txt"):
-                (temporary / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(values))
+                (temporary / file).write_text(
+                    _Template((_TEMPLATES / file).read_text()).substitute(values)
+                )
             temporary.rename(output)
     except OSError as exc:
         raise PkiError(f"cannot create {output}: {(exc.strerror or str(exc)).lower()}") from exc

@@ -51,9 +51,21 @@ class Certificate:
         """
         x509 = import_optional("pki", "cryptography.x509")
         try:
-            found = x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
-            names = [each.value for each in found.extensions if each.oid == x509.OID_SUBJECT_ALTERNATIVE_NAME]
-        except (x509.InvalidVersion, x509.DuplicateExtension, x509.UnsupportedGeneralNameType) as exc:
+            found = (
+                x509.load_pem_x509_certificate(data)
+                if pem
+                else x509.load_der_x509_certificate(data)
+            )
+            names = [
+                each.value
+                for each in found.extensions
+                if each.oid == x509.OID_SUBJECT_ALTERNATIVE_NAME
+            ]
+        except (
+            x509.InvalidVersion,
+            x509.DuplicateExtension,
+            x509.UnsupportedGeneralNameType,
+        ) as exc:
             raise ValueError(str(exc)) from exc
         hosts = tuple(str(name.value) for name in names[0]) if names else ()
         begins, ends = found.not_valid_before_utc, found.not_valid_after_utc
@@ -78,4 +90,6 @@ class Certificate:
 
 
 def _common_name(name: Any) -> str:
-    return next((str(each.value) for each in name if each.rfc4514_attribute_name == "CN"), "unnamed")
+    return next(
+        (str(each.value) for each in name if each.rfc4514_attribute_name == "CN"), "unnamed"
+    )

@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .sample import M2, M3, Counts, M_co, Mode, Query, Sample, Subscribe
-from .source_message import ARDUPILOT, OF_OTHER_AUTOPILOTS, OTHER_AUTOPILOT, RecordStream, Rejection, SourceMessage
+from .source_message import (
+    ARDUPILOT,
+    OF_OTHER_AUTOPILOTS,
+    OTHER_AUTOPILOT,
+    RecordStream,
+    Rejection,
+    SourceMessage,
+)
 from .status import LogStreamStatus, PositionStatus, UntrustedReply
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition, Vehi
 if TYPE_CHECKING:
     import zenoh
 
-Mode = Literal["latest", "every"]  # a slow reader gets the newest message of each key, or every message
+# a slow reader gets the newest message of each key, or every message
+Mode = Literal["latest", "every"]
 M_co = TypeVar("M_co", bound=Message, default=VehicleLocalPosition, covariant=True)
 
 M2 = TypeVar("M2", bound=Message)  # of further topics of a subscription
@@ -94,7 +95,9 @@ class Sample(Generic[M_co]):
         """The fields that the source did not provide; they hold NaN, false or 0."""
         message = self.message
         if isinstance(message, Message):  # another encoder may have used an older layout
-            return self.provenance.missing | (message.DEFINITION.all_fields - message.model_fields_set)
+            return self.provenance.missing | (
+                message.DEFINITION.all_fields - message.model_fields_set
+            )
         return self.provenance.missing
 
     @property
@@ -115,7 +118,16 @@ class Sample(Generic[M_co]):
 
     def _state(self) -> tuple[object, ...]:
         flags = self.retained, self.stored
-        return self.message, self.address, self.received, None, self.lost, self.provenance, *flags, self.sent
+        return (
+            self.message,
+            self.address,
+            self.received,
+            None,
+            self.lost,
+            self.provenance,
+            *flags,
+            self.sent,
+        )
 
 
 @dataclass(frozen=True, slots=True)

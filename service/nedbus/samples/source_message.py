@@ -74,8 +74,14 @@ class SourceMessage:
     def encode(self) -> Encoded:
         """Validate and encode the message; raise InvalidMessageError."""
         if self.error is not None:
-            raise InvalidMessageError(self.error, [("message", "not decodable")], message=self.address.topic)
-        if self.given is None and self.logged is not None and (encoded := self.logged.encode_valid(self.payload)):
+            raise InvalidMessageError(
+                self.error, [("message", "not decodable")], message=self.address.topic
+            )
+        if (
+            self.given is None
+            and self.logged is not None
+            and (encoded := self.logged.encode_valid(self.payload))
+        ):
             return encoded
         return encode_upgraded(self.definition or BY_TOPIC[self.address.topic], self.fields)
 

@@ -16,7 +16,14 @@ from nedbus.flights import find_format
 from nedbus.transport import Tls
 from nedbus_msgs import DEFAULT_PREFIX
 
-from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, RecordingOptions, SimulatorOptions
+from .options import (
+    MavlinkOptions,
+    Options,
+    Px4ZenohOptions,
+    RecordedOptions,
+    RecordingOptions,
+    SimulatorOptions,
+)
 from .source import LiveSource, ReplaySource, Source
 
 
@@ -36,7 +43,11 @@ class SourceKind:
 
     def accepts(self, target: str) -> bool:
         """Return whether this target is allowed; "" means no target."""
-        return self.target is not None if target else self.target is None or self.target.startswith("[")
+        return (
+            self.target is not None
+            if target
+            else self.target is None or self.target.startswith("[")
+        )
 
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
@@ -44,8 +55,12 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.replay", "open_replay"),
     "mcap": SourceKind(RecordingOptions, "FILE", "nedbus.sources.replay", "open_replay", "mcap"),
     "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.replay", "open_replay", "mavlink"),
-    "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
-    "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
+    "px4-zenoh": SourceKind(
+        Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"
+    ),
+    "mavlink": SourceKind(
+        MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"
+    ),
 }
 
 
@@ -59,13 +74,21 @@ class SourceSpec:
     options: Options
 
     def open_source(
-        self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None, prefix: str = DEFAULT_PREFIX
+        self,
+        *,
+        vehicle: str,
+        routers: tuple[str, ...] = (),
+        tls: Tls | None = None,
+        prefix: str = DEFAULT_PREFIX,
     ) -> Source:
         """Create the source for a service; raise ConfigError for an invalid target or file, or a missing extra."""
         kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
         # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
-            raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file; save the data to a file first")
+            raise ConfigError(
+                f"source {self.text!r}",
+                f"{path} is not a regular file; save the data to a file first",
+            )
         make = getattr(import_optional(kind.extra, kind.module), kind.name)
         if isinstance(self.options, RecordedOptions | SimulatorOptions):
             return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
@@ -86,7 +109,11 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
     if kind is None:
         path = rest if rest and "/" not in kind_name else text
         kind_of_file = find_format(path.partition("?")[0])
-        hint = f"write {kind_of_file}:{path}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
+        hint = (
+            f"write {kind_of_file}:{path}"
+            if kind_of_file
+            else f"choose from {', '.join(SOURCE_KINDS)}"
+        )
         raise ConfigError(f"source {text!r}", f"unknown kind {kind_name!r}; {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     if not kind.accepts(target):
@@ -94,21 +121,28 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         raise ConfigError(f"source {text!r}", f"the target is missing or not allowed; write {form}")
     try:
         # Unlike in an HTML form, a plus is not a space.
-        pairs = parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query))
+        pairs = parse_qsl(
+            query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query)
+        )
         options = kind.options.model_validate(dict(pairs))
     except ValidationError as exc:
         detail = exc.errors()[0]
         name = str(detail["loc"][0])
         if (field := kind.options.model_fields.get(name)) is None:
             reason = f"unknown option {name!r}; choose from {', '.join(kind.options.model_fields)}"
-        elif isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
+        elif (
+            isinstance(cause := detail.get("ctx", {}).get("error"), AddressError)
+            and name == "topics"
+        ):
             reason = str(cause)
         else:
             reason = f"{name}={detail['input']} is invalid; expected {field.description}"
         raise ConfigError(f"source {text!r}", reason, key=name) from exc
     except ValueError:
         hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
-        raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}") from None
+        raise ConfigError(
+            f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}"
+        ) from None
     if len(dict(pairs)) < len(pairs):
         raise ConfigError(f"source {text!r}", "an option occurs twice; remove one")
     if kind.target == "FILE":
@@ -122,7 +156,9 @@ def _text_of_table(table: Mapping[str, object]) -> str:
     name = options.pop("kind", None)
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        problem, key = ("kind is missing", "") if name is None else (f"unknown kind {name!r}", "kind")
+        problem, key = (
+            ("kind is missing", "") if name is None else (f"unknown kind {name!r}", "kind")
+        )
         raise ConfigError("source", f"{problem}; choose from {', '.join(SOURCE_KINDS)}", key=key)
     target_name = (kind.target or "").strip("[]").lower()
     target = options.pop(target_name, "")
@@ -142,6 +178,10 @@ def _text_of_value(value: object) -> str:
 
 def _join(kind: str, target: str, options: Mapping[str, str]) -> str:
     """Return the text of a source, with % and ? escaped in a path."""
-    path = target.replace("%", "%25").replace("?", "%3F") if SOURCE_KINDS[kind].target == "FILE" else target
+    path = (
+        target.replace("%", "%25").replace("?", "%3F")
+        if SOURCE_KINDS[kind].target == "FILE"
+        else target
+    )
     query = urlencode(options, safe=":,/+", quote_via=quote)
     return f"{kind}:{path}?{query}" if query else f"{kind}:{path}"

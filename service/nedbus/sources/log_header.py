@@ -2,8 +2,10 @@
 
 from typing import Final
 
-DEFAULT_COUNT: Final = 470  # messages of a header with PX4's default topics: 410 with PX4 1.17, 468 with 1.18
-FIXED_COUNT: Final = 230  # messages of a header without topics: parameters and their defaults, and event metadata
+# messages of a header with PX4's default topics: 410 with PX4 1.17, 468 with 1.18
+DEFAULT_COUNT: Final = 470
+# messages of a header without topics: parameters and their defaults, and event metadata
+FIXED_COUNT: Final = 230
 COUNT_PER_TOPIC: Final = 2.5  # 2.4 were measured with 16 and 22 topics, 1.8 with 101
 PROCESSING: Final = 0.004  # s that PX4 needs for a message, in addition to the round trip
 

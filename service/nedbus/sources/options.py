@@ -75,7 +75,8 @@ class ReplayOptions(Options):
 
     vehicle: Vehicle | None = Field(None, description="1 to 64 characters of A-Z a-z 0-9 _ -")
     speed: Annotated[
-        Annotated[float, Field(ge=0.001, le=1000)] | None, BeforeValidator(lambda text: None if text == "max" else text)
+        Annotated[float, Field(ge=0.001, le=1000)] | None,
+        BeforeValidator(lambda text: None if text == "max" else text),
     ] = Field(1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive")
     wait: bool = Field(False, description="1 to wait for a subscriber before the start, or 0")
 
@@ -102,8 +103,11 @@ class SimulatorOptions(ReplayOptions):
     duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
         None, description="seconds, 0.01 to 1e8 (default: endless)"
     )
-    origin: Annotated[_Origin | None, BeforeValidator(lambda text: text and text.split(","))] = Field(
-        None, description="LATITUDE,LONGITUDE,ALTITUDE of the take-off, degrees and metres (default: Zurich, as in PX4)"
+    origin: Annotated[_Origin | None, BeforeValidator(lambda text: text and text.split(","))] = (
+        Field(
+            None,
+            description="LATITUDE,LONGITUDE,ALTITUDE of the take-off, degrees and metres (default: Zurich, as in PX4)",
+        )
     )
 
 
@@ -116,11 +120,16 @@ class Px4ZenohOptions(Options):
     vehicle: Vehicle | None = Field(
         None, description="1 to 64 characters of A-Z a-z 0-9 _ -, for topics without a namespace"
     )
-    vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
-    layout: _Layout | None = Field(
-        None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(_LAYOUTS)}"
+    vehicles: Vehicles = Field(
+        {}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas"
     )
-    msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
+    layout: _Layout | None = Field(
+        None,
+        description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(_LAYOUTS)}",
+    )
+    msg: str = Field(
+        "", description="PX4's message definitions: .msg files or folders, separated by commas"
+    )
 
 
 def _parse_address(text: object) -> object:
@@ -153,14 +162,17 @@ class MavlinkOptions(Options):
     )
     log: Annotated[
         frozenset[Literal["1", "armed", "take"]],
-        BeforeValidator(lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text),
+        BeforeValidator(
+            lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text
+        ),
     ] = Field(
         frozenset(),
         description="1 to request the ULog stream of each PX4 on the link, armed to start it in flight as well, take"
         " to end the stream of another client, or armed,take",
     )
     header: Annotated[float, Field(ge=1, le=600)] | None = Field(
-        None, description="seconds that the header of a ULog stream may take, 1 to 600 (default: 10)"
+        None,
+        description="seconds that the header of a ULog stream may take, 1 to 600 (default: 10)",
     )
     state: str = Field(
         "",

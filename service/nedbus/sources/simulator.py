@@ -26,13 +26,15 @@ _TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardw
 _LAP: Final = 120.0  # s
 _OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
 _ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
-_REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
+# latitude, longitude [deg], altitude [m]: PX4's default home
+_REFERENCE: Final = (47.397742, 8.545594, 488.0)
 _BOOT: Final = 10_000_000  # us since boot at the start
 
 _HEADING_RESET: Final = 15.0  # s into a lap
 _MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
 _Z_RESET: Final = 90.0  # s into a lap
-_HEADING_DISTURBED: Final = _LAP - 5.0  # s into a lap: start of the heading error that the next heading reset corrects
+# s into a lap: start of the heading error that the next heading reset corrects
+_HEADING_DISTURBED: Final = _LAP - 5.0
 _Z_STEP: Final = 1.0  # m, alternately up and down
 _DRIFT: Final = 0.02  # m/s^2, half the acceleration of the position error in dead reckoning
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
@@ -75,12 +77,15 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float]) 
     acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
     moving = math.hypot(velocity[0], velocity[1]) > 0.5
     heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(direction + math.pi / 4)
-    return Truth(time, _BOOT + round(time * 1e6), positions[1], velocity, acceleration, heading, origin)
+    return Truth(
+        time, _BOOT + round(time * 1e6), positions[1], velocity, acceleration, heading, origin
+    )
 
 
 def _position(time: float, direction: float) -> Vector:
     progress = min(1.0, max(0.0, time / _CLIMB))
-    climb = progress**3 * (10 - 15 * progress + 6 * progress**2)  # from 0 to 1 with continuous acceleration
+    # from 0 to 1 with continuous acceleration
+    climb = progress**3 * (10 - 15 * progress + 6 * progress**2)
     # The phase starts slowly near the end of the climb, and then advances by one figure per minute.
     late = max(0.0, time - 8.0)
     phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
@@ -119,8 +124,12 @@ class Estimator:
     def fields(self, truth: Truth) -> Values:
         """Return the local position; its limits are infinite, as EKF2 sends them."""
         state = self._at(truth.time)
-        position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
-        velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
+        position = [
+            value + error for value, error in zip(truth.position, state.position, strict=True)
+        ]
+        velocity = [
+            value + error for value, error in zip(truth.velocity, state.velocity, strict=True)
+        ]
         return {
             **_motion(position, velocity, truth, has_origin=truth.time >= _ORIGIN_SET),
             **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
@@ -152,8 +161,11 @@ class Estimator:
     def global_fields(self, truth: Truth) -> Values:
         """Return the global position, which the vehicle publishes only after the origin is known."""
         state = self._at(truth.time)
-        x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
-        (latitude, longitude), altitude = MapProjection(*truth.origin[:2]).reproject(x, y), truth.origin[2]
+        x, y, z = (
+            value + error for value, error in zip(truth.position, state.position, strict=True)
+        )
+        (latitude, longitude) = MapProjection(*truth.origin[:2]).reproject(x, y)
+        altitude = truth.origin[2]
         return {
             "timestamp_sample": truth.timestamp - _DELAY,
             "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
@@ -166,7 +178,11 @@ class Estimator:
     def status(self, truth: Truth) -> Values:
         """Return the status: take-off, then a mission; while the position is invalid, a failsafe in altitude mode."""
         failsafe, is_mission = not self._at(truth.time).xy_valid, truth.time >= _CLIMB
-        flown = _Status.NAVIGATION_STATE_AUTO_MISSION if is_mission else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
+        flown = (
+            _Status.NAVIGATION_STATE_AUTO_MISSION
+            if is_mission
+            else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
+        )
         mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
         return {
             "armed_time": _BOOT - 1_000_000, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
@@ -177,11 +193,16 @@ class Estimator:
 
     def _at(self, time: float) -> _State:
         lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + _TICK / 2, _LAP)
-        outages, steps, alignments = (int(lap) + (lap_time >= end) for end in (_OUTAGE[1], _Z_RESET, _HEADING_RESET))
+        outages, steps, alignments = (
+            int(lap) + (lap_time >= end) for end in (_OUTAGE[1], _Z_RESET, _HEADING_RESET)
+        )
         dead_reckoning = lap_time - _OUTAGE[0] if _OUTAGE[0] <= lap_time < _OUTAGE[1] else 0.0
         moved, speed = self._drift(dead_reckoning)
         corrected, slowed = self._drift(_OUTAGE[0] - _OUTAGE[1] if outages else 0.0)
-        x, y, z = (self._noise * (math.sin(time / 7.0 + each) + math.sin(time / 2.3 - each)) for each in self._phases)
+        x, y, z = (
+            self._noise * (math.sin(time / 7.0 + each) + math.sin(time / 2.3 - each))
+            for each in self._phases
+        )
         return _State(
             position=(x + moved[0], y + moved[1], z + _Z_STEP * (steps % 2)),
             velocity=(*speed, 0.0),
@@ -219,7 +240,9 @@ def truth_fields(truth: Truth) -> Values:
     }  # fmt: skip
 
 
-def _motion(position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool) -> Values:
+def _motion(
+    position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool
+) -> Values:
     """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
     latitude, longitude, altitude = truth.origin if has_origin else (math.nan,) * 3
     names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
@@ -276,7 +299,9 @@ def gps(truth: Truth) -> Values:
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
     noise = [0.3 * math.sin(time * rate) for rate in (1.7, 2.3, 3.1)]
     north, east, down = (value + error for value, error in zip(truth.position, noise, strict=True))
-    latitude, longitude = MapProjection(*truth.origin[:2]).reproject(north, east) if fix else (math.nan, math.nan)
+    latitude, longitude = (
+        MapProjection(*truth.origin[:2]).reproject(north, east) if fix else (math.nan, math.nan)
+    )
     altitude = truth.origin[2] - down if fix else math.nan
     vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
     return {
@@ -300,7 +325,11 @@ def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> R
     vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
     ticks = None if options.duration is None else round(options.duration / _TICK)
     streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)
-    chosen = {at: each for at, each in streams.items() if each[0] and (topics is None or at.topic in topics)}
+    chosen = {
+        at: each
+        for at, each in streams.items()
+        if each[0] and (topics is None or at.topic in topics)
+    }
     if not chosen:
         asked = ", ".join(sorted(topics or ()))
         known = ", ".join(sorted({address.topic for address in streams}))
@@ -344,10 +373,14 @@ def _messages(
     absent = {}  # fields of PX4's newest layout, with values that mean "not provided"
     for address in chosen:
         layout = BY_TOPIC[address.topic].layout_of_release("main")
-        absent[address] = {name: kind.absent for name, kind in layout.types.items()} if layout else {}
+        absent[address] = (
+            {name: kind.absent for name, kind in layout.types.items()} if layout else {}
+        )
     for tick in count() if ticks is None else range(ticks):
         time = tick * _TICK
         now = truth_at(time, direction, origin)
         for address, (when, fields) in chosen.items():
             if tick in when:
-                yield SourceMessage(time, address, absent[address] | fields(now) | {"timestamp": now.timestamp})
+                yield SourceMessage(
+                    time, address, absent[address] | fields(now) | {"timestamp": now.timestamp}
+                )

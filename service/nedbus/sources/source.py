@@ -83,11 +83,22 @@ class ReplaySource:
     def finite(self) -> bool:
         """True if the replay has an end."""
         options = self.options
-        return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
+        return (
+            options.duration is not None
+            if isinstance(options, SimulatorOptions)
+            else not options.loop
+        )
 
 
 LiveItem = (
-    SourceMessage | Rejection | UnavailableTopics | LinkLoad | LinkCopies | LogStreamStatus | PositionStatus | None
+    SourceMessage
+    | Rejection
+    | UnavailableTopics
+    | LinkLoad
+    | LinkCopies
+    | LogStreamStatus
+    | PositionStatus
+    | None
 )
 
 

@@ -20,7 +20,9 @@ else:
         ("", "reading"): "read read_plotted",
         ("plot", "plot"): "MAX_STREAMS draw draw_fields",
     }
-    __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
+    __getattr__ = lazy_exports(
+        __name__, {name: place for place, names in _NAMES.items() for name in names.split()}
+    )
 
 __all__ = [
     "MAX_STREAMS", "addresses_of", "align", "array_of", "array_warnings", "draw", "draw_fields", "missing_of", "read",

@@ -15,7 +15,16 @@ from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray, derive_column
 from nedbus_msgs.frames import DERIVED, derived_from
 
-from .arrays import Library, Pandas, Polars, Streams, missing_of, recording_start, to_dataframe, utc_offset_of
+from .arrays import (
+    Library,
+    Pandas,
+    Polars,
+    Streams,
+    missing_of,
+    recording_start,
+    to_dataframe,
+    utc_offset_of,
+)
 from .reading import FlightPath, ReadStreams, read_streams
 
 if TYPE_CHECKING:
@@ -25,8 +34,10 @@ if TYPE_CHECKING:
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
 _MAX_ROWS: Final = 10_000_000  # rows at a given rate; a damaged timestamp must not exhaust memory
-_STALE: Final = 1_000_000  # us; a first message that is older when recording starts was sent before the start
-_STRAY: Final = 0.01  # fraction of messages that may be out of order; a larger one indicates several boots
+# us; a first message that is older when recording starts was sent before the start
+_STALE: Final = 1_000_000
+# fraction of messages that may be out of order; a larger one indicates several boots
+_STRAY: Final = 0.01
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
 _Floats = npt.NDArray[np.float64]
@@ -45,11 +56,17 @@ class _AlignOptions(TypedDict, total=False):
 
 
 @overload
-def align(flight: _Flights, *, dataframe: None = None, **options: Unpack[_AlignOptions]) -> MessageArray: ...
+def align(
+    flight: _Flights, *, dataframe: None = None, **options: Unpack[_AlignOptions]
+) -> MessageArray: ...
 @overload
-def align(flight: _Flights, *, dataframe: Pandas, **options: Unpack[_AlignOptions]) -> pd.DataFrame: ...
+def align(
+    flight: _Flights, *, dataframe: Pandas, **options: Unpack[_AlignOptions]
+) -> pd.DataFrame: ...
 @overload
-def align(flight: _Flights, *, dataframe: Polars, **options: Unpack[_AlignOptions]) -> pl.DataFrame: ...
+def align(
+    flight: _Flights, *, dataframe: Polars, **options: Unpack[_AlignOptions]
+) -> pl.DataFrame: ...
 def align(
     flight: _Flights,
     *,
@@ -92,10 +109,13 @@ def align(
     if isinstance(flight, Mapping):
         streams = _choose_streams(flight, topics, names)
     else:
-        found = read_streams(flight, names if topics else None, vehicle=vehicle, layout=layout, utc=utc)
+        found = read_streams(
+            flight, names if topics else None, vehicle=vehicle, layout=layout, utc=utc
+        )
         streams = found.streams
     if isinstance(on, str):
-        if not _streams_named(on, streams) and not isinstance(flight, Mapping):  # not a topic known to nedbus
+        # not a topic known to nedbus
+        if not _streams_named(on, streams) and not isinstance(flight, Mapping):
             streams |= read_streams(flight, [on], vehicle=vehicle, layout=layout).streams
         on = _first_named(on, streams)
         reference = [on]
@@ -108,25 +128,37 @@ def align(
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     requested = {field.rpartition(".")[2] for field in fields or ()}
     for name, (messages, lacking) in streams.items():
-        rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
+        rows, following, weight = _look_up(
+            stamps[name], times, "own" if [name] == reference else method
+        )
         values, is_absent = _pick(messages, rows), rows < 0
         if method == "linear":
             _interpolate(name, values, _pick(messages, following), weight)
-        columns[f"{name}.age"] = np.where(is_absent, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
+        columns[f"{name}.age"] = (
+            np.where(is_absent, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
+        )
         for field in messages.dtype.names or ():
             columns[f"{name}.{field}"] = values[field]
-            absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else is_absent
+            absent[f"{name}.{field}"] = (
+                np.append(lacking[field], True)[rows] if field in lacking else is_absent
+            )
         for field in requested.intersection(derived_from(messages.dtype.names or ())):
             columns[f"{name}.{field}"] = derive_column(values, field)  # from interpolated values
             absent[f"{name}.{field}"] = is_absent
     columns = columns if fields is None else _choose(columns, fields)
-    lacked = {f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages)}
+    lacked = {
+        f"{name}.{field}"
+        for name, (messages, _) in streams.items()
+        for field in missing_of(messages)
+    }
     missing = tuple(each for each in columns if each in lacked)
     types = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
     table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
     for name, column in columns.items():
         table[name] = column
-    return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
+    return to_dataframe(
+        table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe
+    )
 
 
 def _streams_named(name: str, streams: Streams) -> list[str]:
@@ -142,10 +174,18 @@ def _first_named(name: str, streams: Streams) -> str:
     return named[0]
 
 
-def _choose_streams(arrays: Mapping[str, MessageArray], topics: Sequence[str] | None, names: Sequence[str]) -> Streams:
+def _choose_streams(
+    arrays: Mapping[str, MessageArray], topics: Sequence[str] | None, names: Sequence[str]
+) -> Streams:
     if unknown := [name for name in topics or () if name not in (ANY, *arrays)]:
-        raise AddressError("topic", unknown[0], f"one of {', '.join(arrays)}", problem="is not among these arrays")
-    return {name: (array, {}) for name, array in arrays.items() if not topics or ANY in topics or name in names}
+        raise AddressError(
+            "topic", unknown[0], f"one of {', '.join(arrays)}", problem="is not among these arrays"
+        )
+    return {
+        name: (array, {})
+        for name, array in arrays.items()
+        if not topics or ANY in topics or name in names
+    }
 
 
 def _start_of(found: ReadStreams | None) -> int:
@@ -166,14 +206,23 @@ def _to_utc(times: _Ints, offset: UtcOffset | None) -> npt.NDArray[np.datetime64
     return to_datetime64(offset.unix_us(times) if offset else 0 * times)
 
 
-def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+def _choose(
+    columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]
+) -> dict[str, npt.NDArray[Any]]:
     """Return the time columns and those that `fields` selects; raise ArgumentError for an unknown field."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):
         raise ArgumentError(
-            "fields", sorted(unknown), f"any of {', '.join([*columns, *DERIVED])}", problem="are in no stream"
+            "fields",
+            sorted(unknown),
+            f"any of {', '.join([*columns, *DERIVED])}",
+            problem="are in no stream",
         )
-    return {name: column for name, column in columns.items() if name in {"timestamp", "utc"} or known[name] & {*fields}}
+    return {
+        name: column
+        for name, column in columns.items()
+        if name in {"timestamp", "utc"} or known[name] & {*fields}
+    }
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
@@ -202,11 +251,15 @@ def _pick(messages: MessageArray, rows: _Ints) -> MessageArray:
     return values
 
 
-def _interpolate(stream: str, values: MessageArray, following: MessageArray, weight: _Floats) -> None:
+def _interpolate(
+    stream: str, values: MessageArray, following: MessageArray, weight: _Floats
+) -> None:
     """Interpolate the floats of `values` towards `following`, in place."""
     definition = next((BY_TOPIC[part] for part in stream.split("/") if part in BY_TOPIC), None)
     rules = definition.rules if definition else ()
-    quaternions = {name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields}
+    quaternions = {
+        name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields
+    }
     names = values.dtype.names or ()
     for name in names:
         if name.endswith("reset_counter"):
@@ -232,7 +285,9 @@ def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> 
         step = second - first
         turned = first + weight * (step - np.sign(step) * period)
         start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
-        return np.where(np.abs(step) > period / 2, start + np.mod(turned - start, period), first + weight * step)
+        return np.where(
+            np.abs(step) > period / 2, start + np.mod(turned - start, period), first + weight * step
+        )
 
 
 def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Floats:
@@ -251,7 +306,10 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
     late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
     early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])
     if min(late, early) > max(1, _STRAY * len(stamps)):
-        raise ConfigError(stream, "timestamps restart; align the messages of each boot separately, as slices of `read`")
+        raise ConfigError(
+            stream,
+            "timestamps restart; align the messages of each boot separately, as slices of `read`",
+        )
     return stamps
 
 
@@ -268,13 +326,19 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
     At `start`, PX4 also logs the last message of slow topics, which may be much older: then begin at `start`.
     """
     given = np.asarray(on)
-    if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):
+    if (
+        given.dtype.kind not in "iuf"
+        or given.ndim > 1
+        or not np.all((given > 0) if given.ndim == 0 else (given >= 0))
+    ):
         raise ArgumentError("on", on, "a stream, a rate above 0 [Hz], or times [us]")
     if given.ndim:
         return given.astype(np.int64)
     # A timestamp of 0 is unset, and a few wild ones do not determine the period.
     valid = {name: _without_wild(times[times > 0]) for name, times in stamps.items() if times.any()}
-    firsts, lasts = ({name: int(end(each)) for name, each in valid.items()} for end in (np.min, np.max))
+    firsts, lasts = (
+        {name: int(end(each)) for name, each in valid.items()} for end in (np.min, np.max)
+    )
     rate = float(given)
     first = min(firsts.values(), default=2**62)
     last = max(lasts.values(), default=0)
@@ -284,5 +348,7 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
         earliest, latest = min(firsts, key=firsts.__getitem__), max(lasts, key=lasts.__getitem__)
         ends = f"{earliest} begins at {first / 1e6:.0f} s, {latest} ends at {last / 1e6:.0f} s"
         problem = f"Hz results in too many rows ({ends})"
-        raise ArgumentError("on", rate, "topics on one clock, a lower rate, or times", problem=problem)
+        raise ArgumentError(
+            "on", rate, "topics on one clock, a lower rate, or times", problem=problem
+        )
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

@@ -38,11 +38,15 @@ def addresses_of(path: str | Path) -> list[Address]:
 
     It includes messages that only the file defines.
     """
-    with open_arrays([Path(path).expanduser()], ReadOptions(topics=None), lambda _: False) as flight:
+    with open_arrays(
+        [Path(path).expanduser()], ReadOptions(topics=None), lambda _: False
+    ) as flight:
         return flight.addresses
 
 
-def open_arrays(paths: Sequence[Path], options: ReadOptions, selects: Callable[[Address], bool]) -> Flight:
+def open_arrays(
+    paths: Sequence[Path], options: ReadOptions, selects: Callable[[Address], bool]
+) -> Flight:
     """Read files once, to return the messages of selected addresses as arrays on request.
 
     Raises SourceError if a file cannot be read.
@@ -52,7 +56,9 @@ def open_arrays(paths: Sequence[Path], options: ReadOptions, selects: Callable[[
     return flight
 
 
-def array_of(flight: Flight, address: Address, *, unix_times: bool = False) -> tuple[MessageArray, Absent]:
+def array_of(
+    flight: Flight, address: Address, *, unix_times: bool = False
+) -> tuple[MessageArray, Absent]:
     """Return the valid messages of an address, with a mask of the messages that lack a field, by field.
 
     The dtype has the names of these fields. `unix_times`: their timestamps become Unix times [us].
@@ -118,7 +124,9 @@ def array_warnings(flight: Flight) -> list[tuple[Path, str]]:
     return found
 
 
-def recording_start(flight: Flight, addresses: Sequence[Address], *, unix_times: bool = False) -> int:
+def recording_start(
+    flight: Flight, addresses: Sequence[Address], *, unix_times: bool = False
+) -> int:
     """Return when the recording of these addresses began, on the clock of their timestamps [us], 0 if it is unknown.
 
     `unix_times`: as in `array_of`.
@@ -161,19 +169,24 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
     columns: dict[str, Any] = {}
     for name in messages.dtype.names or ():
         values = messages[name]
-        parts = [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
+        parts = (
+            [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
+        )
         for part, each in zip(parts, values.reshape(len(values), len(parts)).T, strict=True):
             if each.dtype.kind == "S":
                 column = package.Series(list(map(decode_text, each.tolist())))
             else:
                 column = package.Series(np.ascontiguousarray(_to_signed(each)))
             if each.dtype.kind == "M":
-                zoned = column.dt.tz_localize if library == "pandas" else column.dt.replace_time_zone
+                zoned = (
+                    column.dt.tz_localize if library == "pandas" else column.dt.replace_time_zone
+                )
                 column = zoned("UTC")
             elif name in absent and library == "polars":
                 column = column.scatter(np.flatnonzero(absent[name]), None)
             elif name in absent:
-                nullable = column if each.dtype.kind == "f" else column.convert_dtypes()  # floats use NaN
+                # floats use NaN
+                nullable = column if each.dtype.kind == "f" else column.convert_dtypes()
                 column = nullable.mask(absent[name])
             columns[part] = column
     data = package.DataFrame(columns)

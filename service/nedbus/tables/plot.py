@@ -41,7 +41,8 @@ _MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
 }  # fmt: skip
 _LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
 _LEGEND_TOP: Final = -0.1  # in heights of the track, below its axis label
-_STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21_600)  # s between ticks
+# s between ticks
+_STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21_600)
 _TICKS: Final = 6  # on a time axis
 _BOOT: Final = Times()
 _NEAR: Final = 1.0  # s between an event and the message with its position
@@ -79,7 +80,9 @@ class _Mark(NamedTuple):
     end: float
 
 
-def draw(streams: _Arrays, path: Path, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT) -> None:
+def draw(
+    streams: _Arrays, path: Path, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
+) -> None:
     """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
     Each stream must have at least one message.
@@ -108,7 +111,9 @@ def draw_fields(
 def _save(path: Path, draw_it: Callable[[], Figure]) -> None:
     """Save a figure in the format of the file's suffix; nothing is drawn for another suffix."""
     if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(str(path), f"not an image format; the name must end with {' or '.join(_SUFFIXES)}")
+        raise ConfigError(
+            str(path), f"not an image format; the name must end with {' or '.join(_SUFFIXES)}"
+        )
     try:
         # A glyph that the font lacks is only a warning.
         with atomic_write(path, replace=True) as part, warnings.catch_warnings(action="ignore"):
@@ -117,7 +122,9 @@ def _save(path: Path, draw_it: Callable[[], Figure]) -> None:
         raise OutputError(path, exc) from exc
 
 
-def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT) -> Figure:
+def draw_figure(
+    streams: _Arrays, *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
+) -> Figure:
     """Return the figure that `draw` saves."""
     drawn, start = _streams(streams)
     rows, marks = _rows(drawn), _marks(drawn, start / 1e6, events)
@@ -142,15 +149,24 @@ def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), t
     by_time = sorted((mark for own in marks.values() for mark in own), key=lambda mark: mark.begin)
     _mark_events(axes, drawn, by_time)
     # Below the label of the axis; inside the axes it would cover the track.
-    axes["track"].legend(fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, _LEGEND_TOP))
-    seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in by_time)])
+    axes["track"].legend(
+        fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, _LEGEND_TOP)
+    )
+    seconds = np.concatenate(
+        [*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in by_time)]
+    )
     margin = 0.02 * (np.ptp(seconds) or 1.0)
-    axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
+    # room for the last label
+    axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)
     label = _label_times(axes["altitude"], drawn, start / 1e6, times)
     for name in {"speed", lowest}:
         axes[name].set_xlabel(label)
-    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may contain any bytes
-    missing = {each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))] for each in drawn}
+    # a file name may contain any bytes
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)
+    missing = {
+        each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))]
+        for each in drawn
+    }
     notes = (f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)
     figure.supxlabel("\n".join(notes), fontsize="small")
     if marks:
@@ -159,7 +175,12 @@ def draw_figure(streams: _Arrays, *, title: str, events: Iterable[Event] = (), t
 
 
 def draw_field_figure(
-    streams: _Arrays, names: Sequence[str], *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
+    streams: _Arrays,
+    names: Sequence[str],
+    *,
+    title: str,
+    events: Iterable[Event] = (),
+    times: Times = _BOOT,
 ) -> Figure:
     """Return the figure that `draw_fields` saves."""
     drawn, start = _streams(streams)
@@ -182,7 +203,8 @@ def draw_field_figure(
     if len(drawn) > 1:
         first.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     lowest.set_xlabel(_label_times(first, drawn, start / 1e6, times))
-    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may contain any bytes
+    # a file name may contain any bytes
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)
     if marks:
         _draw_events(figure, axes["events"], marks)
     return figure
@@ -194,11 +216,15 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
     for stream in streams:
         values = _values_of(stream.messages, name)
         if values is not None:
-            axes.plot(stream.seconds, values, color=stream.color, linewidth=0.9, label=str(stream.address))
+            axes.plot(
+                stream.seconds, values, color=stream.color, linewidth=0.9, label=str(stream.address)
+            )
             drawn += 1
     if not drawn:
         known = sorted({each for stream in streams for each in _plottable(stream.messages)})
-        raise ConfigError("--field", f"no selected stream has a number {name!r}; they have {', '.join(known)}")
+        raise ConfigError(
+            "--field", f"no selected stream has a number {name!r}; they have {', '.join(known)}"
+        )
     meaning = DERIVED[name].meaning if name in DERIVED else name
     axes.set_title(meaning, fontsize="medium", loc="right", parse_math=False)
     axes.grid(alpha=0.3)
@@ -207,7 +233,11 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
 def _plottable(messages: MessageArray) -> list[str]:
     """Return the names of the fields with one number or flag each, and of the quantities derived from fields."""
     names = messages.dtype.names or ()
-    own = [name for name in names if messages.dtype[name].shape == () and messages.dtype[name].kind in "biuf"]
+    own = [
+        name
+        for name in names
+        if messages.dtype[name].shape == () and messages.dtype[name].kind in "biuf"
+    ]
     return own + derived_from(names)
 
 
@@ -250,15 +280,28 @@ def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None
     _draw_lines(axes["track"], streams, "xy_valid", tracks, width=1.2)
     altitudes = [(each.seconds, -each.messages["z"]) for each in streams]
     _draw_lines(axes["altitude"], streams, "z_valid", altitudes, width=1.0)
-    speeds = [(each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams]
+    speeds = [
+        (each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams
+    ]
     _draw_lines(axes["speed"], streams, "v_xy_valid", speeds, width=0.9)
     for stream in streams:
         track = stream.messages[stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])]
         if len(track):
-            axes["track"].plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
-            axes["track"].plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
+            axes["track"].plot(
+                track["y"][0],
+                track["x"][0],
+                "o",
+                color=stream.color,
+                markersize=7,
+                fillstyle="none",
+            )
+            axes["track"].plot(
+                track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4
+            )
         for time in np.union1d(stream.resets("z_reset_counter"), stream.resets("vz_reset_counter")):
-            axes["altitude"].axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
+            axes["altitude"].axvline(
+                time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--"
+            )
     axes["track"].set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
     axes["track"].locator_params(axis="x", nbins=6)  # more labels may overlap
     axes["track"].set_title("track; circle: start, square: end, thin: xy invalid")
@@ -270,14 +313,23 @@ def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None
 
 
 def _draw_lines(
-    axes: Any, streams: Sequence[_Stream], flag: str, lines: Sequence[tuple[Any, Any]], *, width: float
+    axes: Any,
+    streams: Sequence[_Stream],
+    flag: str,
+    lines: Sequence[tuple[Any, Any]],
+    *,
+    width: float,
 ) -> None:
     """Plot a line per stream, thin where its flag is false; thin parts affect the limits only if nothing is valid."""
     valid = [stream.messages[flag] for stream in streams]
-    in_scale = not any(np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True))
+    in_scale = not any(
+        np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True)
+    )
     for stream, each, line in zip(streams, valid, lines, strict=True):
-        thin = Line2D(*line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)  # below all other lines
-        (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
+        # below all other lines
+        thin = Line2D(*line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)
+        # artists do not affect the axis limits
+        (axes.add_line if in_scale else axes.add_artist)(thin)
         thick = (np.where(each, values, np.nan) for values in line)
         axes.plot(*thick, color=stream.color, linewidth=width, label=str(stream.address))
 
@@ -286,7 +338,8 @@ def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
     """Return label, stream and field of each row: flags, heading resets, and other reset counters that change."""
     rows: list[tuple[str, _Stream, str]] = []
     for stream in streams:
-        suffix, missing = f" {stream.address}" if len(streams) > 1 else "", missing_of(stream.messages)
+        suffix = f" {stream.address}" if len(streams) > 1 else ""
+        missing = missing_of(stream.messages)
         rows += ((name + suffix, stream, name) for name in _FLAGS if name not in missing)
         for counter, name in _COUNTERS.items():
             if counter not in missing and (name == "heading" or len(stream.resets(counter))):
@@ -300,15 +353,25 @@ def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
             times = stream.resets(field)
             axes.plot(times, np.full(len(times), number), "|", color=stream.color, markersize=7)
         else:
-            flag, color = stream.messages[field], _WARNING_COLOR if field == "dead_reckoning" else stream.color
-            is_shown = flag | np.append(False, flag[:-1])  # fill to the first message without the flag
-            axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
-    axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
+            flag = stream.messages[field]
+            color = _WARNING_COLOR if field == "dead_reckoning" else stream.color
+            # fill to the first message without the flag
+            is_shown = flag | np.append(False, flag[:-1])
+            axes.fill_between(
+                stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color
+            )
+    axes.set_yticks(
+        range(len(rows)),
+        [label for label, *_ in rows],
+        fontsize="x-small" if len(rows) > 12 else "small",
+    )
     axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
 
 
-def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> dict[str, list[_Mark]]:
+def _marks(
+    streams: Sequence[_Stream], start: float, events: Iterable[Event]
+) -> dict[str, list[_Mark]]:
     """Return the marks of the plotted vehicles by row, the most severe row first, each row in chronological order.
 
     Events far from all messages are left out, because their timestamps must be damaged.
@@ -317,29 +380,45 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
     rows = defaultdict[str, dict[Event, _Mark]](dict)
     vehicles = sorted({stream.address.vehicle for stream in streams})
     for vehicle in vehicles:
-        seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
+        seconds = np.concatenate(
+            [stream.seconds for stream in streams if stream.address.vehicle == vehicle]
+        )
         first, last = float(seconds.min()), float(seconds.max())
         for span in spans_of([event for event in timed if event.vehicle == vehicle]):
             event = span.begin
-            if span.initial or event.boot is None or (event.severity == "info" and not KINDS[event.kind].phase):
+            if (
+                span.initial
+                or event.boot is None
+                or (event.severity == "info" and not KINDS[event.kind].phase)
+            ):
                 continue
             offset = event.boot - start - event.time
             begin = span.since + offset
             if max(first - begin, begin - last) > last - first + _NEAR:
                 continue
             row = KINDS[event.kind].row or event.kind.replace("_", " ")
-            text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
+            text = (
+                event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
+            )
             marks = rows[f"{row} {vehicle}" if len(vehicles) > 1 else row]
             end = max(begin, last if span.until is None else min(span.until + offset, last))
             # Conditions that begin with the same event share a mark, which ends when the last condition ends.
-            marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
+            marks[event] = _Mark(
+                event, text, begin, max(end, marks[event].end) if event in marks else end
+            )
     order = {
-        row: min((SEVERITIES.index(each.event.severity), each.begin) for each in rows[row].values()) for row in rows
+        row: min((SEVERITIES.index(each.event.severity), each.begin) for each in rows[row].values())
+        for row in rows
     }
-    return {row: sorted(rows[row].values(), key=lambda mark: mark.begin) for row in sorted(rows, key=order.__getitem__)}
+    return {
+        row: sorted(rows[row].values(), key=lambda mark: mark.begin)
+        for row in sorted(rows, key=order.__getitem__)
+    }
 
 
-def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
+def _mark_events(
+    axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]
+) -> None:
     """Mark the start of bad and watch events on the track and on the time axes of altitude and speed."""
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
@@ -348,7 +427,12 @@ def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Ite
         own = [mark for mark in marks if mark.event.severity == severity]
         if not own:
             continue
-        style: dict[str, Any] = {"marker": marker, "color": color, "fillstyle": "none", "linestyle": "none"}
+        style: dict[str, Any] = {
+            "marker": marker,
+            "color": color,
+            "fillstyle": "none",
+            "linestyle": "none",
+        }
         places = []
         for mark in own:
             stream = main[mark.event.vehicle]
@@ -356,13 +440,21 @@ def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Ite
             if abs(stream.seconds[nearest] - mark.begin) <= _NEAR:
                 places.append((stream.messages["y"][nearest], stream.messages["x"][nearest]))
         if places:
-            found = Line2D(*zip(*places, strict=True), label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3)
+            found = Line2D(
+                *zip(*places, strict=True),
+                label=label,
+                markersize=size + 1,
+                markeredgewidth=1.5,
+                zorder=3,
+            )
             found.set(**style)
             axes["track"].add_artist(found)
         for name in ("altitude", "speed"):
             bottom = axes[name].get_xaxis_transform()
             times = [mark.begin for mark in own]
-            axes[name].add_artist(Line2D(times, [0.03] * len(own), transform=bottom, markersize=size - 1, **style))
+            axes[name].add_artist(
+                Line2D(times, [0.03] * len(own), transform=bottom, markersize=size - 1, **style)
+            )
 
 
 def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
@@ -380,12 +472,15 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
     gap = _GAP * _DPI / 72
     for number, marks in enumerate(rows.values()):
         places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
-        for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
+        for mark, after in zip(
+            marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True
+        ):
             text = axes.annotate(
                 mark.text, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
                 fontsize="x-small", parse_math=False,
             )  # fmt: skip
             text.set_in_layout(False)
             box = text.get_window_extent()
-            if box.x0 + 1.05 * box.width > after - gap:  # text width differs slightly between file formats
+            # text width differs slightly between file formats
+            if box.x0 + 1.05 * box.width > after - gap:
                 text.remove()

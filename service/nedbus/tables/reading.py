@@ -50,19 +50,29 @@ class _Filter(TypedDict, total=False):
 
 
 @overload
-def read(path: FlightPath, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_Filter]) -> MessageArray: ...
+def read(
+    path: FlightPath, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_Filter]
+) -> MessageArray: ...
 @overload
-def read(path: FlightPath, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_Filter]) -> pd.DataFrame: ...
+def read(
+    path: FlightPath, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_Filter]
+) -> pd.DataFrame: ...
 @overload
-def read(path: FlightPath, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_Filter]) -> pl.DataFrame: ...
+def read(
+    path: FlightPath, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_Filter]
+) -> pl.DataFrame: ...
 @overload
 def read(
     path: Files, topic: _Topics, *, dataframe: None = None, **stream: Unpack[_Filter]
 ) -> dict[str, MessageArray]: ...
 @overload
-def read(path: Files, topic: _Topics, *, dataframe: Pandas, **stream: Unpack[_Filter]) -> dict[str, pd.DataFrame]: ...
+def read(
+    path: Files, topic: _Topics, *, dataframe: Pandas, **stream: Unpack[_Filter]
+) -> dict[str, pd.DataFrame]: ...
 @overload
-def read(path: Files, topic: _Topics, *, dataframe: Polars, **stream: Unpack[_Filter]) -> dict[str, pl.DataFrame]: ...
+def read(
+    path: Files, topic: _Topics, *, dataframe: Polars, **stream: Unpack[_Filter]
+) -> dict[str, pl.DataFrame]: ...
 def read(
     path: Files,
     topic: str | _Topics = DEFAULT_TOPIC,
@@ -90,8 +100,15 @@ def read(
     several streams match topic, vehicle and instance; ConfigError if the package that reads the file is not installed.
     """
     found = read_streams(path, topic, vehicle=vehicle, instance=instance, layout=layout)
-    tables = {name: to_dataframe(messages, absent, dataframe) for name, (messages, absent) in found.streams.items()}
-    return next(iter(tables.values())) if isinstance(topic, str) and isinstance(path, FlightPath) else tables
+    tables = {
+        name: to_dataframe(messages, absent, dataframe)
+        for name, (messages, absent) in found.streams.items()
+    }
+    return (
+        next(iter(tables.values()))
+        if isinstance(topic, str) and isinstance(path, FlightPath)
+        else tables
+    )
 
 
 class ReadStreams(NamedTuple):
@@ -127,7 +144,9 @@ def read_streams(
         options = _options(names, layout, utc=utc)
         flight, chosen = _choose_in_one(Path(path).expanduser(), options, selections, select)
     else:
-        flight, chosen = _choose_in_several([Path(each).expanduser() for each in path], names, vehicle, layout)
+        flight, chosen = _choose_in_several(
+            [Path(each).expanduser() for each in path], names, vehicle, layout
+        )
     streams = Streams()
     for address in chosen:
         name = address.stream if is_one_file else f"{address.vehicle}/{address.stream}"
@@ -137,14 +156,17 @@ def read_streams(
     return ReadStreams(streams, flight, chosen, unix_times=not is_one_file)
 
 
-def read_plotted(paths: Sequence[Path], selection: Selection, topics: Collection[str]) -> tuple[Flight, list[Address]]:
+def read_plotted(
+    paths: Sequence[Path], selection: Selection, topics: Collection[str]
+) -> tuple[Flight, list[Address]]:
     """Read these topics of one or more files for a plot; return the addresses that a selection chooses.
 
     Raises the errors of `read`.
     """
     topics = frozenset(topics)
     options = ReadOptions(topics if len(paths) == 1 else topics | _UTC_TOPICS)
-    selects = Selection(selection.topics, instance=selection.instance).matches  # a vehicle may have another name here
+    # a vehicle may have another name here
+    selects = Selection(selection.topics, instance=selection.instance).matches
     flight = open_arrays(paths, options, selects)
     found = matching(paths[0], flight.addresses, selection)
     return flight, [address for address in found if address.topic in topics]
@@ -162,8 +184,12 @@ def _choose_in_one(
 ) -> tuple[Flight, list[Address]]:
     """Read a file; return the addresses of one vehicle that are selected."""
     try:
-        flight = open_arrays([path], options, lambda address: any(one.matches(address) for one in selections))
-        chosen = dict.fromkeys(each for one in selections for each in select(path, flight.addresses, one))
+        flight = open_arrays(
+            [path], options, lambda address: any(one.matches(address) for one in selections)
+        )
+        chosen = dict.fromkeys(
+            each for one in selections for each in select(path, flight.addresses, one)
+        )
     except (AddressError, SourceError) as exc:
         raise _explain_absent(path, options, selections, select) or exc from None
     require_one_vehicle(path, chosen, selections[0].vehicles[0])
@@ -179,7 +205,9 @@ def _choose_in_several(
         Selection(topic)  # raises AddressError for a name that no topic can have
     options = _options(topics, layout, utc=True)
     try:
-        flight = open_arrays(paths, options, lambda address: wanted is None or address.topic in wanted)
+        flight = open_arrays(
+            paths, options, lambda address: wanted is None or address.topic in wanted
+        )
     except SourceError as exc:
         selections = [Selection(topic) for topic in sorted(wanted or ())]
         raise _explain_absent(Path(exc.source), options, selections, matching) or exc from None
@@ -189,13 +217,23 @@ def _choose_in_several(
     chosen: list[Address] = []
     for name in vehicles:
         others = {*vehicles} - {name}
-        own = [each.removeprefix(f"{name}/") for each in topics or [ANY] if each.partition("/")[0] not in others]
+        own = [
+            each.removeprefix(f"{name}/")
+            for each in topics or [ANY]
+            if each.partition("/")[0] not in others
+        ]
         if vehicle not in (ANY, name) or not own:
             continue
-        available = [each for each in flight.addresses if each.vehicle == name and (not wanted or each.topic in wanted)]
+        available = [
+            each
+            for each in flight.addresses
+            if each.vehicle == name and (not wanted or each.topic in wanted)
+        ]
         selections = [_selection(each, name, None) for each in own]
         path = path_of(flight, name)
-        chosen += dict.fromkeys(each for one in selections for each in matching(path, available, one))
+        chosen += dict.fromkeys(
+            each for one in selections for each in matching(path, available, one)
+        )
     return flight, chosen
 
 
@@ -205,7 +243,9 @@ def _explain_absent(
     """Return an error with the streams of a file if it lacks a selected one; None if that was not the fault."""
     if options.topics is None or TOPICS.keys() <= {*options.topics}:
         return None
-    flight = open_arrays([path], replace(options, topics={*options.topics, *TOPICS}), lambda _: False)
+    flight = open_arrays(
+        [path], replace(options, topics={*options.topics, *TOPICS}), lambda _: False
+    )
     for one in selections:
         try:
             select(path, flight.addresses, one)
@@ -217,7 +257,11 @@ def _explain_absent(
 def _selection(name: str, vehicle: str, instance: int | None) -> Selection:
     """Return the selection of a topic, or of a stream such as sensor_gps/1."""
     topic, _, number = name.rpartition("/")
-    return Selection(topic, vehicle, int(number)) if number.isdecimal() else Selection(name, vehicle, instance)
+    return (
+        Selection(topic, vehicle, int(number))
+        if number.isdecimal()
+        else Selection(name, vehicle, instance)
+    )
 
 
 def _topics(names: Sequence[str] | None) -> Set[str] | None:

@@ -30,4 +30,6 @@ if TYPE_CHECKING:
     from .utc_estimate import UtcEstimate, to_datetime64
 else:
     # NumPy is slow to import.
-    __getattr__ = lazy_exports(__name__, dict.fromkeys(("UtcEstimate", "to_datetime64"), ("", "utc_estimate")))
+    __getattr__ = lazy_exports(
+        __name__, dict.fromkeys(("UtcEstimate", "to_datetime64"), ("", "utc_estimate"))
+    )

@@ -19,17 +19,21 @@ from .axis import Axis
 from .vehicle_clock import is_boot_possible
 
 _NEAR: Final = 1_000_000  # us; a message this much older or newer than the newest one is usual
-_MAX_LATE: Final = 60_000_000  # us; a message that arrived later than this is old, and keeps its place in the file
+# us; a message that arrived later than this is old, and keeps its place in the file
+_MAX_LATE: Final = 60_000_000
 _MAX_GAP: Final = 30 * 86_400_000_000  # us; a longer pause between two log times is a damaged one
 _MAX_LAST: Final = 86_400_000_000  # us; a last message further ahead has a damaged timestamp
 _CONFIRM: Final = 20  # messages in a row that show that a clock has changed
 _AGREEING: Final = 3  # streams that show together that a clock has gone on
-_OPENING: Final = 1000  # messages from which the start of a file is determined; PX4 first logs an old one of each topic
+# messages from which the start of a file is determined; PX4 first logs an old one of each topic
+_OPENING: Final = 1000
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
 _PART: Final = 2048  # messages that are sorted and passed on at once
-_QUEUED: Final = ("log_message", "event")  # PX4 queues these: the first ones of a log may be from long before it
-_MAX_STEPS: Final = 1000  # changes of the recorder's clock that are kept, to place a vehicle that appears later
+# PX4 queues these: the first ones of a log may be from long before it
+_QUEUED: Final = ("log_message", "event")
+# changes of the recorder's clock that are kept, to place a vehicle that appears later
+_MAX_STEPS: Final = 1000
 
 
 class Message(Protocol):
@@ -138,7 +142,8 @@ class _Track(Generic[M]):
         if agrees or -_NEAR <= distance <= _NEAR:
             if before is not None and is_back and log is None:
                 self.unordered[item.message.address] += 1
-                return self.base + before  # a log keeps the order of each stream, in which the vehicle wrote it
+                # a log keeps the order of each stream, in which the vehicle wrote it
+                return self.base + before
             self._follow(item)
             return self.base + stamp
         is_batched = before is not None and before < stamp <= min(before + _MAX_LATE, self.newest)
@@ -200,12 +205,15 @@ class _Track(Generic[M]):
                 continue
             is_same_clock = is_unix_time(item.stamp) == self.is_unix
             is_next = before is None or before < item.stamp
-            is_old = is_next and is_same_clock and item.stamp < newest  # a stream may begin with old messages
+            # a stream may begin with old messages
+            is_old = is_next and is_same_clock and item.stamp < newest
             is_late = False
             if item.log is not None and self.lag is not None and before != item.stamp:
                 is_late = item.stamp < newest and item.log - item.stamp - self.lag <= _MAX_LATE
             if before is not None and before != item.stamp and not is_old:
-                self.unordered[item.message.address] += item.log is None or abs(item.stamp - before) > _MAX_LATE
+                self.unordered[item.message.address] += (
+                    item.log is None or abs(item.stamp - before) > _MAX_LATE
+                )
             if item.log is None and before is not None and item.stamp < before:
                 found.append((self.base + before, item))  # a log keeps the order of each stream
                 continue
@@ -221,14 +229,19 @@ class _Track(Generic[M]):
         if len(ahead) < _AGREEING:
             return False
         middle = median_low([each.stamp for each in ahead])
-        return len({id(each.stream) for each in ahead if abs(each.stamp - middle) <= _NEAR}) >= _AGREEING
+        return (
+            len({id(each.stream) for each in ahead if abs(each.stamp - middle) <= _NEAR})
+            >= _AGREEING
+        )
 
     def _is_set_back(self) -> bool:
         """Return whether a synchronized clock was set back: a stream goes on from an earlier time."""
         last = self.doubtful[-1]
         if not self.is_unix or last.log is None or last.stamp > self.newest:
             return False
-        return any(each.stream is last.stream and each.stamp < last.stamp for each in self.doubtful[:-1])
+        return any(
+            each.stream is last.stream and each.stamp < last.stamp for each in self.doubtful[:-1]
+        )
 
     def _decide(self, *, is_end: bool = False) -> _Placed[M]:
         """Decide on the doubtful messages: those that advance together show where the vehicle's clock is."""
@@ -249,7 +262,8 @@ class _Track(Generic[M]):
         elapsed = None if first.log is None or self.log is None else first.log - self.log
         is_known = elapsed is not None and 0 <= elapsed <= _MAX_GAP
         is_pause = is_ahead and is_unix == self.is_unix
-        if is_pause and is_unix and elapsed is not None and is_known:  # the log times run on: the clock was set
+        # the log times run on: the clock was set
+        if is_pause and is_unix and elapsed is not None and is_known:
             is_pause = first.stamp - self.newest - elapsed <= _NEAR
         if is_pause:
             self.newest, self.log = first.stamp, first.log
@@ -266,7 +280,13 @@ class _Track(Generic[M]):
         return found
 
     def _is_possible(
-        self, items: Sequence[_Item[M]], first: _Item[M], *, is_ahead: bool, is_unix: bool, is_end: bool
+        self,
+        items: Sequence[_Item[M]],
+        first: _Item[M],
+        *,
+        is_ahead: bool,
+        is_unix: bool,
+        is_end: bool,
     ) -> bool:
         """Return whether the vehicle's clock may have changed to that of these messages."""
         if is_ahead:
@@ -274,7 +294,9 @@ class _Track(Generic[M]):
             return len(items) > 1 or (is_end and is_same and first.stamp - self.newest <= _MAX_LAST)
         return len(items) > 1 and self._may_have_gone_back(items, first, is_unix=is_unix)
 
-    def _may_have_gone_back(self, items: Sequence[_Item[M]], first: _Item[M], *, is_unix: bool) -> bool:
+    def _may_have_gone_back(
+        self, items: Sequence[_Item[M]], first: _Item[M], *, is_unix: bool
+    ) -> bool:
         """Return whether the vehicle may have rebooted, or its Unix time may have been set back."""
         set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
         if first.log is None or self.log is None:  # a log: a few streams may have waited in a queue
@@ -303,7 +325,9 @@ class Order(Generic[M]):
     `axis`: the places of the vehicles' clocks. `unordered`: messages whose timestamps are out of order, by address.
     """
 
-    def __init__(self, start_of: Callable[[str], int] = _unknown, *, has_log_times: bool = True) -> None:
+    def __init__(
+        self, start_of: Callable[[str], int] = _unknown, *, has_log_times: bool = True
+    ) -> None:
         self.axis = Axis()
         self.whole: Axis | None = None
         self.unordered: Counter[Address] = Counter()
@@ -311,8 +335,10 @@ class Order(Generic[M]):
         self._zero: int | None = None
         self._place_of_last: int | None = None  # of the messages that were yielded
         self._tracks: dict[str, _Track[M]] = {}
-        self._anchors: tuple[list[int], list[int]] = [], []  # numbers of messages, and place minus log time from there
-        self._candidate: int | None = None  # place minus log time of the last message, if it differs
+        # numbers of messages, and place minus log time from there
+        self._anchors: tuple[list[int], list[int]] = [], []
+        # place minus log time of the last message, if it differs
+        self._candidate: int | None = None
 
     @property
     def remarks(self) -> list[str]:
@@ -320,7 +346,9 @@ class Order(Generic[M]):
         found = []
         for name, track in self._tracks.items():
             if track.changes:
-                found.append(f"the clock of vehicle {name} was set ({track.changes}); the order of the file decides")
+                found.append(
+                    f"the clock of vehicle {name} was set ({track.changes}); the order of the file decides"
+                )
         return found
 
     @property
@@ -336,14 +364,19 @@ class Order(Generic[M]):
         has_log_times = self._has_log_times
         for number, message in enumerate(messages):
             stream, log = message.logged, message.time
-            stamp = 0 if message.error is not None else message.timestamp or 0 if has_log_times else log
+            stamp = (
+                0 if message.error is not None else message.timestamp or 0 if has_log_times else log
+            )
             track = tracks.get(message.address.vehicle) or self._track_of(message.address.vehicle)
             if (
                 track.is_open
                 and -_NEAR <= stamp - track.newest <= _NEAR
                 and not track.doubtful
                 and stamp >= track.last.get(stream, 0)
-                and (not has_log_times or (track.lag is not None and -_NEAR <= log - stamp - track.lag <= _NEAR))
+                and (
+                    not has_log_times
+                    or (track.lag is not None and -_NEAR <= log - stamp - track.lag <= _NEAR)
+                )
             ):
                 track.last[stream] = stamp
                 if stamp > track.newest:
@@ -410,7 +443,9 @@ class Order(Generic[M]):
         by_vehicle = defaultdict[str, list[_Item[M]]](list)
         for item in opening:
             by_vehicle[item.message.address.vehicle].append(item)
-        firsts = {name: _first_of(items, self._start_of(name)) for name, items in by_vehicle.items()}
+        firsts = {
+            name: _first_of(items, self._start_of(name)) for name, items in by_vehicle.items()
+        }
         for name, first in sorted(firsts.items(), key=lambda each: each[1].number):
             time = first.stamp if first.log is None else first.log
             self._tracks[name].begin(first, time + self._offset_at(first.number))
@@ -487,17 +522,25 @@ def _first_of(items: Sequence[_Item[M]], start: int) -> _Item[M]:
             streams[item.stream].append(item)
     if not streams:
         return items[0]
-    current = {stream: own for stream, own in streams.items() if own[0].message.address.topic not in _QUEUED}
+    current = {
+        stream: own
+        for stream, own in streams.items()
+        if own[0].message.address.topic not in _QUEUED
+    }
     streams = current or streams
     for own in streams.values():
         if len(own) > 1 and _is_old(own[0], own[1]):
             del own[0]
     advancing = _advancing(streams.values())
-    since_start = _advancing([item for item in own if item.stamp >= start] for own in streams.values())
+    since_start = _advancing(
+        [item for item in own if item.stamp >= start] for own in streams.values()
+    )
     if start and since_start:
         advancing = since_start
     if not advancing:
-        known = [own[0] for own in streams.values() if own[0].stamp >= start - _NEAR] if start else []
+        known = (
+            [own[0] for own in streams.values() if own[0].stamp >= start - _NEAR] if start else []
+        )
         return min(known or [own[0] for own in streams.values()][:1], key=lambda each: each.stamp)
     groups: list[list[list[_Item[M]]]] = []  # of streams on one clock, whose periods overlap
     end = 0

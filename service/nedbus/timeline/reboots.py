@@ -37,7 +37,9 @@ class RebootDetector:
         self.before = 0
         self._suspected: Hashable = None  # the stream of the first message
 
-    def add(self, stream: Hashable, time: int, *, before: int, other: int, elapsed: float) -> RebootSign:
+    def add(
+        self, stream: Hashable, time: int, *, before: int, other: int, elapsed: float
+    ) -> RebootSign:
         """Return what a message shows.
 
         `before`: the time of the message before it in its stream [us]. `other`: that of one more message, of this

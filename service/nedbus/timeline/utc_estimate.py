@@ -12,12 +12,14 @@ from nedbus_msgs import DEFAULT_TOPIC, is_unix_time
 from .utc_offset import FIELDS, RELATIVE, UtcOffset
 
 _TOLERANCE: Final = 1_000_000  # us; messages this close to the median agree
-_AGREEING: Final = 0.9  # fraction that must agree; a smaller one indicates several boots or a clock step
+# fraction that must agree; a smaller one indicates several boots or a clock step
+_AGREEING: Final = 0.9
 _TAIL: Final = 0.1  # share of the messages that determines the offset after a correction
 _MIN_PART: Final = 3  # messages after the last correction
 _MAX_PARTS: Final = 3  # offsets until the last correction; more are a drift
 _MAX_CORRECTION: Final = 20e6  # us, more than all leap seconds; a larger step may be another boot
-_APART: Final = 1e6  # us between the messages of a source and all others, if both use the same clock
+# us between the messages of a source and all others, if both use the same clock
+_APART: Final = 1e6
 _MAX_TIME: Final = 2**62  # us; a damaged timestamp may be larger
 
 _Ints = npt.NDArray[np.int64]
@@ -42,7 +44,9 @@ class UtcEstimate:
             utc = stamps - values if name == FIELDS[1] else values - columns.get(RELATIVE, 0)
             is_used = is_unix_time(utc) & ~is_unix_time(stamps)
             if is_used.any():
-                self._sources[FIELDS.index(name), stream].append(np.stack([stamps, utc - stamps])[:, is_used])
+                self._sources[FIELDS.index(name), stream].append(
+                    np.stack([stamps, utc - stamps])[:, is_used]
+                )
 
     def result(self, boot_utc: int = 0) -> UtcOffset | str:
         """Return the offset, or why it is unknown, "" without UTC; `boot_utc`: of the file's metadata [us]."""
@@ -60,7 +64,11 @@ class UtcEstimate:
             if not isinstance(agreement, str):
                 return agreement
             reasons.append(agreement)
-        return UtcOffset("boot_time_utc_us", boot_utc, 1, 0) if is_unix_time(boot_utc) else "".join(reasons[:1])
+        return (
+            UtcOffset("boot_time_utc_us", boot_utc, 1, 0)
+            if is_unix_time(boot_utc)
+            else "".join(reasons[:1])
+        )
 
 
 def to_datetime64(unix: _Ints) -> npt.NDArray[np.datetime64]:
@@ -68,17 +76,23 @@ def to_datetime64(unix: _Ints) -> npt.NDArray[np.datetime64]:
     return np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
 
 
-def _find_agreement(stream: str, times: _Ints, offsets: _Ints, others: tuple[float, float]) -> UtcOffset | str:
+def _find_agreement(
+    stream: str, times: _Ints, offsets: _Ints, others: tuple[float, float]
+) -> UtcOffset | str:
     """Return the offset on which the messages of a stream agree, or why it is unusable.
 
     `others`: the period of the timestamps of other streams [us].
     """
     first, last = _period(times)
     if len(offsets) > 1 and (first > others[1] + _APART or last < others[0] - _APART):
-        return f"the timestamps of {stream}, which has UTC, are not on the clock of the other messages"
+        return (
+            f"the timestamps of {stream}, which has UTC, are not on the clock of the other messages"
+        )
     if (parts := _stable_parts(times, offsets)) is None:
         low, high = np.quantile(offsets, [0.05, 0.95]) / 1e6
-        return f"the UTC of {stream} varies by {high - low:.0f} s: a drift, or several clocks or boots"
+        return (
+            f"the UTC of {stream} varies by {high - low:.0f} s: a drift, or several clocks or boots"
+        )
     final, middle = parts[0], int(np.median(parts[0]))
     corrected = middle - int(np.median(parts[1])) if len(parts) > 1 else 0
     return UtcOffset(stream, middle, len(final), int(np.ptp(final)), corrected)
@@ -111,7 +125,11 @@ def _stable_parts(times: Any, offsets: Any) -> list[Any] | None:
             return None
         parts.append(offsets[begin:][is_late[begin:]])
         offsets = offsets[:begin]
-    return parts if len(parts[0]) >= _MIN_PART and np.ptp([*map(np.median, parts)]) <= _MAX_CORRECTION else None
+    return (
+        parts
+        if len(parts[0]) >= _MIN_PART and np.ptp([*map(np.median, parts)]) <= _MAX_CORRECTION
+        else None
+    )
 
 
 def _is_near(offsets: Any, typical: Any) -> Any:

@@ -37,7 +37,9 @@ class UtcOffset:
 
     def at(self, timestamp: int) -> datetime:
         """Return the UTC of a `timestamp` from the same boot of this vehicle; Unix time is used as it is."""
-        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(self.unix_us(int(timestamp))))
+        return datetime.fromtimestamp(0, UTC) + timedelta(
+            microseconds=int(self.unix_us(int(timestamp)))
+        )
 
     def unix_us(self, timestamps: Any) -> Any:
         """Return the Unix time [us] of a timestamp or an array of timestamps."""

@@ -8,13 +8,17 @@ from typing import Final, NamedTuple
 
 from nedbus_msgs import is_unix_time
 
-_MAX_LATE: Final = 1_000_000  # us by which a message of a current stream may be older than the newest one
-_MARGIN: Final = 2_000_000  # us by which a time since boot may exceed the time that passed: delays of a link
+# us by which a message of a current stream may be older than the newest one
+_MAX_LATE: Final = 1_000_000
+# us by which a time since boot may exceed the time that passed: delays of a link
+_MARGIN: Final = 2_000_000
 _MAX_STREAMS: Final = 1000  # bounds the memory that a peer can use
 _MAX_REMEMBERED: Final = 512  # times of each stream that are known, to find copies
 _MAX_DOUBT: Final = 1.0  # s without a current message after which one stream is enough
-_MAX_OTHER: Final = 10.0  # s without a current message after which another clock counts, possible or not
-_MAX_DELAY: Final = 10_000_000  # us by which a second link may be behind; the same time, later, is another boot
+# s without a current message after which another clock counts, possible or not
+_MAX_OTHER: Final = 10.0
+# us by which a second link may be behind; the same time, later, is another boot
+_MAX_DELAY: Final = 10_000_000
 _UNKNOWN_PAUSE: Final = 60_000_000  # us that may have passed if the arrival time is unknown
 
 
@@ -92,7 +96,8 @@ class VehicleClock:
         self._arrived: float | None = None  # time at which the newest message arrived
         self._ahead = math.inf  # time in the last message, if it was too far ahead [us]
         self._last: dict[Hashable, int] = {}  # time of the last message of each stream [us]
-        self._older: dict[Hashable, float] = {}  # streams that went back since the last current message, and when
+        # streams that went back since the last current message, and when
+        self._older: dict[Hashable, float] = {}
         self._known = RecentTimes()
 
     def add(self, stream: Hashable, time: int, now: float | None = None) -> Reading:
@@ -131,7 +136,9 @@ class VehicleClock:
         self._known.add(stream, time)
         return Reading(TimeKind.STEP if is_step else TimeKind.NEW, time, self.boot)
 
-    def _add_older(self, stream: Hashable, time: int, last: int, newest: int, now: float | None) -> Reading:
+    def _add_older(
+        self, stream: Hashable, time: int, last: int, newest: int, now: float | None
+    ) -> Reading:
         if time < last - _MAX_LATE:
             self._older.setdefault(stream, math.inf if now is None else now)
         is_confirmed = len(self._older) >= min(2, len(self._last))

@@ -19,7 +19,14 @@ from .rmw_zenoh import (
     node_token,
     px4_publishers_key_expr,
 )
-from .router import RouterConfig, RouterState, open_router, query_routers, read_router_config, router_endpoints
+from .router import (
+    RouterConfig,
+    RouterState,
+    open_router,
+    query_routers,
+    read_router_config,
+    router_endpoints,
+)
 from .router_log import Uplinks, log_refusals
 from .session import (
     MAX_REPLY_BYTES,
@@ -34,8 +41,22 @@ from .session import (
 )
 from .tls import UNKNOWN_CA, Tls, check_pem, read_certificate
 from .vehicle_directory import Publishers, VehicleDirectory
-from .write_probe import CONFIRMED, Verdict, is_refused, probe_at_router, probe_writes, routers_of, secure_endpoints
-from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload
+from .write_probe import (
+    CONFIRMED,
+    Verdict,
+    is_refused,
+    probe_at_router,
+    probe_writes,
+    routers_of,
+    secure_endpoints,
+)
+from .zenoh_ext import (
+    Heartbeats,
+    RetransmitRequest,
+    follow_heartbeats,
+    heartbeat_key,
+    heartbeat_payload,
+)
 
 if TYPE_CHECKING:
     from .access_control import AccessControl

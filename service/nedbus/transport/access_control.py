@@ -59,7 +59,9 @@ class AccessControl:
     name or a protocol counts as matched.
     """
 
-    def __init__(self, section: Mapping[str, Any], filters: Iterable[Mapping[str, Any]] = ()) -> None:
+    def __init__(
+        self, section: Mapping[str, Any], filters: Iterable[Mapping[str, Any]] = ()
+    ) -> None:
         """Parse `access_control` and `low_pass_filter` of a configuration that Zenoh has accepted."""
         self.is_enabled: bool = section["enabled"]
         self._is_allowed_by_default = section["default_permission"] == "allow"
@@ -68,7 +70,8 @@ class AccessControl:
         for policy in section["policies"] or ():
             for subject in policy["subjects"]:
                 self._rules[subject] += [rules[name] for name in policy["rules"] if name in rules]
-        self._subjects = defaultdict[str | None, list[str]](list)  # by common name; None: those of every certificate
+        # by common name; None: those of every certificate
+        self._subjects = defaultdict[str | None, list[str]](list)
         for subject in section["subjects"] or ():
             for certificate in subject["cert_common_names"] or (None,):
                 self._subjects[certificate].append(subject["id"])

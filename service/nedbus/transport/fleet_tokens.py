@@ -27,8 +27,10 @@ from .session import Session
 
 _log = logging.getLogger(__name__)
 
-_MAX_TOKENS: Final = 1000  # of one vehicle; two services that publish all topics of a PX4 declare 500
-_MAX_KEY_EXPRS: Final = 5000  # 64 per character of an excluded name; further vehicles are not excluded
+# of one vehicle; two services that publish all topics of a PX4 declare 500
+_MAX_TOKENS: Final = 1000
+# 64 per character of an excluded name; further vehicles are not excluded
+_MAX_KEY_EXPRS: Final = 5000
 _CHARACTERS: Final = string.ascii_letters + string.digits + "_-"
 _LONGEST_NAME: Final = 64  # characters; peers may use longer ones
 _QUERY_TIMEOUT: Final = 60.0  # s
@@ -41,7 +43,9 @@ class FleetTokens:
     `open_session`: raises NedbusError if no router answers.
     """
 
-    def __init__(self, open_session: Callable[[], Session], selection: Selection, *, prefix: str) -> None:
+    def __init__(
+        self, open_session: Callable[[], Session], selection: Selection, *, prefix: str
+    ) -> None:
         self._open_session = open_session
         self._prefix = prefix
         self._selection = selection
@@ -55,7 +59,11 @@ class FleetTokens:
     @property
     def complete(self) -> bool:
         """True if all tokens are known."""
-        return not self._excluded and not self.is_listing and (self._tokens.is_listing or self._tokens.complete)
+        return (
+            not self._excluded
+            and not self.is_listing
+            and (self._tokens.is_listing or self._tokens.complete)
+        )
 
     @property
     def is_listing(self) -> bool:
@@ -70,19 +78,31 @@ class FleetTokens:
         """Return the changes since the last call, like LivelinessTokens."""
         tokens = [reply.ok for each in self._survey for reply in each.poll()]
         found = [(str(token.key_expr), True) for token in tokens if token is not None]
-        changes = [change for change in (found if self._survey else self._tokens.poll()) if self._apply(*change)]
+        changes = [
+            change
+            for change in (found if self._survey else self._tokens.poll())
+            if self._apply(*change)
+        ]
         now = time.monotonic()
-        crowded = {name for name, number in self._numbers.items() if number > _MAX_TOKENS} if changes else set()
+        crowded = (
+            {name for name, number in self._numbers.items() if number > _MAX_TOKENS}
+            if changes
+            else set()
+        )
         if crowded and len(self._key_exprs(self._excluded | crowded)) <= _MAX_KEY_EXPRS:
             text = "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
-            _log.warning(text, ", ".join(map(repr, sorted(crowded))), _MAX_TOKENS, extra=about("incomplete"))
+            _log.warning(
+                text, ", ".join(map(repr, sorted(crowded))), _MAX_TOKENS, extra=about("incomplete")
+            )
             self._excluded |= crowded
             self._retry = now + TIMINGS.excluded
             gone = [(key, False) for key in self._keys if self._vehicle_of(key) in crowded]
             changes += [change for change in gone if self._apply(*change)]
             self._restart(self._subscribe)
         elif self._survey and all(each.ended for each in self._survey):
-            is_complete = len(self._keys) < MAX_REPLIES and not any(each.failed for each in self._survey)
+            is_complete = len(self._keys) < MAX_REPLIES and not any(
+                each.failed for each in self._survey
+            )
             self._restart(partial(self._subscribe, is_surveyed=is_complete))
             self._slow = math.inf  # no vehicle has too many
         elif self._tokens.is_listing and now > self._slow:
@@ -104,12 +124,16 @@ class FleetTokens:
     def _subscribe(self, *, is_surveyed: bool = False) -> None:
         self._survey: list[Replies] = []
         self._is_surveyed = is_surveyed  # a query has listed all tokens
-        self._tokens = LivelinessTokens(self._session, *self._key_exprs(self._excluded), known=self._keys)
+        self._tokens = LivelinessTokens(
+            self._session, *self._key_exprs(self._excluded), known=self._keys
+        )
         self._slow = time.monotonic() + TIMINGS.slow_list
 
     def _query(self) -> None:
         key_exprs = self._key_exprs(self._excluded)
-        self._survey = [query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in key_exprs]
+        self._survey = [
+            query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in key_exprs
+        ]
 
     def _key_exprs(self, excluded: Set[str]) -> list[str]:
         return key_exprs_without(excluded, self._selection, prefix=self._prefix)

@@ -12,7 +12,8 @@ from nedbus.errors import ClosedError
 
 from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
-_RING_CAPACITY: Final = 16_384  # samples that wait while the reader is busy; beyond them the oldest are overwritten
+# samples that wait while the reader is busy; beyond them the oldest are overwritten
+_RING_CAPACITY: Final = 16_384
 
 
 class KeyReader:
@@ -28,7 +29,8 @@ class KeyReader:
         ring: zenoh.handlers.RingChannel[RawSample] = zenoh.handlers.RingChannel(_RING_CAPACITY)
         with translate_zenoh_errors():
             self._subscriber = session.declare_subscriber(key, ring)
-        self._handler = self._subscriber.handler  # a receive on the subscriber would prevent undeclaring it
+        # a receive on the subscriber would prevent undeclaring it
+        self._handler = self._subscriber.handler
 
     def receive(self) -> RawSample:
         """Wait for a sample and return the newest one; raise ClosedError once the reader or its session is closed."""

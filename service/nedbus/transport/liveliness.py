@@ -19,7 +19,8 @@ from .session import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-_MAX_PENDING: Final = 131_072  # replies; large, because Zenoh holds its session lock while it waits for a free slot
+# replies; large, because Zenoh holds its session lock while it waits for a free slot
+_MAX_PENDING: Final = 131_072
 _MAX_CHANGES: Final = 16_384  # queued changes; more than the tokens stored
 _MAX_KEY_LENGTH: Final = MAX_QUERY_BYTES // MAX_REPLIES
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
@@ -28,7 +29,9 @@ _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the pr
 def token_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
     replies = wait_for_replies([query_tokens(session, key_expr, timeout=timeout)])
-    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_REPLIES]
+    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[
+        :MAX_REPLIES
+    ]
 
 
 class LivelinessTokens:
@@ -47,8 +50,10 @@ class LivelinessTokens:
         # Access rules that allow the key expression allow this key.
         self._probe_key = re.sub(r"\*\*|\$?\*", "-", key_exprs[-1])
         self._keys = set(known)
-        self._unseen: set[str] = set()  # tokens of the previous subscription that the current one has not listed yet
-        self._retry = math.inf  # monotonic time of the next attempt to list tokens beyond the limit [s]
+        # tokens of the previous subscription that the current one has not listed yet
+        self._unseen: set[str] = set()
+        # monotonic time of the next attempt to list tokens beyond the limit [s]
+        self._retry = math.inf
         self._probe: Replies | None = None
         self._subscribe()
 
@@ -66,7 +71,8 @@ class LivelinessTokens:
         """End the subscription."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
-        for key in (*self._key_exprs, self._probe_key):  # Zenoh frees neither until something else on it is undeclared
+        # Zenoh frees neither until something else on it is undeclared
+        for key in (*self._key_exprs, self._probe_key):
             self._session.undeclare(self._session.declare_keyexpr(key))
 
     def poll(self) -> list[tuple[str, bool]]:
@@ -83,7 +89,10 @@ class LivelinessTokens:
             for subscriber in self._subscribers:
                 received = list(islice(iter(subscriber.handler.try_recv, None), self._capacity))
                 is_overflow |= len(received) == self._capacity
-                changes += [(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT) for sample in received]
+                changes += [
+                    (str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+                    for sample in received
+                ]
         is_retry_due = len(self._keys) < MAX_REPLIES and time.monotonic() >= self._retry
         if is_overflow or is_retry_due:  # changes were dropped, or there is room again
             self.undeclare()
@@ -125,5 +134,7 @@ def query_tokens(session: Session, key_expr: str, *, timeout: float) -> Replies:
     """Query matching tokens without waiting; each successful reply is one token."""
     timeout = zenoh_timeout(timeout)
     with translate_zenoh_errors():
-        replies = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_PENDING), timeout=timeout)
+        replies = session.liveliness().get(
+            key_expr, zenoh.handlers.FifoChannel(_MAX_PENDING), timeout=timeout
+        )
     return Replies(replies, timeout=timeout)

@@ -33,7 +33,8 @@ class Replies:
     """The replies to one query. Not thread-safe."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
-        self.ended = False  # no more replies: all queryables have replied, or the timeout has passed
+        # no more replies: all queryables have replied, or the timeout has passed
+        self.ended = False
         self.failed = False  # at least one reply was an error, such as a timeout
         self._handler = handler
         self._end = time.monotonic() + timeout + _GRACE
@@ -52,7 +53,9 @@ class Replies:
         return received
 
 
-def send_query(session: Session, selector: str, *, timeout: float, capacity: int = 1024, **options: Any) -> Replies:
+def send_query(
+    session: Session, selector: str, *, timeout: float, capacity: int = 1024, **options: Any
+) -> Replies:
     """Query all matching queryables without waiting; the session blocks while `capacity` replies are pending.
 
     `options`: other arguments of `zenoh.Session.get`, such as `priority`.
@@ -60,7 +63,9 @@ def send_query(session: Session, selector: str, *, timeout: float, capacity: int
     timeout = zenoh_timeout(timeout)
     options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
     with translate_zenoh_errors():
-        replies = session.get(selector, zenoh.handlers.FifoChannel(capacity), timeout=timeout, **options)
+        replies = session.get(
+            selector, zenoh.handlers.FifoChannel(capacity), timeout=timeout, **options
+        )
     return Replies(replies, timeout=timeout)
 
 
@@ -74,13 +79,21 @@ def query(
     replies of the groups that use least come first, so the same holds for a limit of the caller.
     """
     accepted = _Accepted()
-    replies = wait_for_replies([send_query(session, selector, timeout=timeout) for selector in selectors])
+    replies = wait_for_replies(
+        [send_query(session, selector, timeout=timeout) for selector in selectors]
+    )
     for sample in filter(None, (reply.ok for reply in replies)):
         accepted.add(group_of(str(sample.key_expr)), sample)
     if accepted.dropped:
-        text = "%s: dropped %d of %d replies beyond the limits of a query, so the result is incomplete"
+        text = (
+            "%s: dropped %d of %d replies beyond the limits of a query, so the result is incomplete"
+        )
         _log.warning(
-            text, ", ".join(selectors), accepted.dropped, accepted.count + accepted.dropped, extra=about("incomplete")
+            text,
+            ", ".join(selectors),
+            accepted.dropped,
+            accepted.count + accepted.dropped,
+            extra=about("incomplete"),
         )
     return accepted.samples()
 

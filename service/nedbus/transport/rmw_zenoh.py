@@ -30,7 +30,8 @@ _MAX_KEY: Final = 512  # characters; twice the longest keys of PX4 and ROS 2
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
 LONGEST_TOKEN: Final = 2 * _MAX_KEY  # characters; tokens of ROS 2 are shorter
-PX4_TYPES: Final = "px4_msgs$*"  # key expression chunk for the DDS types of PX4 and of its message translation node
+# key expression chunk for the DDS types of PX4 and of its message translation node
+PX4_TYPES: Final = "px4_msgs$*"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,9 @@ class Attachment:
     def parse(cls, data: bytes) -> Self:
         """Parse an attachment of rmw_zenoh; raise DecodeError for anything else."""
         if len(data) != _ATTACHMENT.size or data[_GID] != _GID:
-            raise DecodeError(f"an attachment of {len(data)} bytes, not in rmw_zenoh's format of {_ATTACHMENT.size}")
+            raise DecodeError(
+                f"an attachment of {len(data)} bytes, not in rmw_zenoh's format of {_ATTACHMENT.size}"
+            )
         sequence, time, _, gid = _ATTACHMENT.unpack(data)
         if sequence < 0:
             raise DecodeError(f"an attachment with the sequence number {sequence}")
@@ -100,7 +103,12 @@ class PublisherToken:
     def parse(cls, text: str) -> Self:
         """Parse the token of a publisher; raise DecodeError for anything else."""
         parts = text.split("/")
-        if len(parts) != 13 or parts[0] != "@ros2_lv" or parts[5] != "MP" or len(text) > LONGEST_TOKEN:
+        if (
+            len(parts) != 13
+            or parts[0] != "@ros2_lv"
+            or parts[5] != "MP"
+            or len(text) > LONGEST_TOKEN
+        ):
             raise DecodeError("a liveliness token that does not belong to a publisher")
         _, domain, session, _, _, _, _, _, node, topic, dds_type, type_hash, _ = parts
         name = topic.replace("%", "/").strip("/")

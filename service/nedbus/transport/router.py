@@ -22,7 +22,14 @@ from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
 from .queries import query
-from .session import COMMON_SETTINGS, Session, error_reason, insert_settings, open_session, random_backoff
+from .session import (
+    COMMON_SETTINGS,
+    Session,
+    error_reason,
+    insert_settings,
+    open_session,
+    random_backoff,
+)
 from .tls import Tls
 
 if TYPE_CHECKING:
@@ -30,7 +37,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_OTHER_FILES: Final = 100  # open files other than sessions: 21 of a router, plus sources and HTTP clients of a service
+# open files other than sessions: 21 of a router, plus sources and HTTP clients of a service
+_OTHER_FILES: Final = 100
 _ADMIN_KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
 _MAX_STATE_BYTES: Final = 2**20  # a reply with about 5,700 sessions
 _MAX_SESSIONS: Final = 2**32  # largest limit accepted from a router
@@ -78,7 +86,8 @@ def open_router(
         if plugins := _get(config, "plugins"):
             text = "%s: %s not loaded, because this router, unlike zenohd, loads no plugins"
             _log.warning(text, config_file, _plugin_names(plugins), extra=about("router"))
-        for name, file in _tls_files(config).items():  # because Zenoh's error does not name the file
+        # because Zenoh's error does not name the file
+        for name, file in _tls_files(config).items():
             if not os.access(file, os.R_OK):
                 reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
                 raise ConfigError.in_file(config_file, reason)
@@ -86,12 +95,16 @@ def open_router(
         settings = {name: endpoints for name, endpoints in given.items() if endpoints}
     insert_settings(config, settings, where="listen")
     if tls is not None and not _get(config, "transport/link/tls").get("root_ca_certificate"):
-        files = {f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()}
+        files = {
+            f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()
+        }
         insert_settings(config, files, where="tls")
     sessions = _get(config, "transport/unicast/max_sessions")
     metadata = _get(config, "metadata")
     if metadata is None or isinstance(metadata, dict):  # any JSON value is allowed
-        insert_settings(config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata")
+        insert_settings(
+            config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata"
+        )
     raise_file_limit(sessions)
     try:
         return open_session(config)
@@ -116,7 +129,9 @@ def raise_file_limit(sessions: int) -> None:
         _log.warning(text, soft, max(0, soft - _OTHER_FILES), sessions, extra=about("router"))
 
 
-def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None) -> tuple[str, ...]:
+def router_endpoints(
+    listen: Sequence[str] = (), config_file: Path | None = None
+) -> tuple[str, ...]:
     """Return the listening endpoints of a router: those given, else those of the file, else the default.
 
     Raises ConfigError for a malformed file.
@@ -147,7 +162,11 @@ def read_router_config(path: Path | None = None) -> RouterConfig:
     sessions = int(_get(config, "transport/unicast/max_sessions"))
     access = AccessControl(_get(config, "access_control"), _get(config, "low_pass_filter"))
     return RouterConfig(
-        _endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config), sessions, access
+        _endpoints(config, "listen"),
+        _endpoints(config, "connect"),
+        _tls_files(config),
+        sessions,
+        access,
     )
 
 
@@ -162,14 +181,20 @@ def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
 
 def _tls_files(config: zenoh.Config) -> dict[str, Path]:
     section = _get(config, "transport/link/tls").items()
-    return {name: Path(file) for name, file in section if file and name.endswith(("_certificate", "_private_key"))}
+    return {
+        name: Path(file)
+        for name, file in section
+        if file and name.endswith(("_certificate", "_private_key"))
+    }
 
 
 def _read_config(path: Path) -> zenoh.Config:
     """Read the file for an embedded router; raise ConfigError if it is malformed or requires a plugin."""
     config = _parse_config(path)
     plugins = _get(config, "plugins").items()
-    if required := [name for name, settings in plugins if settings and settings.get("__required__")]:
+    if required := [
+        name for name, settings in plugins if settings and settings.get("__required__")
+    ]:
         reason = f"it requires {_plugin_names(required)}, but this router loads no plugins: run it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
@@ -181,7 +206,9 @@ def _plugin_names(plugins: Iterable[str]) -> str:
 
 def _parse_config(path: Path) -> zenoh.Config:
     if path.suffix not in {".json5", ".json", ".yaml", ".yml"}:
-        raise ConfigError.in_file(path, "not a Zenoh configuration: expected a .json5, .json, .yaml or .yml file")
+        raise ConfigError.in_file(
+            path, "not a Zenoh configuration: expected a .json5, .json, .yaml or .yml file"
+        )
     if not path.is_file():
         raise ConfigError.in_file(path, "there is no such file")
     try:
@@ -220,7 +247,9 @@ def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     """
     replies = query(session, "@/*/router", timeout=timeout)
     small = (reply for reply in replies if len(reply.payload) <= _MAX_STATE_BYTES)
-    states = filter(None, (parse_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small))
+    states = filter(
+        None, (parse_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small)
+    )
     by_zid = {state.zid: state for state in states}
     return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
 

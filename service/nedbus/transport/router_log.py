@@ -27,7 +27,8 @@ _log = logging.getLogger(__name__)
 _LINK_TIMEOUT: Final = 3.0  # s before a link that does not come up is logged
 _EXIT_TIMEOUT: Final = 1.0  # s; a child process may hold the pipe open
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
-_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # only listeners give a hint
+# only listeners give a hint
+_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")
 _REASONS: Final = {  # by substring of Zenoh's text
     "certificate expired": "its certificate has expired",
     "BadSignature": "its certificate is signed by another CA",
@@ -60,33 +61,57 @@ class Uplinks:
         self._is_client = is_client
         names = [" or ".join(endpoints)] if is_client else endpoints
         # Last logged state of each link, None at first, and the time of its change [s].
-        self._states: dict[str, tuple[bool | None, float]] = dict.fromkeys(names, (is_client or None, now()))
+        self._states: dict[str, tuple[bool | None, float]] = dict.fromkeys(
+            names, (is_client or None, now())
+        )
 
     def check(self) -> None:
         """Compare the configured links with the open ones, and log changes."""
         # The destination of an open link is the dialled endpoint, but its host name may have been resolved.
         dialled = [link.dst for link in self._session.info.links()]
         for name, (was_up, since) in self._states.items():
-            is_up, lasted = bool(dialled) if self._is_client else self._is_linked(name, dialled), self._now() - since
+            is_up = bool(dialled) if self._is_client else self._is_linked(name, dialled)
+            lasted = self._now() - since
             if is_up == was_up or (not is_up and was_up is None and lasted < _LINK_TIMEOUT):
                 continue
             self._states[name] = is_up, since if was_up is None else self._now()
             if is_up:
-                text = f"joined {name}" if was_up is None else f"the link to {name} is up after {lasted:.0f} s"
+                text = (
+                    f"joined {name}"
+                    if was_up is None
+                    else f"the link to {name} is up after {lasted:.0f} s"
+                )
                 _log.info("%s", text, extra=about("link_up"))
             elif was_up:
                 _log.warning("the link to %s is lost: reconnecting", name, extra=about("link_lost"))
             else:
-                _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link_lost"))
+                _log.warning(
+                    "no link to %s%s: still trying",
+                    name,
+                    self._explain(name),
+                    extra=about("link_lost"),
+                )
 
     def _is_linked(self, endpoint: str, dialled: Sequence[str]) -> bool:
         """Return whether a link to an endpoint is open; compare hosts only if several endpoints share its port."""
         protocol, host, port = split_endpoint(endpoint) or (endpoint, "", 0)
-        hosts = {each[1] for each in map(split_endpoint, dialled) if each and each[::2] == (protocol, port)}
-        if not hosts or sum(each[::2] == (protocol, port) for each in map(split_endpoint, self._states) if each) == 1:
+        hosts = {
+            each[1]
+            for each in map(split_endpoint, dialled)
+            if each and each[::2] == (protocol, port)
+        }
+        if (
+            not hosts
+            or sum(
+                each[::2] == (protocol, port) for each in map(split_endpoint, self._states) if each
+            )
+            == 1
+        ):
             return bool(hosts) or endpoint in dialled  # a Unix socket has no host
         try:
-            return not hosts.isdisjoint([host, *(str(each[4][0]) for each in socket.getaddrinfo(host, None))])
+            return not hosts.isdisjoint(
+                [host, *(str(each[4][0]) for each in socket.getaddrinfo(host, None))]
+            )
         except OSError:
             return True  # a failed name resolution does not affect an open link
 
@@ -108,7 +133,9 @@ def log_refusals() -> None:
     os.dup2(write, 1)
     os.close(write)
     zenoh.init_log_from_env_or("zenoh_link_tls=warn")
-    reader = threading.Thread(target=_forward, args=(read, stdout), name="nedbus-refusals", daemon=True)
+    reader = threading.Thread(
+        target=_forward, args=(read, stdout), name="nedbus-refusals", daemon=True
+    )
     reader.start()
     atexit.register(_close_pipe, stdout, reader)
 
@@ -124,8 +151,12 @@ def _forward(read: int, stdout: int) -> None:
         for line in lines:
             found = _REFUSED.search(_COLOUR.sub("", line.decode(errors="replace")))
             if found is not None:
-                reason = next((text for part, text in _REASONS.items() if part in found[1]), found[1])
-                _log.warning("refused a client: %s", reason, extra=about("client_refused", reason=reason))
+                reason = next(
+                    (text for part, text in _REASONS.items() if part in found[1]), found[1]
+                )
+                _log.warning(
+                    "refused a client: %s", reason, extra=about("client_refused", reason=reason)
+                )
                 continue
             with suppress(OSError):  # the reader of stdout has closed it
                 os.write(stdout, line)

@@ -53,7 +53,8 @@ COMMON_SETTINGS: Final = {
         },
     ],
 }
-MAX_REPLY_BYTES: Final = 2**18  # payload of a reply: services split longer ones, clients reject them
+# payload of a reply: services split longer ones, clients reject them
+MAX_REPLY_BYTES: Final = 2**18
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # backoff between the first attempts to connect [s]
 
@@ -84,7 +85,11 @@ def open_session(config: zenoh.Config) -> Session:
 
 
 def open_client(
-    endpoints: Sequence[str], *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
+    endpoints: Sequence[str],
+    *,
+    timeout: float | None,
+    tls: Tls | None = None,
+    stop: threading.Event | None = None,
 ) -> Session:
     """Open a session as a client of the first router that answers; Ctrl-C or setting `stop` cancels the wait.
 
@@ -126,8 +131,14 @@ def open_client(
                 break
     # For most failures Zenoh reports only "Unable to connect".
     cause = resolution_error(endpoints) or (tls.explain() if tls is not None else None)
-    if not cause and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
-        cause = "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
+    if (
+        not cause
+        and (tls is None or tls.certificate is None)
+        and endpoints[0].startswith(("tls/", "quic/"))
+    ):
+        cause = (
+            "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
+        )
     secure = [] if cause or stop.is_set() else _tls_ports(endpoints)
     advice = f"{' and '.join(secure)} speaks TLS: use tls/ instead of tcp/" if secure else ""
     reason = cause or ("" if "Unable to connect" in reason else reason)
@@ -140,17 +151,25 @@ def _tls_ports(endpoints: Sequence[str]) -> list[str]:
     return [
         endpoint
         for endpoint, found in parts.items()
-        if found is not None and found[0] == "tcp" and read_certificate(found[1], found[2], TIMINGS.tls_hint)
+        if found is not None
+        and found[0] == "tcp"
+        and read_certificate(found[1], found[2], TIMINGS.tls_hint)
     ]
 
 
 def random_backoff() -> dict[str, float]:
     """Return Zenoh's `connect/retry` section with a random backoff, so a fleet does not reconnect simultaneously."""
     first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - not a secret
-    return {"period_init_ms": round(first), "period_max_ms": round(longest), "period_increase_factor": 1.5}
+    return {
+        "period_init_ms": round(first),
+        "period_max_ms": round(longest),
+        "period_increase_factor": 1.5,
+    }
 
 
-def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:
+def insert_settings(
+    config: zenoh.Config, settings: Mapping[str, object], *, where: str
+) -> zenoh.Config:
     """Add settings to a Zenoh configuration and return it; raise ConfigError for a value that Zenoh rejects."""
     for key, value in settings.items():
         try:
@@ -179,7 +198,11 @@ def translate_error(error: zenoh.ZError) -> NedbusError:
 
     The error text decides, because `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
     """
-    return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
+    return (
+        ClosedError()
+        if _CLOSED.search(str(error))
+        else NedbusError(f"Zenoh reports: {error_reason(error)}")
+    )
 
 
 def error_reason(error: zenoh.ZError) -> str:

@@ -41,7 +41,9 @@ class Tls:
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.key is None):
-            raise ConfigError("tls", "a certificate needs its key, and a key its certificate: set both or neither")
+            raise ConfigError(
+                "tls", "a certificate needs its key, and a key its certificate: set both or neither"
+            )
 
     def zenoh_settings(self) -> dict[str, object]:
         """Return Zenoh's `transport/link/tls` section.
@@ -56,7 +58,10 @@ class Tls:
             check_pem(self.certificate, "CERTIFICATE")
             check_pem(self.key, "PRIVATE KEY")
             _load_pair(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), self.certificate, self.key)
-            own = {"connect_certificate": str(self.certificate), "connect_private_key": str(self.key)}
+            own = {
+                "connect_certificate": str(self.certificate),
+                "connect_private_key": str(self.key),
+            }
             settings |= {**own, "enable_mtls": True}
         return settings
 
@@ -87,7 +92,9 @@ class Tls:
         if self.certificate is None:
             if not peer.get_ca_certs():
                 return f"{self.ca} is not a CA certificate: it cannot sign others"
-            until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in peer.get_ca_certs())
+            until = max(
+                ssl.cert_time_to_seconds(str(each["notAfter"])) for each in peer.get_ca_certs()
+            )
             return f"{self.ca} has expired" if until < clock.utc() else None
         ours.check_hostname = False
         ours.verify_mode = ssl.CERT_NONE  # the server is this process
@@ -101,7 +108,9 @@ class Tls:
             except ssl.SSLWantReadError:
                 continue
             except ssl.SSLCertVerificationError as exc:
-                return f"{self.certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
+                return (
+                    f"{self.certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
+                )
             except ssl.SSLError:
                 break
         return None
@@ -119,11 +128,15 @@ def read_certificate(host: str, port: int, timeout: float) -> str:
 def check_pem(path: str | Path, kind: str) -> None:
     """Raise ConfigError unless a file has a PEM block of this kind, such as CERTIFICATE or PRIVATE KEY."""
     if not os.access(path, os.R_OK) or not Path(path).is_file():
-        raise ConfigError("tls", f"{path} cannot be read: check that it exists and that this user may read it")
+        raise ConfigError(
+            "tls", f"{path} cannot be read: check that it exists and that this user may read it"
+        )
     text = Path(path).read_text(errors="replace")
     labels = _LABEL.findall(text)
     if not any(label.endswith(kind) for label in labels):
-        found = f"contains a {labels[0].lower()}" if labels else "is not PEM" if text else "is empty"
+        found = (
+            f"contains a {labels[0].lower()}" if labels else "is not PEM" if text else "is empty"
+        )
         hint = "check whether two files are swapped" if labels else "create one with 'nedbus pki'"
         raise ConfigError("tls", f"{path} {found}, but a {kind.lower()} is required: {hint}")
 

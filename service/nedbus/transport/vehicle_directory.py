@@ -32,7 +32,9 @@ class Publishers(Counter[Address]):
 class VehicleDirectory:
     """Addresses and their publishers, from the liveliness tokens that `follow` subscribes to on the first call."""
 
-    def __init__(self, follow: Callable[[], LivelinessTokens | FleetTokens], *, prefix: str) -> None:
+    def __init__(
+        self, follow: Callable[[], LivelinessTokens | FleetTokens], *, prefix: str
+    ) -> None:
         self._prefix, self._follow = prefix, follow
         self._lock = threading.Lock()
         self._closed = threading.Event()
@@ -43,7 +45,9 @@ class VehicleDirectory:
         self._logged = False
 
     @classmethod
-    def of_fleet(cls, open_session: Callable[[], Session], selection: Selection, *, prefix: str) -> Self:
+    def of_fleet(
+        cls, open_session: Callable[[], Session], selection: Selection, *, prefix: str
+    ) -> Self:
         """Return a directory of the selected streams; arguments as in FleetTokens."""
         return cls(partial(FleetTokens, open_session, selection, prefix=prefix), prefix=prefix)
 
@@ -91,6 +95,8 @@ class VehicleDirectory:
         is_listing = self._tokens is None or self._tokens.is_listing
         if is_listing and timeout and not self._logged:
             text = "the router listed only %s within %g s; it may be slow, or forbid listing others"
-            _log.warning(text, counted(len(publishers), "stream"), timeout, extra=about("incomplete"))
+            _log.warning(
+                text, counted(len(publishers), "stream"), timeout, extra=about("incomplete")
+            )
         self._logged = is_listing and (self._logged or timeout > 0)
         return publishers

@@ -32,13 +32,19 @@ _SPARE: Final = 16  # slots in the channel beyond one probe per vehicle
 
 
 def probe_writes(
-    reader: Session, writer: Session, vehicles: Collection[str], *, prefix: str, timeout: float = 1.0
+    reader: Session,
+    writer: Session,
+    vehicles: Collection[str],
+    *,
+    prefix: str,
+    timeout: float = 1.0,
 ) -> dict[str, Verdict]:
     """Return for each vehicle whether `writer` may publish it; "unknown" if `reader` is not allowed to subscribe.
 
     `timeout`: time for the router to announce the subscriber, and again for an allowed message to arrive [s].
     """
-    probe = f"@doctor/{secrets.token_hex(8)}"  # the `**` of readers does not match a chunk that starts with @
+    # the `**` of readers does not match a chunk that starts with @
+    probe = f"@doctor/{secrets.token_hex(8)}"
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
     missing, capacity = dict(keys), len(keys) + _SPARE
 
@@ -48,11 +54,15 @@ def probe_writes(
         return not missing
 
     with translate_zenoh_errors():
-        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(capacity))
+        subscriber = reader.declare_subscriber(
+            f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(capacity)
+        )
         # Deleted rather than undeclared, because `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))
         # Zenoh's stubs declare a bool, but the status is an object, which is always true.
-        matched = _wait(lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, timeout)
+        matched = _wait(
+            lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, timeout
+        )
         for _ in range(round(timeout / _RETRY)):
             for key in missing:
                 # Above the priority of data, whose queue may be full and would drop the probe.

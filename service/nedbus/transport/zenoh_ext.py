@@ -22,7 +22,8 @@ Heartbeats = dict[tuple[str, str], int]  # newest sequence number by key and pub
 # A lost heartbeat is followed by another.
 _MAX_HEARTBEATS: Final = 4096
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
-_MAX_KEY: Final = 1024  # characters of a heartbeat key; longer keys are ignored, because keys are cached
+# characters of a heartbeat key; longer keys are ignored, because keys are cached
+_MAX_KEY: Final = 1024
 _PAYLOAD_BYTES: Final = 4
 _SPARE: Final = 64  # slots for unexpected replies of other publishers
 
@@ -37,7 +38,9 @@ def heartbeat_payload(published: int) -> bytes:
     return ((published - 1) % 2**32).to_bytes(_PAYLOAD_BYTES, "little")
 
 
-def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
+def follow_heartbeats(
+    session: Session, key_expr: str
+) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
     """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
     with translate_zenoh_errors():
         key = f"{key_expr}/@adv/pub/**"
@@ -49,7 +52,8 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
             for heartbeat in islice(iter(subscriber.handler.try_recv, None), _MAX_HEARTBEATS):
                 key, payload = str(heartbeat.key_expr), heartbeat.payload.to_bytes()
                 publisher = _parse_key(key) if len(key) <= _MAX_KEY else None
-                if publisher is not None and len(payload) == _PAYLOAD_BYTES:  # peers may send malformed heartbeats
+                # peers may send malformed heartbeats
+                if publisher is not None and len(payload) == _PAYLOAD_BYTES:
                     newest[publisher] = int.from_bytes(payload, "little")
         return newest
 
@@ -69,14 +73,18 @@ class RetransmitRequest:
     instead of matching it against the queryables of all publishers.
     """
 
-    def __init__(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> None:
+    def __init__(
+        self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float
+    ) -> None:
         self._key = key
         self._publisher = publisher
         self._numbers = numbers
         selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
         capacity = min(len(numbers), MAX_REPLIES) + _SPARE
         any_key = zenoh.ReplyKeyExpr.ANY
-        self._replies = send_query(session, selector, timeout=timeout, capacity=capacity, accept_replies=any_key)
+        self._replies = send_query(
+            session, selector, timeout=timeout, capacity=capacity, accept_replies=any_key
+        )
 
     @property
     def ended(self) -> bool:
@@ -88,7 +96,11 @@ class RetransmitRequest:
         samples: dict[int, RawSample] = {}
         for sample in filter(None, (reply.ok for reply in self._replies.poll())):
             info = sample.source_info
-            if info is None or info.source_sn not in self._numbers or str(sample.key_expr) != self._key:
+            if (
+                info is None
+                or info.source_sn not in self._numbers
+                or str(sample.key_expr) != self._key
+            ):
                 continue
             if entity_name(info.source_id) == self._publisher:
                 samples[info.source_sn] = sample

@@ -8,10 +8,19 @@ from typing import Any, Final, NamedTuple
 from nedbus_msgs import FieldType, decode_text, field_type
 
 BASIC_TYPES: Final[Mapping[str, FieldType]] = {
-    **{f"{sign}int{bits}_t": field_type(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    **{
+        f"{sign}int{bits}_t": field_type(f"{sign}int{bits}")
+        for sign in ("", "u")
+        for bits in (8, 16, 32, 64)
+    },
     **{
         c: field_type(px4)
-        for c, px4 in {"float": "float32", "double": "float64", "bool": "bool", "char": "char"}.items()
+        for c, px4 in {
+            "float": "float32",
+            "double": "float64",
+            "bool": "bool",
+            "char": "char",
+        }.items()
     },
 }
 """ULog's basic types, by their C names."""
@@ -22,8 +31,10 @@ UNSET_BOOLS: Final = "bools of {} whose byte is neither 0 nor 1 are read as true
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
 _MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
-_MAX_ALL_FIELDS: Final = 8192  # fields of all messages, even rejected ones: each costs 45 us; a real log has 1,500
-_MAX_FIELDS: Final = 1000  # fields of one message, including nested fields and padding; a real message has 100
+# fields of all messages, even rejected ones: each costs 45 us; a real log has 1,500
+_MAX_ALL_FIELDS: Final = 8192
+# fields of one message, including nested fields and padding; a real message has 100
+_MAX_FIELDS: Final = 1000
 _MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
 
@@ -47,13 +58,16 @@ class PayloadLayout:
         self.fields = fields
         self.size = size
         self.padding = padding
-        self._indices: list[tuple[str, int | slice]] = []  # index of each field among the unpacked values
+        # index of each field among the unpacked values
+        self._indices: list[tuple[str, int | slice]] = []
         code = "<"
         end = 0
         count = 0
         self.bool_mask = 0
         for name, kind, offset in fields:
-            self._indices.append((name, slice(count, count + kind.values) if kind.is_array else count))
+            self._indices.append(
+                (name, slice(count, count + kind.values) if kind.is_array else count)
+            )
             code += f"{offset - end}x{kind.form}"
             end, count = offset + kind.values * kind.size, count + kind.values
             if kind.base == "bool":
@@ -82,7 +96,9 @@ class PayloadLayout:
     def dtype(self) -> Any:
         """Argument for `numpy.dtype` that describes a payload; a bool is a uint8."""
         types = [
-            f"S{kind.size}" if kind.is_text else (f"<{kind.form.replace('?', 'B')}"[-1], kind.length or ())
+            f"S{kind.size}"
+            if kind.is_text
+            else (f"<{kind.form.replace('?', 'B')}"[-1], kind.length or ())
             for _, kind, _ in self.fields
         ]
         names, _, offsets = zip(*self.fields, strict=True)
@@ -128,15 +144,23 @@ class Formats:
             if number > _MAX_FIELDS or offset > _MAX_SIZE:
                 raise ValueError(f"it has more than {_MAX_FIELDS} fields or {_MAX_SIZE} bytes")
             if not field.rpartition(".")[2].startswith("_padding"):
-                flat = re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_") if "." in field else field
+                flat = (
+                    re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_") if "." in field else field
+                )
                 if flat in fields:
-                    raise ValueError(f"two fields are called {flat} after flattening nested messages")
+                    raise ValueError(
+                        f"two fields are called {flat} after flattening nested messages"
+                    )
                 array = "char" if c_type == "char" else base.base
-                fields[flat] = PayloadField(flat, field_type(f"{array}[{length}]") if length else base, start)
+                fields[flat] = PayloadField(
+                    flat, field_type(f"{array}[{length}]") if length else base, start
+                )
             size = size if field.startswith("_padding") else offset
         return PayloadLayout(tuple(fields.values()), size, offset - size)
 
-    def _expand(self, name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, str, int | None]]:
+    def _expand(
+        self, name: str, prefix: str = "", level: int = 0
+    ) -> Iterator[tuple[str, str, int | None]]:
         """Yield name, basic type and length of each field one by one, which lets the caller stop at its limits."""
         if level > _MAX_NESTING:
             raise ValueError(f"it nests messages more than {_MAX_NESTING} levels deep")
@@ -152,4 +176,6 @@ class Formats:
                 yield field, kind, length
                 continue
             for index in range(length or 1):
-                yield from self._expand(kind, f"{field}." if length is None else f"{field}[{index}].", level + 1)
+                yield from self._expand(
+                    kind, f"{field}." if length is None else f"{field}[{index}].", level + 1
+                )

@@ -21,7 +21,9 @@ from .records import Data, Information, LoggedText, Record, Subscription
 
 _STRUCT: Final = struct.Struct("<QB127s")
 _FIELDS: Final = (("timestamp", "uint64", 0), ("severity", "uint8", 8), ("text", "char[127]", 9))
-_LAYOUT: Final = PayloadLayout(tuple(PayloadField(a, field_type(b), c) for a, b, c in _FIELDS), _STRUCT.size, 0)
+_LAYOUT: Final = PayloadLayout(
+    tuple(PayloadField(a, field_type(b), c) for a, b, c in _FIELDS), _STRUCT.size, 0
+)
 LOG_MESSAGE: Final = Subscription(-1, 0, "log_message", _LAYOUT)
 """Subscription of the messages that `LogMessageBuilder` generates."""
 
@@ -39,11 +41,13 @@ _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
 _MAX_PACKED: Final = 2**18  # bytes; PX4's take 17,000
 _MAX_UNPACKED: Final = 2**21  # bytes; PX4's take 170,000
 _MAX_MEMORY: Final = 2**27  # bytes for the xz dictionary
-_MAX_PARTS: Final = 64  # components, event groups, enums, mode groups, and modes per group; PX4 has 30
+# components, event groups, enums, mode groups, and modes per group; PX4 has 30
+_MAX_PARTS: Final = 64
 _MAX_EVENTS: Final = 5000  # of all components; PX4 has 400
 _TOO_MANY_ARGUMENTS: Final = 26  # of an event, which has 25 bytes for them; PX4's have up to 6
 _MAX_SEPARATOR: Final = 10  # characters between the names of a bit field
-_MAX_TEXT: Final = 200  # characters of a template, or of an argument; PX4's longest template has 120
+# characters of a template, or of an argument; PX4's longest template has 120
+_MAX_TEXT: Final = 200
 _CHECKS: Final = ("arming_check", "health")
 _MARKUP = re.compile(
     r"\\(?P<escaped>.)"
@@ -51,7 +55,15 @@ _MARKUP = re.compile(
     r"|\{(?P<number>\d{1,2})(?::(?:\.(?P<digits>\d))?)?(?P<unit>m_v|m/s|m\^2|m|C)?\}",
     re.DOTALL,
 )
-_DAMAGED: Final = (LookupError, TypeError, ValueError, AttributeError, RecursionError, struct.error, lzma.LZMAError)
+_DAMAGED: Final = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RecursionError,
+    struct.error,
+    lzma.LZMAError,
+)
 
 
 def to_log_text(text: str) -> str:
@@ -59,7 +71,9 @@ def to_log_text(text: str) -> str:
     short = _COLOUR.sub("", text[:_MAX_CHARACTERS])
     plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
     data = plain.encode()
-    return plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
+    return (
+        plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
+    )
 
 
 class _Event(NamedTuple):
@@ -86,7 +100,11 @@ class _ArgumentType(NamedTuple):
         """Return a number as it is, and the name of an enum's value, or of each bit set."""
         if self.names is None:
             return value
-        bits = [value] if self.separator is None else [1 << bit for bit in range(64) if value >> bit & 1]
+        bits = (
+            [value]
+            if self.separator is None
+            else [1 << bit for bit in range(64) if value >> bit & 1]
+        )
         names = (self.names.get(str(each), f"(unknown: {value})") for each in bits)
         return (self.separator or "").join(names)[:_MAX_TEXT]
 
@@ -107,7 +125,10 @@ class _EventMetadata:
             enums = [each.get("enums", {}) for each in components.values()]
             if max(map(len, [components, *groups, *enums])) > _MAX_PARTS:
                 raise ValueError(f"more than {_MAX_PARTS} components, event groups or enums")
-            if sum(len(part["events"]) for group in groups for part in group.values()) > _MAX_EVENTS:
+            if (
+                sum(len(part["events"]) for group in groups for part in group.values())
+                > _MAX_EVENTS
+            ):
                 raise ValueError(f"more than {_MAX_EVENTS} events")
             for component, content in zip(components.values(), enums, strict=True):
                 for name, enum in content.items():
@@ -120,7 +141,9 @@ class _EventMetadata:
                             decoder = self._decoder(event, group, component["namespace"], states)
                             self._decoders.setdefault((number, key), decoder)
         except _DAMAGED as exc:
-            reason = str(exc) if isinstance(exc, ValueError | lzma.LZMAError) else "unexpected structure"
+            reason = (
+                str(exc) if isinstance(exc, ValueError | lzma.LZMAError) else "unexpected structure"
+            )
             raise ValueError(f"the event metadata cannot be read ({reason})") from exc
 
     def decode(self, number: int, arguments: bytes) -> _Event | None:
@@ -131,9 +154,15 @@ class _EventMetadata:
 
     def _add_enum(self, name: str, enum: Mapping[str, Any]) -> None:
         with suppress(*_DAMAGED):
-            names = {key: entry["description"][:_MAX_TEXT] for key, entry in enum["entries"].items()}
-            separator = enum.get("separator", "|")[:_MAX_SEPARATOR] if enum.get("is_bitfield") else None
-            self._types.setdefault(name, _ArgumentType(BASIC_TYPES[enum["type"]].form, names, separator))
+            names = {
+                key: entry["description"][:_MAX_TEXT] for key, entry in enum["entries"].items()
+            }
+            separator = (
+                enum.get("separator", "|")[:_MAX_SEPARATOR] if enum.get("is_bitfield") else None
+            )
+            self._types.setdefault(
+                name, _ArgumentType(BASIC_TYPES[enum["type"]].form, names, separator)
+            )
 
     def _decoder(
         self, event: Mapping[str, Any], group: str, namespace: str, states: Mapping[Any, int]
@@ -142,12 +171,19 @@ class _EventMetadata:
         names = [each["type"] for each in event.get("arguments", [])[:_TOO_MANY_ARGUMENTS]]
         types = [self._types.get(name) or self._types[f"{namespace}::{name}"] for name in names]
         unpack = struct.Struct("<" + "".join(each.code for each in types)).unpack_from
-        masks = [index for index, name in enumerate(names) if "navigation_mode_group_t" in name and group in _CHECKS]
-        lists_checks, template = event.get("type") == "append_health_and_arming_messages", event["message"][:_MAX_TEXT]
+        masks = [
+            index
+            for index, name in enumerate(names)
+            if "navigation_mode_group_t" in name and group in _CHECKS
+        ]
+        lists_checks = event.get("type") == "append_health_and_arming_messages"
+        template = event["message"][:_MAX_TEXT]
 
         def decode(data: bytes) -> _Event:
             values = unpack(data)
-            text = _fill(template, [each.show(value) for each, value in zip(types, values, strict=True)])
+            text = _fill(
+                template, [each.show(value) for each, value in zip(types, values, strict=True)]
+            )
             listed = states.get(values[0], 0) if lists_checks else 0
             return _Event(group, text, values[masks[0]] if masks else None, listed)
 
@@ -158,7 +194,11 @@ def _states(component: Mapping[str, Any]) -> Mapping[int, int]:
     """Return the bit mask of the navigation state of each custom mode."""
     with suppress(*_DAMAGED):
         groups = component["navigation_mode_groups"]["groups"].items()
-        return {mode: 1 << int(bit) % 32 for bit, modes in islice(groups, _MAX_PARTS) for mode in modes[:_MAX_PARTS]}
+        return {
+            mode: 1 << int(bit) % 32
+            for bit, modes in islice(groups, _MAX_PARTS)
+            for mode in modes[:_MAX_PARTS]
+        }
     return {}
 
 
@@ -167,12 +207,19 @@ def _fill(template: str, values: Sequence[Any]) -> str:
 
     def replaced(found: re.Match[str]) -> str:
         if found["escaped"] or found["tag"]:
-            shows = {"profile": found["value"] == "dev", "a": True, "param": True}  # other profiles are for end users
-            return found["escaped"] or (_fill(found["content"], values) if shows.get(found["tag"]) else "")
+            # other profiles are for end users
+            shows = {"profile": found["value"] == "dev", "a": True, "param": True}
+            return found["escaped"] or (
+                _fill(found["content"], values) if shows.get(found["tag"]) else ""
+            )
         if not 0 < int(found["number"]) <= len(values):
             return found[0]
         value = values[int(found["number"]) - 1]
-        text = f"{value:.{found['digits']}f}" if found["digits"] and not isinstance(value, str) else str(value)
+        text = (
+            f"{value:.{found['digits']}f}"
+            if found["digits"] and not isinstance(value, str)
+            else str(value)
+        )
         return f"{text} {found['unit'].removesuffix('_v')}" if found["unit"] else text
 
     return _MARKUP.sub(replaced, template).strip()
@@ -230,10 +277,13 @@ class LogMessageBuilder:
         self.problem = ""
         self._packed = b""
         self._metadata: _EventMetadata | None = None
-        self._events: deque[tuple[int, str]] = deque(maxlen=100)  # unmatched events: time, first words of a check
-        self._texts: deque[tuple[Any, ...]] = deque(maxlen=100)  # unmatched texts: time, and what may match them
+        # unmatched events: time, first words of a check
+        self._events: deque[tuple[int, str]] = deque(maxlen=100)
+        # unmatched texts: time, and what may match them
+        self._texts: deque[tuple[Any, ...]] = deque(maxlen=100)
         self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log an event twice
-        self._failed: dict[str, tuple[int, int]] = {}  # checks in the current report: level, blocked modes
+        # checks in the current report: level, blocked modes
+        self._failed: dict[str, tuple[int, int]] = {}
         self._earlier: dict[str, tuple[int, int]] = {}
         self._nav_state = -1
 
@@ -245,17 +295,27 @@ class LogMessageBuilder:
                 yield record
             if name and name not in self.TOPICS:
                 continue
-            with suppress(LookupError, TypeError, ValueError, struct.error):  # the topic may have other fields
+            # the topic may have other fields
+            with suppress(LookupError, TypeError, ValueError, struct.error):
                 if (text := self._read(record)) and self.limit.admits(text.timestamp):
-                    yield Data(LOG_MESSAGE, _STRUCT.pack(text.timestamp, text.level, to_log_text(text.text).encode()))
+                    yield Data(
+                        LOG_MESSAGE,
+                        _STRUCT.pack(text.timestamp, text.level, to_log_text(text.text).encode()),
+                    )
 
     def _read(self, record: Record) -> LoggedText | None:
         """Return the text that a record completes; None if it completes none, or repeats an event."""
         if isinstance(record, LoggedText):
             return None if self._is_duplicate(record) else record
-        if isinstance(record, Information) and record.key == "metadata_events" and isinstance(record.value, bytes):
+        if (
+            isinstance(record, Information)
+            and record.key == "metadata_events"
+            and isinstance(record.value, bytes)
+        ):
             if self._metadata is None and not self.problem:  # the first metadata is used
-                self._packed = ((self._packed if record.continued else b"") + record.value)[:_MAX_PACKED]
+                self._packed = ((self._packed if record.continued else b"") + record.value)[
+                    :_MAX_PACKED
+                ]
         elif isinstance(record, Data) and record.subscription.name == "event":
             return self._read_event(record.subscription.layout.decode(record.payload))
         elif isinstance(record, Data) and record.subscription.name == "vehicle_status":
@@ -266,7 +326,9 @@ class LogMessageBuilder:
         timestamp = fields["timestamp"]
         level = fields["log_levels"] >> 4
         key = (fields["id"], fields["event_sequence"])
-        if (timestamp, *key) in self._seen or (event := self._decode(fields["id"], bytes(fields["arguments"]))) is None:
+        if (timestamp, *key) in self._seen or (
+            event := self._decode(fields["id"], bytes(fields["arguments"]))
+        ) is None:
             return None
         self._seen.append((timestamp, *key))
         is_check = event.group in _CHECKS
@@ -277,15 +339,20 @@ class LogMessageBuilder:
         text = event.text
         if is_check:
             modes = _ALL_MODES if event.modes is None else event.modes
-            affects_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
-            shown, known = level if affects_mode else max(level, _INFO), self._failed.get(text, self._earlier.get(text))
+            affects_mode = modes == _ALL_MODES or (
+                self._nav_state >= 0 and modes >> self._nav_state & 1
+            )
+            shown = level if affects_mode else max(level, _INFO)
+            known = self._failed.get(text, self._earlier.get(text))
             if len(self._failed) < _MAX_PER_SECOND:
                 self._failed[text] = shown, modes if level < _INFO else 0
             if known and known[0] <= shown:
                 return None
             level = shown
         elif event.lists_checks_of and text.endswith(":"):
-            text += " " + ", ".join(name for name, (_, modes) in self._failed.items() if modes & event.lists_checks_of)
+            text += " " + ", ".join(
+                name for name, (_, modes) in self._failed.items() if modes & event.lists_checks_of
+            )
         check = _first_words(text) if is_check else ""
         for time, *words in self._texts:
             if abs(timestamp - time) <= _WINDOW and check in words:

@@ -28,14 +28,18 @@ _START: Final = 16  # bytes before the first record
 _HEADER: Final = 3  # bytes of a record: size and type
 _DATA_HEADER: Final = 5  # bytes: size, type and message id
 _MAX_PADDING: Final = 8  # bytes of trailing padding in a message; PX4 aligns to 8
-_MAX_SUBSCRIPTIONS: Final = 1000  # not counting those that continue an earlier one; a real log has 170
+# not counting those that continue an earlier one; a real log has 170
+_MAX_SUBSCRIPTIONS: Final = 1000
 _MAX_SKIPPED: Final = 16  # consecutive records of unknown content
-_MAX_CHAIN: Final = 2**16  # bytes of a chain of records before its last one; a record has up to 65,538
+# bytes of a chain of records before its last one; a record has up to 65,538
+_MAX_CHAIN: Final = 2**16
 _WINDOW: Final = 2**16  # bytes; damage of up to twice this length is searched completely
 _SAMPLE: Final = 2**12  # bytes searched of each further window
 _MIN_DISTANCE: Final = 64  # bytes per candidate, on average; denser data is searched only in part
 _VALUE: Final = rb"[\x05-\xff](?:u?int|float|double|bool|char)"
-_CANDIDATE = re.compile(rb"(?s)D|S/s\x13 |A...[A-Za-z]|F[A-Za-z]\w|[IP]%b|[MQ].%b|[CL][0-7]" % (_VALUE, _VALUE))
+_CANDIDATE = re.compile(
+    rb"(?s)D|S/s\x13 |A...[A-Za-z]|F[A-Za-z]\w|[IP]%b|[MQ].%b|[CL][0-7]" % (_VALUE, _VALUE)
+)
 """The type of a record, and enough of its content to rule out most other bytes."""
 _CONTEXT: Final = 16  # maximum bytes of a candidate
 
@@ -74,9 +78,11 @@ class UlogParser:
         """By the first five bytes of a data message: its subscription (None: not returned), its length, the length
         without padding, and the list to which payloads are added instead."""
         self._buffer = b""
-        self._sync = -1  # position in the buffer of the next sync, or the end; before the current record if unknown
+        # position in the buffer of the next sync, or the end; before the current record if unknown
+        self._sync = -1
         self._offset = 0  # offset of the buffer in the log
-        self._boundaries: list[int] | None = None  # offsets of appended data; None before the first record
+        # offsets of appended data; None before the first record
+        self._boundaries: list[int] | None = None
         self._damage: int | None = None  # offset at which the search for records began
         self._records: list[Record] = []
 
@@ -95,7 +101,9 @@ class UlogParser:
         This ends with the next subscription to its topic; the messages after that are returned again.
         """
         payloads: list[bytes] = []
-        for message_id in [number for number, each in self.subscriptions.items() if each is subscription]:
+        for message_id in [
+            number for number, each in self.subscriptions.items() if each is subscription
+        ]:
             self._collected.setdefault(subscription.name, []).append(message_id)
             self._route(message_id, payloads)
         return payloads
@@ -132,7 +140,11 @@ class UlogParser:
 
     def _begin(self, *, is_end: bool) -> None:
         kind, content = self._buffer[_START + 2 : _START + _HEADER], _START + _HEADER
-        stop = content + int.from_bytes(self._buffer[_START : _START + 2], "little") if kind == b"B" else _START
+        stop = (
+            content + int.from_bytes(self._buffer[_START : _START + 2], "little")
+            if kind == b"B"
+            else _START
+        )
         if is_end or (kind and stop <= len(self._buffer)):
             header = read_header(self._buffer[:_START])
             self._records.append(header)
@@ -180,7 +192,9 @@ class UlogParser:
                 if payloads is not None:
                     payloads.append(buffer[at + _DATA_HEADER : at + used])
                 elif subscription is not None:
-                    records.append(make(Data, (subscription, buffer[at + _DATA_HEADER : at + used])))
+                    records.append(
+                        make(Data, (subscription, buffer[at + _DATA_HEADER : at + used]))
+                    )
                 at = stop
         return at
 
@@ -272,7 +286,9 @@ class UlogParser:
         if is_partial:
             return _Inspection("incomplete", stop)
         if known is not None:  # a sync message inside the record means that bytes are missing
-            return _Inspection("unknown" if self._verify and SYNC in buffer[at:stop] else "valid", stop)
+            return _Inspection(
+                "unknown" if self._verify and SYNC in buffer[at:stop] else "valid", stop
+            )
         try:
             record = READERS[kind[0]](buffer[content:stop])
         except (ValueError, LookupError, struct.error):
@@ -334,7 +350,9 @@ class UlogParser:
         topic, old = (new.name, new.multi_id), self.subscriptions.get(new.message_id)
         if old is not None:
             if (old.name, old.multi_id) != topic:
-                raise ValueError(f"{new.name} is ignored, because its message id belongs to {old.name}")
+                raise ValueError(
+                    f"{new.name} is ignored, because its message id belongs to {old.name}"
+                )
             return
         if ended := self._ended.get(topic):
             subscription = ended.pop(0)
@@ -354,9 +372,16 @@ class UlogParser:
     def _route(self, message_id: int, payloads: list[bytes] | None) -> None:
         """Add the payloads of a message id to a list from now on, or return its messages."""
         if (subscription := self.subscriptions.get(message_id)) is not None:
-            returned = subscription if self._topics is None or subscription.name in self._topics else None
+            returned = (
+                subscription if self._topics is None or subscription.name in self._topics else None
+            )
             for length, head in _heads(message_id, subscription.layout):
-                self._known[head] = returned, length, subscription.layout.size + _DATA_HEADER, payloads
+                self._known[head] = (
+                    returned,
+                    length,
+                    subscription.layout.size + _DATA_HEADER,
+                    payloads,
+                )
 
     def _unsubscribe(self, message_id: int) -> None:
         old = self.subscriptions.pop(message_id, None)

@@ -114,7 +114,9 @@ Record = Header | _Definition | _Logged | Damage
 def read_header(data: bytes) -> Header:
     """Parse the 16-byte file header; raise UlogError for other data."""
     if len(data) < 16 or not data.startswith(b"ULog\x01\x12\x35"):
-        raise UlogError("it does not begin with ULog's magic bytes; check that it is a complete PX4 log")
+        raise UlogError(
+            "it does not begin with ULog's magic bytes; check that it is a complete PX4 log"
+        )
     return Header(data[7], int.from_bytes(data[8:16], "little"))
 
 
@@ -155,7 +157,8 @@ def _subscription(content: bytes) -> Subscription:
     name = content[3:].decode("ascii")
     if not _NAME.fullmatch(name):
         raise ValueError
-    return Subscription(message_id, multi_id, name, PayloadLayout((), 0, 0))  # resolved by the parser
+    # resolved by the parser
+    return Subscription(message_id, multi_id, name, PayloadLayout((), 0, 0))
 
 
 def _sync(content: bytes) -> Sync:
@@ -166,7 +169,9 @@ def _sync(content: bytes) -> Sync:
 
 READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
     ord("A"): _subscription,
-    ord("C"): lambda content: _text(content[:1] + content[3:], struct.unpack_from("<H", content, 1)[0]),
+    ord("C"): lambda content: _text(
+        content[:1] + content[3:], struct.unpack_from("<H", content, 1)[0]
+    ),
     ord("F"): _format,
     ord("I"): lambda content: Information(*_key_and_value(content)),
     ord("L"): _text,
@@ -210,8 +215,17 @@ class LoggedStream:
             known = self.definition.known_types.get(name, {kind})
             if kind not in known:
                 self.converted[name] = self.definition.types.get(name) or next(iter(known))
-        at = next((each.offset for each in layout.fields if each.name == "timestamp" not in self.converted), None)
-        self.timestamp: Callable[[bytes], tuple[int | None]] = lambda payload: (self.decode(payload).get("timestamp"),)
+        at = next(
+            (
+                each.offset
+                for each in layout.fields
+                if each.name == "timestamp" not in self.converted
+            ),
+            None,
+        )
+        self.timestamp: Callable[[bytes], tuple[int | None]] = lambda payload: (
+            self.decode(payload).get("timestamp"),
+        )
         """Return the timestamp of a message [us], or None if it has none, in a tuple."""
         if at is not None:
             self.timestamp = struct.Struct(f"<{at}xQ").unpack_from
@@ -249,4 +263,5 @@ class LoggedStream:
         return fields
 
 
-_define = lru_cache(256)(define)  # shared by all instances and logs, because codecs are cached per definition
+# shared by all instances and logs, because codecs are cached per definition
+_define = lru_cache(256)(define)

@@ -15,16 +15,33 @@ from . import rules
 from .detectors import ChangeDetector, Detection, Finding, detect_nothing, read_fields
 
 AIR_DATA: Final = "vehicle_air_data"
-_GNSS: Final = ("GNSS", ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv"))
+_GNSS: Final = (
+    "GNSS",
+    ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv"),
+)
 REFERENCES: Final = {
     "vehicle_gps_position": _GNSS, "sensor_gps": _GNSS, AIR_DATA: ("barometer", ("baro_alt_meter", "baro_device_id")),
     "vehicle_local_position_groundtruth": ("ground truth", ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")),
 }  # fmt: skip
 """Topics with independent measurements, each with its instrument and its fields."""
 
-_ESTIMATE: Final = ("x", "y", "z", "vx", "vy", "z_valid", "xy_valid", "z_global", "ref_lat", "ref_lon", "ref_alt")
-_INTERVAL: Final = 400_000  # us of the vehicle's clock, of each of which the first measurement is compared
-_DELAY: Final = 500_000  # us by which comparisons follow the estimate: topics are written and sent in any order
+_ESTIMATE: Final = (
+    "x",
+    "y",
+    "z",
+    "vx",
+    "vy",
+    "z_valid",
+    "xy_valid",
+    "z_global",
+    "ref_lat",
+    "ref_lon",
+    "ref_alt",
+)
+# us of the vehicle's clock, of each of which the first measurement is compared
+_INTERVAL: Final = 400_000
+# us by which comparisons follow the estimate: topics are written and sent in any order
+_DELAY: Final = 500_000
 _MAX_STEP: Final = 500_000  # us between the estimates before and after a measurement
 _FRESH: Final = 1_500_000  # us for which a comparison is valid
 _MAX_WAITING: Final = 100  # measurements; bounds the memory that a peer can use
@@ -48,7 +65,8 @@ class ReferenceDetector(ChangeDetector):
         interval = self.stamp // _INTERVAL
         if interval != self._interval:
             self._interval, values = interval, self._read_reference(message)
-            if all(isinstance(value, int | float) for value in values):  # fields of AIR_DATA may have any type
+            # fields of AIR_DATA may have any type
+            if all(isinstance(value, int | float) for value in values):
                 self._comparison.remember(_Measurement(self.stamp, self._name, values))
         return found
 
@@ -103,7 +121,9 @@ class _Estimate(NamedTuple):
 
     @property
     def height_limit(self) -> float:
-        return rules.HEIGHT_LIMIT + rules.HEIGHT_SHARE * (0.0 if math.isnan(self.z) else abs(self.z))
+        return rules.HEIGHT_LIMIT + rules.HEIGHT_SHARE * (
+            0.0 if math.isnan(self.z) else abs(self.z)
+        )
 
     @property
     def distance_limit(self) -> float:
@@ -126,7 +146,8 @@ class Comparison:
         self._height = _Contradiction("height")
         self._position = _Contradiction("position")
         self._origin = _Contradiction("origin")
-        self._offsets: dict[str, tuple[object, float]] = {}  # origin and first difference, by reference
+        # origin and first difference, by reference
+        self._offsets: dict[str, tuple[object, float]] = {}
         self._waiting: list[_Measurement] = []  # by time
         self._estimates: deque[_Message] = deque(maxlen=_MAX_ESTIMATES)
 
@@ -148,7 +169,9 @@ class Comparison:
         while self._waiting and self._waiting[0].stamp <= stamp - _DELAY:
             measurement = self._waiting.pop(0)
             delay = (stamp - measurement.stamp) / 1e6
-            findings += [replace(finding, age=finding.age + delay) for finding in self._compare(measurement)]
+            findings += [
+                replace(finding, age=finding.age + delay) for finding in self._compare(measurement)
+            ]
         while estimates[0].stamp < stamp - 2 * _DELAY - _MAX_STEP:
             estimates.popleft()
         return findings
@@ -177,7 +200,9 @@ class Comparison:
             self._position.update(name, stamp, error.distance, error.distance_limit),
         ]
         if name == "GNSS" and estimate.z_global == 1 and not self._height.since:
-            changes.append(self._origin.update(name, stamp, error.altitude, self._limit_of_origin(error)))
+            changes.append(
+                self._origin.update(name, stamp, error.altitude, self._limit_of_origin(error))
+            )
         return [change for change in changes if change is not None]
 
     def _limit_of_origin(self, error: _Error) -> float:
@@ -219,7 +244,9 @@ class Comparison:
         x, y, z, latitude, longitude, altitude = measurement.values
         height = self._relative("ground truth", estimate.height - altitude + z, estimate.has_origin)
         if math.isfinite(estimate.latitude):
-            north, east = MapProjection(estimate.latitude, estimate.longitude).project(latitude, longitude)
+            north, east = MapProjection(estimate.latitude, estimate.longitude).project(
+                latitude, longitude
+            )
             distance = math.hypot(estimate.x - x - north, estimate.y - y - east)
         elif math.isfinite(estimate.x + estimate.y):
             north = self._relative("north", estimate.x - x, None)
@@ -240,9 +267,12 @@ class Comparison:
         error = estimate.altitude - estimate.z - altitude
         change = self._relative("GNSS", error, None)
         height = min(error, change, key=abs)
-        if error * change < 0.0:  # on opposite sides: the altitude and its change do not support each other
+        # on opposite sides: the altitude and its change do not support each other
+        if error * change < 0.0:
             height = 0.0
-        north, east = MapProjection(estimate.latitude, estimate.longitude).project(latitude, longitude)
+        north, east = MapProjection(estimate.latitude, estimate.longitude).project(
+            latitude, longitude
+        )
         eph, epv = (value if value > 0.0 else rules.UNKNOWN_ACCURACY for value in (eph, epv))
         return _Error(
             height, math.hypot(estimate.x - north, estimate.y - east), error,
@@ -307,13 +337,19 @@ class _Contradiction:
         }
         is_alone = self.quantity != "position" and len(fresh) == 1
         factor = 2.0 if is_alone else 1.0
-        directions = {math.copysign(abs(error) > factor * limit, error) for error, limit in fresh.values()}
+        directions = {
+            math.copysign(abs(error) > factor * limit, error) for error, limit in fresh.values()
+        }
         if directions not in ({1.0}, {-1.0}):
             was_reported, self.is_reported = self.is_reported, False
             self.since, self.worst = 0, 0.0
             self.smallest_limit = math.inf
             kind = f"{self.quantity}_contradicted"
-            return Finding(kind, "end", f"{self.quantity} no longer contradicted") if was_reported else None
+            return (
+                Finding(kind, "end", f"{self.quantity} no longer contradicted")
+                if was_reported
+                else None
+            )
         self.since, self.worst = self.since or stamp, max(self.worst, error, key=abs)
         self.smallest_limit = min(self.smallest_limit, limit)
         lasted = (stamp - self.since) / 1e6

@@ -103,7 +103,11 @@ class ChangeDetector:
 
     def again(self, before: Fields) -> Iterator[Finding]:
         """Return the findings in the last message as if it followed one with these fields."""
-        return iter(()) if self.last is None else self._detect(before, self._by_name(self.last, self.missing))
+        return (
+            iter(())
+            if self.last is None
+            else self._detect(before, self._by_name(self.last, self.missing))
+        )
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
         values = zip(self._read_all.names, self._read_all(message), strict=True)
@@ -131,7 +135,9 @@ class AidDetector(ChangeDetector):
     `explain`: returns the cause as the end of a sentence, or "".
     """
 
-    def __init__(self, topic: str, is_primary: Callable[[object], bool], explain: Callable[[], str]) -> None:
+    def __init__(
+        self, topic: str, is_primary: Callable[[object], bool], explain: Callable[[], str]
+    ) -> None:
         super().__init__(("fused", "innovation_rejected", "estimator_instance"), (), detect_nothing)
         self.topic, self.kind = topic, ""  # of the condition that it began
         self._is_primary, self._explain = is_primary, explain
@@ -184,12 +190,16 @@ class AidDetector(ChangeDetector):
         is_new_run = not (before and kind)
         age = (self.stamp - self._since) / 1e6 if is_new_run else 0.0
         if before and before != kind:
-            yield Finding(before, "end", text or KINDS[before].end.format(self._label), (self.topic,), age=age)
+            yield Finding(
+                before, "end", text or KINDS[before].end.format(self._label), (self.topic,), age=age
+            )
         if kind and before != kind:
             severity: Severity | None = "info" if self.topic in KINDS[kind].minor else None
             initial = kind == "aid_unused" and self._is_first
             text = KINDS[kind].begin.format(self._label) + self._explain()
-            yield Finding(kind, "begin", text, (self.topic,), severity=severity, initial=initial, age=age)
+            yield Finding(
+                kind, "begin", text, (self.topic,), severity=severity, initial=initial, age=age
+            )
 
 
 class VisionDetector(ChangeDetector):
@@ -200,7 +210,9 @@ class VisionDetector(ChangeDetector):
     `explain`: returns the cause as the end of a sentence, or "".
     """
 
-    def __init__(self, is_fused: Callable[[], tuple[bool | None, int]], explain: Callable[[], str]) -> None:
+    def __init__(
+        self, is_fused: Callable[[], tuple[bool | None, int]], explain: Callable[[], str]
+    ) -> None:
         super().__init__((), (), detect_nothing)
         self._is_fused, self._explain = is_fused, explain
         self.is_unused = False
@@ -285,8 +297,12 @@ def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterat
                 found.setdefault((True, "begin" if now == kind.bad else "end"), []).append(name)
         for (is_event, change), flags in sorted(found.items()):
             severity: Severity | None = "info" if kind.minor.issuperset(flags) else None
-            text = (kind.begin if change == "begin" else kind.end).format(", ".join(map(kind.flags.__getitem__, flags)))
-            yield Finding(kind.name, change, text, tuple(flags), severity=severity, initial=not is_event)
+            text = (kind.begin if change == "begin" else kind.end).format(
+                ", ".join(map(kind.flags.__getitem__, flags))
+            )
+            yield Finding(
+                kind.name, change, text, tuple(flags), severity=severity, initial=not is_event
+            )
 
 
 def _detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
@@ -294,14 +310,20 @@ def _detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
     if level is not None and text:
         is_bad, is_watch = level <= LogMessage.CRITICAL, level <= LogMessage.WARNING
         severity: Severity = "bad" if is_bad else "watch" if is_watch else "info"
-        yield Finding("text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity)
+        yield Finding(
+            "text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity
+        )
 
 
 def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
     fix, was = after["fix_type"], before.get("fix_type")
     satellites, earlier = after["satellites_used"], before.get("satellites_used")
     if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
-        text = f"no GPS fix, {satellites} satellites" if satellites in range(_UNKNOWN_SATELLITES) else "no GPS fix"
+        text = (
+            f"no GPS fix, {satellites} satellites"
+            if satellites in range(_UNKNOWN_SATELLITES)
+            else "no GPS fix"
+        )
         yield Finding("gps_fix_lost", "begin", text, initial=True)
     elif was is not None and fix is not None and was != fix:
         names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
@@ -322,7 +344,9 @@ def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
             initial = level == 2 and (last[kind][0] is None or not before)
             is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS receiver
             severity: Severity | None = "info" if is_info else None
-            found = Finding(kind, "begin", begin, (), numbers, severity=severity, initial=initial, switch=True)
+            found = Finding(
+                kind, "begin", begin, (), numbers, severity=severity, initial=initial, switch=True
+            )
             yield found if level else Finding(kind, "end", end, (), numbers, switch=True)
 
 
@@ -332,13 +356,20 @@ def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
     if satellites is not None and satellites != _UNKNOWN_SATELLITES:
         few = (satellites < rules.FEW_SATELLITES) + (satellites < rules.ENOUGH_SATELLITES)
     indicator, jammed, spoofed = (gps.get(name) or 0 for name in _INTERFERENCE)
-    jamming = 2 if jammed > 1 else (indicator >= rules.JAMMING_BEGIN) + (indicator >= rules.JAMMING_END)
+    jamming = (
+        2 if jammed > 1 else (indicator >= rules.JAMMING_BEGIN) + (indicator >= rules.JAMMING_END)
+    )
     state = f", state {jammed}" if jammed > 1 else ""
     count, jam = f"{satellites} satellites", f"GNSS jamming: indicator {indicator}"
     spoof = f"GNSS spoofing: state {spoofed}"
     return {
         "few_satellites": (few, f"only {count}", count, {"satellites": satellites}),
-        "jamming": (jamming, f"{jam}{state}", "GNSS jamming ended", {"indicator": indicator, "state": jammed}),
+        "jamming": (
+            jamming,
+            f"{jam}{state}",
+            "GNSS jamming ended",
+            {"indicator": indicator, "state": jammed},
+        ),
         "spoofing": (2 if spoofed > 1 else 0, spoof, "GNSS spoofing ended", {"state": spoofed}),
     }
 
@@ -359,7 +390,13 @@ def _detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("nav_state"), after["nav_state"]
     if was is not None and now is not None and was != now:
         names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
-        yield Finding("mode", "once", f"mode changed from {names[0]} to {names[1]}", names, {"from": was, "to": now})
+        yield Finding(
+            "mode",
+            "once",
+            f"mode changed from {names[0]} to {names[1]}",
+            names,
+            {"from": was, "to": now},
+        )
 
     yield from _detect_transition(before, after)
 
@@ -368,7 +405,9 @@ def _detect_transition(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the begin and end of a VTOL's transition, and the vehicle type that it changes."""
     was, now = before.get("in_transition_mode"), after["in_transition_mode"]
     if now and not was:
-        aim = {True: " to fixed wing", False: " to rotary wing"}.get(after["in_transition_to_fw"], "")
+        aim = {True: " to fixed wing", False: " to rotary wing"}.get(
+            after["in_transition_to_fw"], ""
+        )
         yield Finding("transition", "begin", f"VTOL transition{aim}", initial=was is None)
     elif was and now is False:
         yield Finding("transition", "end", "VTOL transition ended")
@@ -388,20 +427,30 @@ def _detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
 
 def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     known = ({"connected": True, "warning": 0} | before, after)
-    was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
+    was, warning = (
+        0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known
+    )
     if warning is None or was is None or was == warning:
         return
     remaining = after["remaining"]
     numbers = {"warning": warning}
     left = ""
     if remaining is not None and 0 <= remaining <= 1:
-        numbers, left = {"warning": warning, "remaining": remaining}, f", {100 * remaining:.0f} % left"
+        numbers = {"warning": warning, "remaining": remaining}
+        left = f", {100 * remaining:.0f} % left"
     if warning:
         severity: Severity | None = "watch" if warning in (1, 7) else None
         text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
-        yield Finding("battery", "begin", text, numbers=numbers, severity=severity, initial=not before)
+        yield Finding(
+            "battery", "begin", text, numbers=numbers, severity=severity, initial=not before
+        )
     else:
-        yield Finding("battery", "end", f"battery no longer {rules.WARNINGS.get(was, was)}{left}", numbers=numbers)
+        yield Finding(
+            "battery",
+            "end",
+            f"battery no longer {rules.WARNINGS.get(was, was)}{left}",
+            numbers=numbers,
+        )
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:

@@ -142,7 +142,9 @@ def rank(condition: Condition, until: float | None) -> tuple[int, int, float]:
 
 def state_of(conditions: Iterable[Condition]) -> State:
     """Return the state of a vehicle, set by the worst of these conditions and recent single events."""
-    counting = (each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless)
+    counting = (
+        each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless
+    )
     ordered = sorted(counting, key=lambda condition: rank(condition, None))
     if not ordered:
         return State("info", "ok", None, ())
@@ -169,7 +171,9 @@ def without_wild(events: Iterable[Event]) -> list[Event]:
     for event in events:
         if id(event) in wild:
             key, indices = (event.vehicle, event.kind), range(len(kept) - 1, -1, -1)
-            begin = next((each for each in indices if (kept[each].vehicle, kept[each].kind) == key), None)
+            begin = next(
+                (each for each in indices if (kept[each].vehicle, kept[each].kind) == key), None
+            )
             if begin is not None and event.time - kept[begin].time <= MAX_ALONE:
                 del kept[begin]
                 if event.change != "begin":
@@ -197,7 +201,12 @@ def explain(
         for condition in conditions:
             begin = condition.begin
             is_before = begin.time <= event.time + late  # an event may be reported late
-            if condition.kind in causes and is_before and not begin.is_minor and _is_notable(condition.kind, condition):
+            if (
+                condition.kind in causes
+                and is_before
+                and not begin.is_minor
+                and _is_notable(condition.kind, condition)
+            ):
                 latest.setdefault(condition.kind, begin)
     return sorted(latest.values(), key=lambda cause: cause.time)
 
@@ -217,4 +226,8 @@ def _may_explain(cause: Event, event: Event) -> bool:
 
 def _is_notable(kind: str, found: Event | Condition) -> bool:
     """Return whether a start is not routine: info because of the kind, or on the ground, but not by its size."""
-    return found.severity != "info" or KINDS[kind].severity == "info" or KINDS[kind].on_ground == "info"
+    return (
+        found.severity != "info"
+        or KINDS[kind].severity == "info"
+        or KINDS[kind].on_ground == "info"
+    )

@@ -80,10 +80,13 @@ class EventLog:
         log message that is not of PX4.
         """
         vehicle = self.vehicles.get(address.vehicle)
-        if vehicle is not None and not lost and vehicle.skips(address, time):  # most messages; needs no lock
+        # most messages; needs no lock
+        if vehicle is not None and not lost and vehicle.skips(address, time):
             return
         with self._lock:
-            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
+            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(
+                address.vehicle, time
+            ):
                 if lost:
                     vehicle.count_lost(lost, "" if is_estimate else address.stream, time)
                 vehicle.author = AUTHORS.get(source, vehicle.author)
@@ -98,7 +101,9 @@ class EventLog:
     def reject(self, address: Address, reason: str, time: float) -> None:
         """Record a rejected message."""
         with self._lock:
-            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(address.vehicle, time):
+            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(
+                address.vehicle, time
+            ):
                 vehicle.reject(address.stream, reason, time)
 
     def update(
@@ -121,7 +126,9 @@ class EventLog:
         """
         with self._lock:
             change: Change = "begin" if link else "end"
-            self._common.emit(Finding("link_down", change, link or "link restored", switch=True), "", time)
+            self._common.emit(
+                Finding("link_down", change, link or "link restored", switch=True), "", time
+            )
             if dropped > self._dropped or is_behind:
                 self._last_overload = time
                 text = f"{self._reader} overloaded: messages are delayed or dropped"
@@ -132,12 +139,16 @@ class EventLog:
                 self._common.emit(ended, "", time, changed=self._last_overload)
             self._dropped = dropped
             if present is not None:
-                for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
+                for here in filter(
+                    None, map(self.vehicles.get, self.vehicles if link else present)
+                ):
                     here.last_seen = time
                 self._most_present = max(self._most_present, len(present))
                 gone = self._gone(time)
                 beyond = gone[: -max(MAX_GONE, self._most_present)]
-                self._forget([each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond)
+                self._forget(
+                    [each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond
+                )
             if self.overload is not None:
                 self._settled = time + MAX_SILENCE  # delayed messages need time to arrive
             if time < self._settled:
@@ -165,7 +176,10 @@ class EventLog:
     def events_since(self, seen: int) -> tuple[list[Event], int]:
         """Return the retained events after the first `seen` reported ones, and the number of all reported events."""
         with self._lock:
-            new = [self._events[number] for number in takewhile(lambda number: number >= seen, reversed(self._events))]
+            new = [
+                self._events[number]
+                for number in takewhile(lambda number: number >= seen, reversed(self._events))
+            ]
             return new[::-1], self.reported
 
     def label_first_events(self) -> None:
@@ -191,7 +205,11 @@ class EventLog:
 
     def _gone(self, time: float) -> list[tuple[float, str]]:
         """Return the time last seen and the name of each vehicle not seen for a minute, longest gone first."""
-        return sorted((each.last_seen, name) for name, each in self.vehicles.items() if time - each.last_seen > RECENT)
+        return sorted(
+            (each.last_seen, name)
+            for name, each in self.vehicles.items()
+            if time - each.last_seen > RECENT
+        )
 
     def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:
         for _, name in vehicles:

@@ -10,7 +10,12 @@ from nedbus_msgs.text import counted
 from .event import ALL, without_wild
 from .report import AccountReport, VehicleReport, by_vehicle, once_per_service
 
-VALID: Final[Mapping[str, str]] = {"xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid"}
+VALID: Final[Mapping[str, str]] = {
+    "xy": "xy_valid",
+    "z": "z_valid",
+    "vxy": "v_xy_valid",
+    "vz": "v_z_valid",
+}
 """Quantities whose validity a health check can require, and their flags in VehicleLocalPosition."""
 
 _MAX_RECENT: Final = 20  # recent events listed
@@ -31,23 +36,35 @@ class Expectation:
     well: bool = False
 
 
-def faults_of(reports: Sequence[AccountReport], expected: Expectation, *, only: str | None = None) -> list[str]:
+def faults_of(
+    reports: Sequence[AccountReport], expected: Expectation, *, only: str | None = None
+) -> list[str]:
     """Return the faults that fail a health check, one line each; `only`: consider only reports of this host."""
     checked = [report for report in reports if only is None or report.host == only]
-    vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
+    vehicles = {
+        name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()
+    }
     missing = [name for name in expected.expect if name not in vehicles]
     active = [name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent]
     names = f": {', '.join(active[:20])}" if active else ""
-    faults = [f"vehicle {name} is missing: it has no publisher{names and f'; published{names}'}" for name in missing]
+    faults = [
+        f"vehicle {name} is missing: it has no publisher{names and f'; published{names}'}"
+        for name in missing
+    ]
     if len(active) < (expected.vehicles or 0):
         faults.append(f"messages arrive from {len(active)} of {expected.vehicles} vehicles{names}")
     for name, (now, vehicle) in vehicles.items():
         if not expected.expect or name in expected.expect:
-            faults += [f"vehicle {name}: {fault}" for fault in _faults_of_vehicle(name, vehicle, now, expected)]
+            faults += [
+                f"vehicle {name}: {fault}"
+                for fault in _faults_of_vehicle(name, vehicle, now, expected)
+            ]
     return list(dict.fromkeys([*faults, *_recent_faults(checked, expected)]))
 
 
-def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: Expectation) -> Iterator[str]:
+def _faults_of_vehicle(
+    name: str, vehicle: VehicleReport, now: float, expected: Expectation
+) -> Iterator[str]:
     invalid = [each for each in expected.valid if VALID[each] in vehicle.flags]
     unknown = [each for each in expected.valid if VALID[each] in vehicle.unknown]
     if vehicle.is_silent:

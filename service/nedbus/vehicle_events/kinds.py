@@ -5,7 +5,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
-from .rules import AID_SOURCES, EVIDENCE, FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, MINOR_AIDS, REJECTED
+from .rules import (
+    AID_SOURCES,
+    EVIDENCE,
+    FAILSAFE_FLAGS,
+    FAULTS,
+    FUSED,
+    HEIGHTS,
+    MINOR_AIDS,
+    REJECTED,
+)
 
 Severity = Literal["bad", "watch", "info"]
 """How bad an event or a state is."""
@@ -72,7 +81,14 @@ _SENSING: Final = (
     "transition",
 )  # fmt: skip
 _CONTRADICTED: Final = ("height_contradicted", "position_contradicted")
-_INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning", *_CONTRADICTED)
+_INVALID: Final = (
+    "xy_invalid",
+    "z_invalid",
+    "v_xy_invalid",
+    "v_z_invalid",
+    "dead_reckoning",
+    *_CONTRADICTED,
+)
 
 
 def _validity(name: str, flag: str, quantity: str, *causes: str) -> Kind:

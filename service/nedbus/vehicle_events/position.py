@@ -34,7 +34,8 @@ _VELOCITY: Final[tuple[Quantity, ...]] = ("vxy", "vz")
 _DIRECTIONS: Final = re.compile(r" \(.*\)")  # in the text of a reset of xy
 _DURATION: Final = re.compile(r" in [\d.]+ s")  # in the text of a jump
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-_CONTEXT: Final = dict.fromkeys(JUMP_FIELDS, math.nan)  # read when a compared field changes, with their defaults
+# read when a compared field changes, with their defaults
+_CONTEXT: Final = dict.fromkeys(JUMP_FIELDS, math.nan)
 
 Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
@@ -48,7 +49,8 @@ class PositionDetector(ChangeDetector):
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
         self._jump: Step | None = None  # in progress
-        self._left: tuple[int, object] = (0, ())  # time when an origin changed [us], and the one before
+        # time when an origin changed [us], and the one before
+        self._left: tuple[int, object] = (0, ())
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings in a message, None if nothing has changed."""
@@ -74,19 +76,29 @@ class PositionDetector(ChangeDetector):
     def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
         if before:
             earlier, values = (
-                {name: _CONTEXT.get(name) if value is None else value for name, value in fields.items()}
+                {
+                    name: _CONTEXT.get(name) if value is None else value
+                    for name, value in fields.items()
+                }
                 for fields in (before, after)
             )
             for found in _detect_origin(earlier, values):
                 old, new = ([each[name] for name in _ORIGIN] for each in (earlier, values))
-                is_back = self._left == (self.earlier, new) and self.stamp - self.earlier <= 1e6 * MAX_ALONE
+                is_back = (
+                    self._left == (self.earlier, new)
+                    and self.stamp - self.earlier <= 1e6 * MAX_ALONE
+                )
                 self._left = self.stamp, old
                 yield replace(found, numbers={**found.numbers, ALONE: 1}) if is_back else found
-            counts = [(name, [each[RESET_COUNTERS[name]] for each in (earlier, values)]) for name in _RESETS]
+            counts = [
+                (name, [each[RESET_COUNTERS[name]] for each in (earlier, values)])
+                for name in _RESETS
+            ]
             quantities = [name for name, each in counts if None not in each and each[0] != each[1]]
             if quantities:
                 yield _reset(quantities, earlier, values)
-            is_same_origin = all(str(earlier[name]) == str(values[name]) for name in _ORIGIN)  # NaN equals NaN
+            # NaN equals NaN
+            is_same_origin = all(str(earlier[name]) == str(values[name]) for name in _ORIGIN)
             is_comparable = values["xy_valid"] and "xy" not in quantities and is_same_origin
             yield from self._track_jump(self._unexplained_step() if is_comparable else None)
         yield from detect_flags(_KINDS, before, after)
@@ -96,21 +108,30 @@ class PositionDetector(ChangeDetector):
         seconds = (self.stamp - self.earlier) / 1e6
         if not 0 < seconds <= _MAX_INTERVAL:
             return None
-        (x_before, y_before, vx_before, vy_before), (x, y, vx, vy) = self._motion_before, self._motion
-        north, east = x - x_before - (vx + vx_before) / 2 * seconds, y - y_before - (vy + vy_before) / 2 * seconds
+        (x_before, y_before, vx_before, vy_before) = self._motion_before
+        (x, y, vx, vy) = self._motion
+        north = x - x_before - (vx + vx_before) / 2 * seconds
+        east = y - y_before - (vy + vy_before) / 2 * seconds
         limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
-        return (self.earlier / 1e6, north, east) if north * north + east * east > limit * limit else None
+        return (
+            (self.earlier / 1e6, north, east)
+            if north * north + east * east > limit * limit
+            else None
+        )
 
     def _track_jump(self, step: Step | None) -> Iterator[Finding]:
         """Add a step to the jump in progress; yield the jump when it ends."""
         jump, self._jump = self._jump, step
         if jump is not None and step is not None:
             self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
-        elif jump is not None and (distance := math.hypot(*jump[1:])) > JUMP_DISTANCE:  # else one message was wild
+        elif jump is not None and (distance := math.hypot(*jump[1:])) > JUMP_DISTANCE:
+            # else one message was wild
             seconds = self.stamp / 1e6 - jump[0]
             text = f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
-            yield Finding("jump", "once", text, numbers=numbers, is_large=distance >= LARGE_CORRECTION)
+            yield Finding(
+                "jump", "once", text, numbers=numbers, is_large=distance >= LARGE_CORRECTION
+            )
 
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
@@ -129,14 +150,18 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
     is_large = any(size >= LARGE_CORRECTION for size in sizes)
     text = f"reset of {', '.join(known + unknown)}"
     severity: Severity | None = "info" if is_small else None
-    return Finding("reset", "once", text, tuple(quantities), numbers, severity=severity, is_large=is_large)
+    return Finding(
+        "reset", "once", text, tuple(quantities), numbers, severity=severity, is_large=is_large
+    )
 
 
 def _describe(name: Quantity, numbers: Mapping[str, float]) -> str:
     """Return the text for a quantity of a reset, whose `numbers` have its sizes."""
     names, text = _RESETS[name]
     sizes = {each: numbers[each] for each in names}
-    return text.format(**sizes, size=math.hypot(*sizes.values()), degrees=math.degrees(sizes[names[0]]))
+    return text.format(
+        **sizes, size=math.hypot(*sizes.values()), degrees=math.degrees(sizes[names[0]])
+    )
 
 
 def _sizes_of(reset: Event) -> dict[Quantity, float]:
@@ -152,7 +177,11 @@ def large_part(reset: Event) -> str:
     """Return the text of a reset, without the quantities that a large one moved little."""
     sizes = _sizes_of(reset)
     large = [name for name, size in sizes.items() if size >= LARGE_CORRECTION]
-    return f"reset of {', '.join(_describe(name, reset.numbers) for name in large)}" if large else reset.text
+    return (
+        f"reset of {', '.join(_describe(name, reset.numbers) for name in large)}"
+        if large
+        else reset.text
+    )
 
 
 def short_text(correction: Event) -> str:
@@ -170,17 +199,28 @@ def short_text(correction: Event) -> str:
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield an origin that was set or moved; one that was not provided before, and `ref_timestamp`, are ignored."""
-    had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
+    had, has = (
+        each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"])
+        for each in (before, after)
+    )
     if has and not had and before["xy_global"] is not None:
         origin = GlobalPosition.wrapped(after["ref_lat"], after["ref_lon"], math.nan)
         text = f"origin set at {origin.latitude:.6f}, {origin.longitude:.6f}"
         numbers = {"latitude": origin.latitude, "longitude": origin.longitude}
         yield Finding("origin_set", "once", text, numbers=numbers)
     elif has and had:
-        moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(after["ref_lat"], after["ref_lon"])
+        moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(
+            after["ref_lat"], after["ref_lon"]
+        )
         distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
         up = up if math.isfinite(up) else 0.0
         if distance >= 0.01 or abs(up) >= 0.01:
             text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
             severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
-            yield Finding("origin_moved", "once", text, numbers={"distance": distance, "up": up}, severity=severity)
+            yield Finding(
+                "origin_moved",
+                "once",
+                text,
+                numbers={"distance": distance, "up": up},
+                severity=severity,
+            )

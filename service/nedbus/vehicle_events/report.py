@@ -19,7 +19,8 @@ from .kinds import KINDS, OF_SERVICE, rank_vehicle
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests this report instead of the status; its value is the period [s]."""
 
-_MAX_TOPICS: Final = 30  # per vehicle; those that nedbus defines come first, because verdicts depend on them
+# per vehicle; those that nedbus defines come first, because verdicts depend on them
+_MAX_TOPICS: Final = 30
 _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 
@@ -68,7 +69,9 @@ class AccountReport:
         """Return what this report says about one vehicle; events of the link and the reader become its events."""
         vehicles = {name: each for name, each in self.vehicles.items() if name == vehicle}
         events = (each for each in self.events if each.vehicle in (vehicle, ALL))
-        own = tuple(each if each.vehicle == vehicle else replace(each, vehicle=vehicle) for each in events)
+        own = tuple(
+            each if each.vehicle == vehicle else replace(each, vehicle=vehicle) for each in events
+        )
         return replace(self, vehicles=vehicles, events=own)
 
     def split(self, number: int) -> list[AccountReport]:
@@ -76,7 +79,11 @@ class AccountReport:
         vehicles, events = list(self.vehicles.items()), self.events
         many, some = -(-len(vehicles) // number), -(-len(events) // number)
         return [
-            replace(self, vehicles=dict(vehicles[each * many :][:many]), events=events[each * some :][:some])
+            replace(
+                self,
+                vehicles=dict(vehicles[each * many :][:many]),
+                events=events[each * some :][:some],
+            )
             for each in range(number if max(len(vehicles), len(events)) > 1 else 0)
         ]
 
@@ -100,24 +107,34 @@ def report_of(
     for name, vehicle in list(event_log.vehicles.items()):
         state = event_log.state(name, now)
         held = list(vehicle.conditions.items())
-        flags = {flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if KINDS[kind].validity}
+        flags = {
+            flag: max(0.0, each.since + to_utc)
+            for (kind, flag), each in held
+            if KINDS[kind].validity
+        }
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
         known = [condition for _, condition in held] + [*vehicle.usual.values()]
         bad = (condition for condition in known if condition.severity != "info")
-        unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))
+        unreported = tuple(
+            dict.fromkeys(each for each in bad if each.begin.identity not in reported)
+        )
         vehicles[name] = VehicleReport(
             state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
             tuple(sorted(vehicle.topics, key=lambda each: (each not in TOPICS, each)))[:_MAX_TOPICS],
             vehicle.main is not None, tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
             max(0.0, vehicle.first + to_utc),
         )  # fmt: skip
-    return AccountReport(service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events))
+    return AccountReport(
+        service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events)
+    )
 
 
 def joined(parts: Sequence[AccountReport]) -> AccountReport:
     """Join the parts of a report."""
     vehicles = {name: vehicle for part in parts for name, vehicle in part.vehicles.items()}
-    return replace(parts[0], vehicles=vehicles, events=tuple(event for part in parts for event in part.events))
+    return replace(
+        parts[0], vehicles=vehicles, events=tuple(event for part in parts for event in part.events)
+    )
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
@@ -127,7 +144,12 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
         for name in report.vehicles:
             if name not in found or found[name].vehicles[name].is_silent:
                 found[name] = report
-    return dict(sorted(found.items(), key=lambda each: rank_vehicle(each[0], each[1].vehicles[each[0]].severity)))
+    return dict(
+        sorted(
+            found.items(),
+            key=lambda each: rank_vehicle(each[0], each[1].vehicles[each[0]].severity),
+        )
+    )
 
 
 def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountReport, Event]]:
@@ -140,8 +162,17 @@ def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountRepo
     for report in reports:
         for event in report.events:
             if event.kind in OF_SERVICE:
-                content = (event.kind, event.change, event.severity, event.text, event.time, event.lasted)
-                found.setdefault((report.service, report.host, content), (report, replace(event, vehicle=ALL)))
+                content = (
+                    event.kind,
+                    event.change,
+                    event.severity,
+                    event.text,
+                    event.time,
+                    event.lasted,
+                )
+                found.setdefault(
+                    (report.service, report.host, content), (report, replace(event, vehicle=ALL))
+                )
             else:
                 found[id(event)] = report, event
     return sorted(found.values(), key=lambda each: each[1].time)

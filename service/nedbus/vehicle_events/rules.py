@@ -51,10 +51,13 @@ AID_SOURCES: Final[Mapping[str, str]] = {
 """Measurements that the EKF may fuse, by topic: PX4's EstimatorAidSource1d, 2d and 3d (1.14 and later)."""
 VISION: Final = ("vehicle_visual_odometry",)
 """Topics of positions sent into the vehicle that EKF2 reads; it does not read vehicle_mocap_odometry."""
-AID_HOLD: Final = 0.5  # s for which all messages of an aid source agree before it counts as fused, rejected or unused
+# s for which all messages of an aid source agree before it counts as fused, rejected or unused
+AID_HOLD: Final = 0.5
 AID_COUNT: Final = 3  # ... and their minimum number
-AID_PAUSE: Final = 1.0  # s without messages after which an aid source has stopped, and is judged anew
-VISION_HOLD: Final = 1.5  # s in which vision arrives without being fused; PX4 starts to fuse it within 0.5 s
+# s without messages after which an aid source has stopped, and is judged anew
+AID_PAUSE: Final = 1.0
+# s in which vision arrives without being fused; PX4 starts to fuse it within 0.5 s
+VISION_HOLD: Final = 1.5
 
 _FAILSAFE_FLAGS: Final = (
     "angular_velocity_invalid", "attitude_invalid", "local_altitude_invalid", "local_position_invalid",
@@ -80,7 +83,11 @@ SUBJECTS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 """Sensors and quantities, with patterns of the words for them in texts of PX4 and nedbus."""
 
-POSITIONS: Final = ("vehicle_local_position", "external_ins_local_position", "estimator_local_position")
+POSITIONS: Final = (
+    "vehicle_local_position",
+    "external_ins_local_position",
+    "estimator_local_position",
+)
 """Topics with position validity flags, in order of preference."""
 
 EVIDENCE: Final[Mapping[str, tuple[str, ...]]] = {
@@ -93,16 +100,19 @@ EVIDENCE: Final[Mapping[str, tuple[str, ...]]] = {
 RECENT: Final = 60.0
 """Seconds for which a single event affects the state of a vehicle."""
 
-MAX_SILENCE: Final = 3.0  # s without a position after which a vehicle is silent, if the state of its stream is unknown
+# s without a position after which a vehicle is silent, if the state of its stream is unknown
+MAX_SILENCE: Final = 3.0
 MIN_FIX_TYPE: Final = 3  # SensorGps.FIX_TYPE_3D
-FEW_SATELLITES: Final = 6  # the condition begins below this (PX4's EKF2_REQ_NSATS) and ends at ENOUGH_SATELLITES
+# the condition begins below this (PX4's EKF2_REQ_NSATS) and ends at ENOUGH_SATELLITES
+FEW_SATELLITES: Final = 6
 ENOUGH_SATELLITES: Final = 7
 JAMMING_BEGIN: Final = 80  # jamming_indicator; "too high" in PX4's guide to flight log analysis
 JAMMING_END: Final = 60
 JUMP_DISTANCE: Final = 1.0  # m of unexplained motion, plus JUMP_SHARE of the distance flown
 JUMP_SHARE: Final = 0.2
 LARGE_CORRECTION: Final = 10.0  # m or m/s; while armed, a reset or jump of this size is bad
-RECOVERY: Final = 1.0  # s after an invalid estimate in which a large correction is its recovery, and not bad
+# s after an invalid estimate in which a large correction is its recovery, and not bad
+RECOVERY: Final = 1.0
 SMALL_RESET: Final = 0.5  # m or m/s; a smaller reset is info
 # A reference contradicts a valid estimate if they differ by more than the limit plus HEIGHT_SHARE of the height, SIGMAS
 # times the GNSS accuracy, and the distance flown in GNSS_DELAY. Healthy logs: up to 2.9 m in height, 2.2 m at 18 m/s.
@@ -112,7 +122,8 @@ POSITION_LIMIT: Final = 4.0  # m
 GNSS_DELAY: Final = 0.5  # s
 SIGMAS: Final = 3.0
 UNKNOWN_ACCURACY: Final = 10.0  # m, in place of a missing eph or epv
-CONTRADICTED: Final = {"height": 1.5, "position": 3.0, "origin": 3.0}  # s for which all references must disagree
+# s for which all references must disagree
+CONTRADICTED: Final = {"height": 1.5, "position": 3.0, "origin": 3.0}
 ATMOSPHERE_SHARE: Final = 0.15  # of the height climbed; see `atmosphere_error`
 TROPOPAUSE: Final = 11_000.0  # m; PX4 computes the barometer's height with the lapse rate below it
 # Events within WINDOW; beyond these numbers, only the last one is reported.
@@ -120,9 +131,12 @@ CONDITION_CHANGES: Final = 4  # of one condition
 KIND_CHANGES: Final = 20  # of the conditions of one kind
 EQUAL_EVENTS: Final = 10  # single events of one kind, severity and quantities, or with one text
 SINGLE_EVENTS: Final = 200  # single events of one kind
-PERIODIC: Final = ("VehicleLocalPosition", "SensorGps", "BatteryStatus")  # PX4 sends the others when they change
-MAX_ALONE: Final = 0.4  # s; a condition of a PERIODIC message that ends this soon, with the next one, may be wild
-PAUSE: Final = 5.0  # s without a recurrence after which flapping, losses, rejections or an overload have ended
+# PX4 sends the others when they change
+PERIODIC: Final = ("VehicleLocalPosition", "SensorGps", "BatteryStatus")
+# s; a condition of a PERIODIC message that ends this soon, with the next one, may be wild
+MAX_ALONE: Final = 0.4
+# s without a recurrence after which flapping, losses, rejections or an overload have ended
+PAUSE: Final = 5.0
 MAX_BURST: Final = 20.0  # s after which continuing losses are reported
 
 MODES: Final[Mapping[int, str]] = {
@@ -135,7 +149,12 @@ MODES: Final[Mapping[int, str]] = {
 
 """Flight mode names by nav_state, as in QGroundControl."""
 
-VEHICLE_TYPES: Final[Mapping[int, str]] = {0: "unspecified", 1: "rotary wing", 2: "fixed wing", 3: "rover"}
+VEHICLE_TYPES: Final[Mapping[int, str]] = {
+    0: "unspecified",
+    1: "rotary wing",
+    2: "fixed wing",
+    3: "rover",
+}
 """Vehicle types by vehicle_type of VehicleStatus."""
 
 FIXES: Final[Mapping[int, str]] = {

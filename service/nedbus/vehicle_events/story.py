@@ -13,8 +13,10 @@ from .times import Times
 
 TOGETHER: Final = 1.0  # s; maximum time between the starts of conditions of one story
 _INVALID: Final = " not valid"
-_UNNEEDED: Final = ("barometer", "magnetometer", "battery")  # EVIDENCE that does not explain an invalid estimate
-_SENSOR_FAILURE: Final = re.compile(r"#\d+ fail(ed|ure):")  # PX4's "MAG #0 failed: STALE!", and its event for it
+# EVIDENCE that does not explain an invalid estimate
+_UNNEEDED: Final = ("barometer", "magnetometer", "battery")
+# PX4's "MAG #0 failed: STALE!", and its event for it
+_SENSOR_FAILURE: Final = re.compile(r"#\d+ fail(ed|ure):")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +103,9 @@ class Story:
         if begin is not None and begin.time != self.since:  # silence is detected later
             boot = None if begin.boot is None else begin.boot - (begin.time - self.since)
             begin = replace(begin, time=self.since, boot=boot)
-        return times.period(begin, self.end, (now if self.until is None else self.until) - self.since)
+        return times.period(
+            begin, self.end, (now if self.until is None else self.until) - self.since
+        )
 
 
 def stories_of(
@@ -131,7 +135,11 @@ def stories_of(
         chosen = [span for span in chosen if span not in group]
     if at is not None:
         stories.sort(key=lambda story: story.since)
-        held = [story for story in stories if story.since <= at and (story.until is None or at <= story.until)]
+        held = [
+            story
+            for story in stories
+            if story.since <= at and (story.until is None or at <= story.until)
+        ]
         stories = held or [story for story in stories if story.since <= at][-1:] or stories[:1]
     return sorted(_without_parts(stories), key=lambda story: story.since)
 
@@ -143,7 +151,9 @@ def events_outside(stories: Iterable[Story], events: Iterable[Event]) -> list[Ev
         told.update(story.before, story.meanwhile, story.after)
         for span in story.spans:
             told.add(span.begin)
-    return [event for event in without_wild(events) if event.severity != "info" and event not in told]
+    return [
+        event for event in without_wild(events) if event.severity != "info" and event not in told
+    ]
 
 
 def is_alarm(event: Event) -> bool:
@@ -155,7 +165,8 @@ def is_alarm(event: Event) -> bool:
 def _is_fault(span: Span) -> bool:
     if span.kind == "text":
         return is_alarm(span.begin)
-    has_ended_early = span.initial and span.end is not None  # as the invalid estimate of a vehicle that boots
+    # as the invalid estimate of a vehicle that boots
+    has_ended_early = span.initial and span.end is not None
     return span.severity != "info" and not span.is_usual and not has_ended_early
 
 
@@ -165,7 +176,11 @@ def _as_fault(span: Span) -> Span:
 
 
 def story_of(
-    event: Event, events: Sequence[Event], conditions: Iterable[Condition] = (), *, topics: Collection[str] = ()
+    event: Event,
+    events: Sequence[Event],
+    conditions: Iterable[Condition] = (),
+    *,
+    topics: Collection[str] = (),
 ) -> Story | None:
     """Return the story of a single event, or of the condition that an event begins or ends."""
     spans = spans_of(events, conditions)
@@ -192,8 +207,13 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
         ended = dict.fromkeys([active.pop(key) for key in keys if key in active])
         spans.extend(replace(span, until=event.time, end=event) for span in ended)
 
-    def order(step: Event | Span) -> tuple[float, bool, bool]:  # at equal times: reboots, initial conditions, others
-        return (step.since, True, False) if isinstance(step, Span) else (step.time, step.kind != "reboot", True)
+    # at equal times: reboots, initial conditions, others
+    def order(step: Event | Span) -> tuple[float, bool, bool]:
+        return (
+            (step.since, True, False)
+            if isinstance(step, Span)
+            else (step.time, step.kind != "reboot", True)
+        )
 
     steps: list[Event | Span] = [*events, *(each for each in unreported if each.initial)]
     for step in sorted(steps, key=order):
@@ -204,12 +224,17 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
         elif step.change == "end":
             end(keys, step)
         elif step.change == "once":
-            spans.append(Span(step.kind, step.severity, step.text, step.time, step, until=step.time))
+            spans.append(
+                Span(step.kind, step.severity, step.text, step.time, step, until=step.time)
+            )
             if step.kind == "reboot":
                 end([key for key in active if not KINDS[key[0]].kept_on_reboot], step)
-        elif step.kind != "duplicate" or keys[0] not in active:  # each service that publishes the vehicle reports it
+        elif step.kind != "duplicate" or keys[0] not in active:
+            # each service that publishes the vehicle reports it
             end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
-            since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
+            since = step.time - (
+                step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0
+            )
             active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))
     spans += dict.fromkeys(active.values())
     spans += [each for each in dict.fromkeys(unreported) if not each.initial]
@@ -249,7 +274,11 @@ def _make_story(
 ) -> Story:  # fmt: skip
     """Return the story of a group of conditions; start and evidence are those of the first one."""
     span = group[0]
-    until = None if any(each.until is None for each in group) else max(each.until or 0.0 for each in group)
+    until = (
+        None
+        if any(each.until is None for each in group)
+        else max(each.until or 0.0 for each in group)
+    )
     end = next((each.end for each in group if each.end is not None and each.until == until), None)
     used = {event for each in group for event in (each.begin, each.end) if event is not None}
 
@@ -261,9 +290,15 @@ def _make_story(
     before = unused(_evidence(span, spans, events))
     after = unused(explain(end, events)) if end else []
     stop = math.inf if until is None else until
-    begun = (each for each in events if each.change != "end" and (each.severity != "info" or each.kind == "mode"))
+    begun = (
+        each
+        for each in events
+        if each.change != "end" and (each.severity != "info" or each.kind == "mode")
+    )
     notable = [each for each in begun if each not in used]
-    after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
+    after += [
+        each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"
+    ]
     meanwhile = [each for each in notable if span.since <= each.time < stop]
     in_flight = not flights or any(begin <= stop and span.since <= end for begin, end in flights)
     return Story(
@@ -282,7 +317,11 @@ def _text_of(group: Sequence[Span]) -> str:
 
 def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> list[Event]:
     """Return the possible causes of a condition; without any, all other starts of the ten seconds before it."""
-    held = [other for other in spans if (other.initial or not span.initial) and other.is_active(span.since)]
+    held = [
+        other
+        for other in spans
+        if (other.initial or not span.initial) and other.is_active(span.since)
+    ]
     if span.initial:
         return explain(span.begin, (), held)
     recovered = {
@@ -299,7 +338,9 @@ def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> lis
     ]
     if span.kind == "text":
         causes += [event for event in near if event.kind == "text" and event.severity != "info"]
-        causes = sorted((cause for cause in causes if cause.time <= span.since), key=lambda cause: cause.time)
+        causes = sorted(
+            (cause for cause in causes if cause.time <= span.since), key=lambda cause: cause.time
+        )
     if causes:
         return causes
     others = [
@@ -315,8 +356,13 @@ def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> lis
 
 def _without_texts_before_arming(events: Sequence[Event], time: float) -> list[Event]:
     """Leave out the texts of failed checks before the arming that precedes `time`: they no longer hold then."""
-    armed = max((event.time for event in events if event.kind == "armed" and event.time <= time), default=-math.inf)
-    return [event for event in events if event.kind != "text" or event.time >= armed or is_alarm(event)]
+    armed = max(
+        (event.time for event in events if event.kind == "armed" and event.time <= time),
+        default=-math.inf,
+    )
+    return [
+        event for event in events if event.kind != "text" or event.time >= armed or is_alarm(event)
+    ]
 
 
 def _is_routine(event: Event) -> bool:

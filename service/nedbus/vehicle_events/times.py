@@ -82,7 +82,11 @@ class Times:
             return f"from the first message {still} ({format_duration(lasted)})"
         since = f"{self.text(begin)} {Times.unit(self.clock(begin))}"
         if end is None:
-            return f"at {since}" if lasted == 0 else f"from {since}, {still} ({format_duration(lasted)})"
+            return (
+                f"at {since}"
+                if lasted == 0
+                else f"from {since}, {still} ({format_duration(lasted)})"
+            )
         return f"from {self.text(begin)} to {self.text(end)} {Times.unit(self.clock(end))} ({format_duration(lasted)})"
 
     def find(self, text: str, near: Event) -> float:
@@ -96,10 +100,17 @@ class Times:
         if found := _CLOCK.fullmatch(text):
             utc = self.utc(near)
             if utc is None:
-                raise ValueError(self.remarks.get(near.vehicle, "no message of this vehicle has UTC"))
-            midnight = datetime.fromtimestamp(utc, UTC).replace(hour=0, minute=0, second=0, microsecond=0)
-            since = timedelta(hours=int(found[1]), minutes=int(found[2]), seconds=float(found[3] or 0))
-            step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200  # closest, also across midnight
+                raise ValueError(
+                    self.remarks.get(near.vehicle, "no message of this vehicle has UTC")
+                )
+            midnight = datetime.fromtimestamp(utc, UTC).replace(
+                hour=0, minute=0, second=0, microsecond=0
+            )
+            since = timedelta(
+                hours=int(found[1]), minutes=int(found[2]), seconds=float(found[3] or 0)
+            )
+            # closest, also across midnight
+            step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200
             return near.time + step
         try:
             seconds = float(text)

@@ -19,7 +19,18 @@ from nedbus_msgs.text import counted
 from . import detectors, rules
 from .contradictions import AIR_DATA, REFERENCES, Comparison, ReferenceDetector
 from .detectors import AidDetector, ChangeDetector, Fields, Finding, VisionDetector
-from .event import ALONE, SUPPRESSED, WINDOW, Author, Condition, Event, State, explain, state_of, without_wild
+from .event import (
+    ALONE,
+    SUPPRESSED,
+    WINDOW,
+    Author,
+    Condition,
+    Event,
+    State,
+    explain,
+    state_of,
+    without_wild,
+)
 from .kinds import KINDS, Severity
 from .position import PositionDetector
 
@@ -42,7 +53,8 @@ _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the pri
 _read_sample: Final = FieldReader(_SAMPLE)
 _FUSION_TOPICS: Final = {*AID_TOPICS, *rules.VISION, _EKF}
 _VISION_FLAGS: Final = ("cs_ev_pos", "cs_ev_vel", "cs_ev_hgt", "cs_ev_yaw")
-_NEW: Final = ChangeDetector((), (), detectors.detect_nothing)  # in place of the detector of a new stream
+# in place of the detector of a new stream
+_NEW: Final = ChangeDetector((), (), detectors.detect_nothing)
 
 
 class Vehicle:
@@ -60,7 +72,12 @@ class Vehicle:
     """
 
     def __init__(
-        self, name: str, on_event: Callable[[Event], None], common: Vehicle | None = None, *, first: float = 0.0
+        self,
+        name: str,
+        on_event: Callable[[Event], None],
+        common: Vehicle | None = None,
+        *,
+        first: float = 0.0,
     ) -> None:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
@@ -84,17 +101,23 @@ class Vehicle:
         self._invalid = -math.inf  # last time when a quantity of the estimate was invalid
         self._rebooted = -math.inf
         self._reboots = RebootDetector()
-        self._held: _Held | None = None  # what a message shows that may be the first one after a reboot
-        self._changes: dict[tuple[str, object], deque[Event]] = {}  # by condition or likeness, and by kind
-        self._suppressed: Counter[tuple[str, object]] = Counter()  # number of suppressed events, by the same keys
-        self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
+        # what a message shows that may be the first one after a reboot
+        self._held: _Held | None = None
+        # by condition or likeness, and by kind
+        self._changes: dict[tuple[str, object], deque[Event]] = {}
+        # number of suppressed events, by the same keys
+        self._suppressed: Counter[tuple[str, object]] = Counter()
+        # lost and rejected messages and dropouts [ms], by kind
+        self._bursts: dict[str, _Burst] = {}
         self._ekf = 0  # instance of the primary EKF
         self._fusion = FusionTracker()  # explains why vision is not fused
-        self._vision: tuple[bool | None, int] = (None, 0)  # whether it fuses vision, None if unknown; since when [us]
+        # whether it fuses vision, None if unknown; since when [us]
+        self._vision: tuple[bool | None, int] = (None, 0)
         self._position: PositionDetector | None = None  # of `main`
         self._comparison = Comparison()
         self._supplies: dict[str, _Supply] = {}  # by key of EVIDENCE
-        self._checked = self._resumed = 0  # time of the last position then, and after its last pause [us since boot]
+        # time of the last position then, and after its last pause [us since boot]
+        self._checked = self._resumed = 0
         self._equal: dict[int, bool] = {}  # by EKF: whether its estimate equals the vehicle's
 
     def skips(self, address: Address, time: float) -> bool:
@@ -131,7 +154,9 @@ class Vehicle:
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
-                    self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
+                    self.emit(
+                        Finding(kind, "end", f"{address.stream} resumed"), address.topic, time
+                    )
             found = iter([*(found or ()), *self._comparison.add_estimate(stamp, message, missing)])
         if not is_queued and (stamp < before - MAX_REORDERED or self._held is not None):
             # Only the previous message was damaged unless another one of this or another stream is later as well.
@@ -158,13 +183,19 @@ class Vehicle:
         """Record a rejected message."""
         self.last_seen = time
         if "rejected" not in self._bursts:
-            self.emit(Finding("rejected", "begin", f"{topic} rejected: {reason}", names=(topic, reason)), topic, time)
+            self.emit(
+                Finding("rejected", "begin", f"{topic} rejected: {reason}", names=(topic, reason)),
+                topic,
+                time,
+            )
         self._count("rejected", time, 1, topic)
 
     def settle(self, time: float) -> None:
         """Report bursts and flapping that have ended."""
         for kind, burst in list(self._bursts.items()):
-            if time - burst.end <= rules.PAUSE and (kind != "lost" or time - burst.begin <= rules.MAX_BURST):
+            if time - burst.end <= rules.PAUSE and (
+                kind != "lost" or time - burst.begin <= rules.MAX_BURST
+            ):
                 continue
             del self._bursts[kind]
             messages = counted(burst.count, "message")
@@ -178,13 +209,23 @@ class Vehicle:
                 duration = burst.end - burst.begin
                 within = f" in {format_duration(duration)}" if duration >= 1 else ""
                 text = f"{messages} lost{within} ({streams})"
-                self.emit(Finding(kind, "once", text, names, numbers | {"duration": duration}), "", burst.begin)
+                self.emit(
+                    Finding(kind, "once", text, names, numbers | {"duration": duration}),
+                    "",
+                    burst.begin,
+                )
             elif kind == "rejected":
-                self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
+                self.emit(
+                    Finding(kind, "end", f"rejections stopped ({messages})", (), numbers),
+                    "",
+                    burst.end,
+                )
             else:
                 duration = burst.count / 1e3
                 text = f"logging dropout of {format_duration(duration)}"
-                self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
+                self.emit(
+                    Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin
+                )
         for key, events in list(self._changes.items()):
             last = events[-1]
             if key in self._suppressed and time - last.time > rules.PAUSE:
@@ -206,12 +247,20 @@ class Vehicle:
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > rules.MAX_SILENCE:
             silent = "silent"
-        if silent is None or self.main is None or {(silent, ""), ("gone", "")} & self.conditions.keys():
+        if (
+            silent is None
+            or self.main is None
+            or {(silent, ""), ("gone", "")} & self.conditions.keys()
+        ):
             return
         known = self.conditions.pop(("silent", ""), None)
         since, stream = known.since if known is not None else self._main_time, self.main.stream
         age = max(0.0, time - since)
-        text = f"silent: no {stream} for {age:.1f} s" if silent == "silent" else f"gone: no publisher of {stream}"
+        text = (
+            f"silent: no {stream} for {age:.1f} s"
+            if silent == "silent"
+            else f"gone: no publisher of {stream}"
+        )
         self.emit(Finding(silent, "begin", text, numbers={"age": age}), stream, time, changed=since)
 
     def _check_supplies(self) -> None:
@@ -221,7 +270,8 @@ class Vehicle:
         now = min(self._position.stamp, self._position.earlier)
         silent = dict[str, int]()
         resumed = list[str]()
-        if not 0 <= now - self._checked <= _MAX_PAUSE:  # positions resume: other messages may follow them
+        # positions resume: other messages may follow them
+        if not 0 <= now - self._checked <= _MAX_PAUSE:
             self._resumed = now
         self._checked = now
         for name, supply in self._supplies.items():
@@ -265,19 +315,33 @@ class Vehicle:
     def state(self, time: float) -> State:
         """Return the current state, set by active and flapping conditions and single events of the last minute."""
         is_flying = self.armed is not False
-        found = [each for each in self.conditions.values() if is_flying or KINDS[each.kind].on_ground != "info"]
+        found = [
+            each
+            for each in self.conditions.values()
+            if is_flying or KINDS[each.kind].on_ground != "info"
+        ]
         kinds = {each.kind for each in found}
         for event in reversed(without_wild(self.recent)):
             if event.change == "once" and time - rules.RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
                 continue
             keys = {(event.kind, event.names), (event.kind, None)}
-            if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
+            if (
+                event.change == "begin"
+                and event.kind not in kinds
+                and not keys.isdisjoint(self._suppressed)
+            ):
                 kinds.add(event.kind)
-                found.append(Condition(event.kind, event.severity, f"{event.text} (flapping)", event.time, event))
+                found.append(
+                    Condition(
+                        event.kind, event.severity, f"{event.text} (flapping)", event.time, event
+                    )
+                )
         return state_of(dict.fromkeys(found))  # a condition with several flags appears once
 
-    def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
+    def emit(
+        self, found: Finding, topic: str, time: float, *, changed: float | None = None
+    ) -> None:
         """Begin or end the conditions of a finding, or report a single event.
 
         `changed`: time when the condition began or ended, if earlier than `time`.
@@ -296,7 +360,9 @@ class Vehicle:
         if found.switch and keys[0] in self.conditions:
             return
         event = self._event(found, topic, time, is_alone=self._is_alone(found))
-        condition = Condition(found.kind, found.severity or kind.severity, found.text, since, event, found.initial)
+        condition = Condition(
+            found.kind, found.severity or kind.severity, found.text, since, event, found.initial
+        )
         for key in keys:
             self.usual.pop(key, None)
         if found.initial and kind.usual:
@@ -318,7 +384,9 @@ class Vehicle:
         for key in keys:
             self.usual.pop(key, None)
         ended = [self.conditions.pop(key) for key in keys if key in self.conditions]
-        if KINDS[found.kind].validity and not any(KINDS[kind].validity for kind, _ in self.conditions):
+        if KINDS[found.kind].validity and not any(
+            KINDS[kind].validity for kind, _ in self.conditions
+        ):
             self._invalid = until
         starts = [condition.since for condition in ended if not condition.initial]
         text, lasted = found.text, None
@@ -327,11 +395,19 @@ class Vehicle:
             text = f"{text} after {format_duration(lasted)}"
         elif KINDS[found.kind].first:
             text = KINDS[found.kind].first
-        event = self._event(replace(found, text=text), topic, time, lasted=lasted, is_alone=is_alone)
+        event = self._event(
+            replace(found, text=text), topic, time, lasted=lasted, is_alone=is_alone
+        )
         self._report_unless_frequent(found, event)
 
     def _event(
-        self, found: Finding, topic: str, time: float, *, lasted: float | None = None, is_alone: bool = False
+        self,
+        found: Finding,
+        topic: str,
+        time: float,
+        *,
+        lasted: float | None = None,
+        is_alone: bool = False,
     ) -> Event:
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
         numbers = dict(found.numbers)
@@ -359,10 +435,15 @@ class Vehicle:
 
     def _is_alone(self, found: Finding) -> bool:
         """Return whether the value that changes now began with the message just before, of a PERIODIC stream."""
-        if KINDS[found.kind].message not in rules.PERIODIC or self.time - self._before > rules.MAX_ALONE:
+        if (
+            KINDS[found.kind].message not in rules.PERIODIC
+            or self.time - self._before > rules.MAX_ALONE
+        ):
             return False
         held = [self.conditions[key] for key in _keys_of(found) if key in self.conditions]
-        return any(condition.begin.time == self._before and not condition.initial for condition in held)
+        return any(
+            condition.begin.time == self._before and not condition.initial for condition in held
+        )
 
     def _report_unless_frequent(self, found: Finding, event: Event) -> None:
         if not found.initial and not self._is_frequent(event):
@@ -382,7 +463,11 @@ class Vehicle:
     def held_from_start(self) -> str:
         """Bad and watch conditions active since the first message, as text; "" if none."""
         active = self.conditions.values()
-        held = [condition.text for condition in active if condition.initial and condition.severity != "info"]
+        held = [
+            condition.text
+            for condition in active
+            if condition.initial and condition.severity != "info"
+        ]
         return ", ".join(dict.fromkeys(held))
 
     def _count(self, kind: str, time: float, count: int, topic: str = "") -> None:
@@ -397,7 +482,11 @@ class Vehicle:
             self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
         if topic == detectors.EKF_SELECTOR:
-            unused = [each for each in self._detectors if each.topic == rules.POSITIONS[-1] and each != self.main]
+            unused = [
+                each
+                for each in self._detectors
+                if each.topic == rules.POSITIONS[-1] and each != self.main
+            ]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
         is_of_ekf = topic in (*rules.POSITIONS, *rules.AID_SOURCES, _EKF)
@@ -406,15 +495,24 @@ class Vehicle:
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.setdefault(group, address)
-            best = min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0))
+            best = min(
+                current, address, key=lambda each: (group.index(each.topic), each.instance or 0)
+            )
             supply = self._supplies.get(_EVIDENCE_OF.get(topic, ""))
             if best != address and not (supply and supply.is_late):
-                is_sought = topic == rules.POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
+                is_sought = (
+                    topic == rules.POSITIONS[-1] != current.topic
+                    and detectors.EKF_SELECTOR not in self.topics
+                )
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
             if current != address:  # reopen unused streams, and end conditions of the old one
                 self._preferred[group], message = address, BY_TOPIC[topic].name
-                self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
+                self._detectors = {
+                    each: found
+                    for each, found in self._detectors.items()
+                    if found and each != current
+                }
                 self._end(address, lambda kind, _: KINDS[kind].message == message)
         if group is rules.POSITIONS:
             self.main, self._position = address, PositionDetector()
@@ -429,7 +527,9 @@ class Vehicle:
         """Return a detector for a topic other than the positions, None if it has no events."""
         own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
         if topic in rules.AID_SOURCES:
-            return AidDetector(topic, lambda primary: primary == self._ekf, partial(self._explain, topic))
+            return AidDetector(
+                topic, lambda primary: primary == self._ekf, partial(self._explain, topic)
+            )
         if topic in rules.VISION:
             return VisionDetector(self._is_vision_fused, partial(self._explain, topic))
         if topic in REFERENCES:
@@ -455,7 +555,9 @@ class Vehicle:
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
         """Without EKF_SELECTOR: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
-        last, absent = (None, ()) if self._position is None else (self._position.last, self._position.missing)
+        last, absent = (
+            (None, ()) if self._position is None else (self._position.last, self._position.missing)
+        )
         values = zip(_SAMPLE, _read_sample(last), strict=True)
         vehicle = tuple(None if name in absent else value for name, value in values)
         if before and before["timestamp_sample"] == vehicle[0]:
@@ -470,7 +572,10 @@ class Vehicle:
             return
         self._vision, self._fusion.primary = (None, 0), instance
         stream, message = Address(self.name, _EKF, instance), BY_TOPIC[_EKF].name
-        self._end(stream, lambda kind, flag: KINDS[kind].message == message or flag.startswith(f"{instance}:"))
+        self._end(
+            stream,
+            lambda kind, flag: KINDS[kind].message == message or flag.startswith(f"{instance}:"),
+        )
         for each in (old, instance):
             detector = self._detectors.get(replace(stream, instance=each))
             for found in () if detector is None else detector.again(detectors.HEALTHY):
@@ -481,12 +586,17 @@ class Vehicle:
         self.usual = {key: condition for key, condition in self.usual.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
-            self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
+            self.emit(
+                Finding(each.kind, "end", text, each.begin.names, initial=each.initial),
+                new.topic,
+                self.time,
+            )
 
     def _set_boot(self, boot: float, time: float, *, is_queued: bool) -> None:
         """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
         expected = boot if self.boot is None else self.boot + time - self.time
-        was_off, self._is_off = self._is_off, is_queued or abs(boot - expected) > 1e-6 * MAX_REORDERED
+        was_off = self._is_off
+        self._is_off = is_queued or abs(boot - expected) > 1e-6 * MAX_REORDERED
         self.time, self.boot = time, boot if was_off or is_queued or not self._is_off else expected
 
     def _emit_all(self, found: Iterable[Finding], address: Address, time: float) -> None:
@@ -519,7 +629,9 @@ class Vehicle:
     def _begin_boot(self, address: Address, time: float) -> None:
         """Reset the state after a reboot, which a message of this address has confirmed."""
         held, self._held = self._held, None
-        first = None if held is None or held.address == address else self._detectors.get(held.address)
+        first = (
+            None if held is None or held.address == address else self._detectors.get(held.address)
+        )
         initial = [] if first is None else [*first.again({})]
         self._reboot(self._reboots.before, time)
         if held is not None:
@@ -529,7 +641,9 @@ class Vehicle:
         """Reset the state; report the reboot once, even if delayed messages from before it follow."""
         for detector in filter(None, self._detectors.values()):
             detector.reset()
-        self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
+        self.conditions = {
+            key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot
+        }
         self.armed = None
         self._vision = None, 0
         self.usual.clear()
@@ -558,7 +672,10 @@ class Vehicle:
                 (event.kind, None): rules.SINGLE_EVENTS,
             }
         else:  # flags of a kind may change in any combination
-            limits = {(event.kind, event.names): rules.CONDITION_CHANGES, (event.kind, None): rules.KIND_CHANGES}
+            limits = {
+                (event.kind, event.names): rules.CONDITION_CHANGES,
+                (event.kind, None): rules.KIND_CHANGES,
+            }
             if (event.kind, None) in self._suppressed:
                 del limits[event.kind, event.names]
         for key, limit in limits.items():
@@ -606,7 +723,8 @@ class _Supply:
     """Messages of one entry of EVIDENCE; `is_late`: another topic may replace the one in use."""
 
     detectors: dict[Address, ChangeDetector] = field(default_factory=dict)
-    steps: deque[int] = field(default_factory=lambda: deque(maxlen=9))  # us between two messages, sampled
+    # us between two messages, sampled
+    steps: deque[int] = field(default_factory=lambda: deque(maxlen=9))
     newest: int = 0
     is_late: bool = False
 
@@ -617,4 +735,6 @@ class _Supply:
         if self.newest != before and last.stamp > last.earlier > 0:
             self.steps.append(last.stamp - last.earlier)
         is_known = len(self.steps) >= _MIN_STEPS
-        return self.newest, max(1e6 * rules.MAX_SILENCE, _INTERVALS * median(self.steps)) if is_known else math.inf
+        return self.newest, max(
+            1e6 * rules.MAX_SILENCE, _INTERVALS * median(self.steps)
+        ) if is_known else math.inf

@@ -115,7 +115,9 @@ class _Parts:
         add_evidence(event for event in self.evidence if event not in chosen)
         add_missing()
         add_others(part for part in self.others if part not in others)
-        return textwrap.shorten(text(), _LINES * _WIDTH, placeholder="...") if not fits() else text()
+        return (
+            textwrap.shorten(text(), _LINES * _WIDTH, placeholder="...") if not fits() else text()
+        )
 
 
 def _describe_unknown(topics: Collection[str]) -> str:
@@ -151,10 +153,17 @@ def verdict_of(
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
         remark = "" if known else f"; {_describe_unknown(topics)}"
-        return Verdict(f"{_without_faults(held, times, end, since)}{remark}", known, vehicle, times, end)
+        return Verdict(
+            f"{_without_faults(held, times, end, since)}{remark}", known, vehicle, times, end
+        )
     is_now = times.is_live and at is None
-    past = [story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)]
-    ranked = sorted(stories, key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank))
+    past = [
+        story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)
+    ]
+    ranked = sorted(
+        stories,
+        key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank),
+    )
     worst = ranked[0]
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and worst not in past and is_then else known
@@ -163,8 +172,16 @@ def verdict_of(
     if not is_then:
         head = "no fault at that time; nearest: "
     cause, ordered = _evidence(worst, stories, events)
-    none = f"No evidence in the {WINDOW:.0f} s before." if worst.begin and worst.is_bad and not cause else ""
-    missing = f"Not in the data: {', '.join(worst.lacking)}." if worst.lacking and (worst.is_bad or not cause) else ""
+    none = (
+        f"No evidence in the {WINDOW:.0f} s before."
+        if worst.begin and worst.is_bad and not cause
+        else ""
+    )
+    missing = (
+        f"Not in the data: {', '.join(worst.lacking)}."
+        if worst.lacking and (worst.is_bad or not cause)
+        else ""
+    )
     state = f"{head}{_what(worst)}{_count(worst, stories)} {worst.when(times, end)}."
     others = _others(worst, ranked, cause, stories, times)
     is_other_urgent = sum(story.is_bad for story in stories) > 1
@@ -173,11 +190,15 @@ def verdict_of(
         after_bad_one = 1 if is_other_urgent else 0
         others.insert(after_bad_one, f"{times.text(correction)} {short_text(correction)}")
         is_other_urgent = True
-    text = _Parts(state, tuple(ordered), none, missing, tuple(others), is_other_urgent).render(times)
+    text = _Parts(state, tuple(ordered), none, missing, tuple(others), is_other_urgent).render(
+        times
+    )
     return Verdict(text, usable, vehicle, times, end, worst.begin, worst.end, cause, tuple(stories))
 
 
-def _without_faults(held: Iterable[Condition], times: Times, end: float, since: float | None) -> str:
+def _without_faults(
+    held: Iterable[Condition], times: Times, end: float, since: float | None
+) -> str:
     if not times.is_live:
         text = f"no faults in {end:.0f} s"
     elif since is None:
@@ -199,7 +220,13 @@ def _valid_since(events: Iterable[Event], first: float | None) -> float | None:
 
 
 def _head(
-    worst: Story, stories: Iterable[Story], times: Times, since: float | None, *, is_past: bool, usable: bool | None
+    worst: Story,
+    stories: Iterable[Story],
+    times: Times,
+    since: float | None,
+    *,
+    is_past: bool,
+    usable: bool | None,
 ) -> str:
     """Return the words before the worst fault: whether the position is valid, and `since` when, None if unknown."""
     of_estimate = [story for story in stories if story.is_bad and story.spans[0].is_of_estimate]
@@ -221,7 +248,9 @@ def _when_valid(faults: Sequence[Story], times: Times, since: float | None) -> s
     return "now" if since is None else f"since {times.text_at(since)} UTC"
 
 
-def _evidence(worst: Story, stories: Sequence[Story], events: Sequence[Event]) -> tuple[tuple[Event, ...], list[Event]]:
+def _evidence(
+    worst: Story, stories: Sequence[Story], events: Sequence[Event]
+) -> tuple[tuple[Event, ...], list[Event]]:
     """Return all evidence for a story in chronological order, and what the text may show, most important first.
 
     Texts of PX4 count until TOGETHER after the start, or all of them for a bad fault that was active in the first
@@ -233,11 +262,17 @@ def _evidence(worst: Story, stories: Sequence[Story], events: Sequence[Event]) -
     late = TOGETHER
     if worst.begin is None:
         late = math.inf if worst.is_bad else -WINDOW
-    near = [text for text in texts if -WINDOW <= text.time - worst.since <= late and text is not worst.begin]
+    near = [
+        text
+        for text in texts
+        if -WINDOW <= text.time - worst.since <= late and text is not worst.begin
+    ]
     quoted = [text for text in near if text.text not in usual]
     until = math.inf if worst.until is None else worst.until
     if not quoted:
-        quoted = [text for text in texts if text.severity == "bad" and worst.since <= text.time <= until][:1]
+        quoted = [
+            text for text in texts if text.severity == "bad" and worst.since <= text.time <= until
+        ][:1]
         quoted = [text for text in quoted if text is not worst.begin]
     causes = [event for event in worst.before if event.kind != "text"]
     cause = tuple(sorted([*quoted, *causes], key=lambda event: event.time))
@@ -261,11 +296,20 @@ def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]
         if not any(_is_same(text, other) for other in said):
             said.append(text)
     said = said[:_MAX_TEXTS]
-    shown = [event for event in causes if not any(_repeats(other, event) for other in (*said, *causes))]
+    shown = [
+        event for event in causes if not any(_repeats(other, event) for other in (*said, *causes))
+    ]
     of_worst = _subjects(worst.what)
-    shown.sort(key=lambda event: (of_worst.isdisjoint(_subjects(event.text)), importance(event.kind), -event.time))
+    shown.sort(
+        key=lambda event: (
+            of_worst.isdisjoint(_subjects(event.text)),
+            importance(event.kind),
+            -event.time,
+        )
+    )
     shown = shown[:_MAX_CAUSES]
-    shown.sort(key=lambda event: KINDS[event.kind].message == "VehicleLocalPosition")  # effects after causes
+    # effects after causes
+    shown.sort(key=lambda event: KINDS[event.kind].message == "VehicleLocalPosition")
     return [*said[:1], *shown, *said[1:]]
 
 
@@ -287,7 +331,11 @@ def _repeats(other: Event, event: Event) -> bool:
         return False
     if event.kind == "ekf_changed":
         return other.kind == "text" and "primary EKF changed" in other.text
-    return event.kind == "few_satellites" and other.kind == "gps_fix_lost" and "satellites" in other.text
+    return (
+        event.kind == "few_satellites"
+        and other.kind == "gps_fix_lost"
+        and "satellites" in other.text
+    )
 
 
 def _largest_correction(worst: Story, stories: Sequence[Story]) -> Event | None:
@@ -296,19 +344,27 @@ def _largest_correction(worst: Story, stories: Sequence[Story]) -> Event | None:
     corrections = [
         event
         for event in (*worst.meanwhile, *worst.after)
-        if event.kind in ("reset", "jump") and event not in begins and _size(event) >= LARGE_CORRECTION
+        if event.kind in ("reset", "jump")
+        and event not in begins
+        and _size(event) >= LARGE_CORRECTION
     ]
     return max(corrections, key=_size, default=None)
 
 
 def _size(correction: Event) -> float:
     """Return the largest part of a reset or jump [m or m/s]; that of the heading and times do not count."""
-    sizes = [abs(size) for name, size in correction.numbers.items() if name not in ("heading", "begin")]
+    sizes = [
+        abs(size) for name, size in correction.numbers.items() if name not in ("heading", "begin")
+    ]
     return max(sizes, default=0.0)
 
 
 def _others(
-    worst: Story, ranked: Sequence[Story], cause: Sequence[Event], stories: Sequence[Story], times: Times
+    worst: Story,
+    ranked: Sequence[Story],
+    cause: Sequence[Event],
+    stories: Sequence[Story],
+    times: Times,
 ) -> list[str]:
     """Return the worst other fault of each kind, worst first."""
     largest: dict[str, Story] = {}
@@ -317,7 +373,12 @@ def _others(
         largest.setdefault(key, story)
     parts = []
     for story in largest.values():
-        if story is worst or story.kind == worst.kind != "text" or story.begin is None or story.begin in cause:
+        if (
+            story is worst
+            or story.kind == worst.kind != "text"
+            or story.begin is None
+            or story.begin in cause
+        ):
             continue
         if story.kind != worst.kind or is_alarm(story.begin):
             what = short_text(story.begin) if KINDS[story.kind].correction else _what(story)

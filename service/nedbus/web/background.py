@@ -16,10 +16,21 @@ from nedbus_msgs.frames import MapProjection
 
 from .style import Style
 
-_WORLD_FILES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # suffixes
+# suffixes
+_WORLD_FILES: Final = {
+    ".png": ".pgw",
+    ".jpg": ".jgw",
+    ".jpeg": ".jgw",
+    ".tif": ".tfw",
+    ".tiff": ".tfw",
+}
 _MAX_SIDE: Final = 2000  # pixels; larger images are scaled down
 _MAX_PIXELS: Final = 50_000_000  # of an image file; decoded, each takes up to 4 bytes
-_PARTS: Final = {"FeatureCollection": "features", "GeometryCollection": "geometries", "Feature": "geometry"}
+_PARTS: Final = {
+    "FeatureCollection": "features",
+    "GeometryCollection": "geometries",
+    "Feature": "geometry",
+}
 
 Ring = list[tuple[float, float]]
 
@@ -57,10 +68,23 @@ class Background:
 
         if self.pixels is not None:
             (west, south), (east, north) = (project(*corner) for corner in self._corners)
-            plot.image_rgba([self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image")
-        lines = [list(zip(*(project(*point) for point in ring), strict=True)) for ring in self.rings]
-        source = ColumnDataSource({"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]})
-        plot.multi_line("east", "north", source=source, color=style.colours["quiet"], line_width=1.5, level="underlay")
+            plot.image_rgba(
+                [self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image"
+            )
+        lines = [
+            list(zip(*(project(*point) for point in ring), strict=True)) for ring in self.rings
+        ]
+        source = ColumnDataSource(
+            {"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]}
+        )
+        plot.multi_line(
+            "east",
+            "north",
+            source=source,
+            color=style.colours["quiet"],
+            line_width=1.5,
+            level="underlay",
+        )
         points = [line for line in lines if len(line[0]) == 1]
         easts, norths = [east[0] for east, _ in points], [north[0] for _, north in points]
         plot.scatter(easts, norths, marker="cross", color=style.colours["quiet"], level="underlay")
@@ -68,17 +92,30 @@ class Background:
     def _read_image(self, path: Path) -> None:
         from PIL import Image
 
-        worlds = [path.with_suffix(each) for each in (_WORLD_FILES[path.suffix.lower()], ".wld")]  # GDAL writes .wld
+        # GDAL writes .wld
+        worlds = [path.with_suffix(each) for each in (_WORLD_FILES[path.suffix.lower()], ".wld")]
         world = next((each for each in worlds if each.exists()), None)
         if world is None:
-            raise ValueError(f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES")
+            raise ValueError(
+                f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES"
+            )
         width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
-        if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
-            raise ValueError("the image is not north up in degrees: convert it with gdalwarp -t_srs EPSG:4326")
+        if (
+            skew
+            or other_skew
+            or not (width > 0 > height)
+            or not (abs(west) <= 180 and abs(north) <= 90)
+        ):
+            raise ValueError(
+                "the image is not north up in degrees: convert it with gdalwarp -t_srs EPSG:4326"
+            )
         too_large = f"more than {_MAX_PIXELS:,} pixels: reduce it with gdal_translate -outsize {_MAX_SIDE} 0"
         warned = Image.DecompressionBombWarning
         try:
-            with warnings.catch_warnings(category=warned, action="error"), Image.open(path) as image:
+            with (
+                warnings.catch_warnings(category=warned, action="error"),
+                Image.open(path) as image,
+            ):
                 columns, rows = image.size
                 if columns * rows > _MAX_PIXELS:  # before it is decoded
                     raise ValueError(too_large)
@@ -87,7 +124,8 @@ class Background:
         except (Image.DecompressionBombError, warned) as exc:
             raise ValueError(too_large) from exc
         self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
-        left, top = west - width / 2, north - height / 2  # the world file has the centre of the first pixel
+        # the world file has the centre of the first pixel
+        left, top = west - width / 2, north - height / 2
         self._corners = [(left, top + rows * height), (left + columns * width, top)]
 
 

@@ -13,7 +13,8 @@ from .fleet import TRUTH
 from .stream import COLUMNS, History
 from .style import PALETTE
 
-_MAX_POINTS: Final = 6_000  # points of all tracks together, which a browser can draw ten times a second
+# points of all tracks together, which a browser can draw ten times a second
+_MAX_POINTS: Final = 6_000
 _MIN_TRACK_POINTS: Final = 60
 _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
 _DOUBTFUL_LINE, _TRUTH_LINE = "doubtful", "truth"
@@ -37,7 +38,11 @@ def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None
         source.data = new
     else:  # repr, because NaN is not equal to itself
         cells = slice(len(rows))
-        changed = {name: [(cells, values)] for name, values in new.items() if repr(values) != repr(old[name])}
+        changed = {
+            name: [(cells, values)]
+            for name, values in new.items()
+            if repr(values) != repr(old[name])
+        }
         if changed:
             source.patch(changed)
 
@@ -62,28 +67,41 @@ class Tracks:
             self._tracks, self._seen = dict(tracks), [0] * len(tracks)
             longest = max((history.size for history, _ in tracks.values()), default=1)
             points = max(_MIN_TRACK_POINTS, min(longest, _MAX_POINTS // max(1, len(tracks))))
-            written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
+            written = max(
+                (min(history.written, history.size) for history, _ in tracks.values()), default=1
+            )
             self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
             self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
-            self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in _COLUMNS}
+            self.source.data = {
+                name: np.full((self._slots + 2) * len(tracks), math.nan) for name in _COLUMNS
+            }
         cells: dict[str, dict[int, float]] = {name: {} for name in _COLUMNS}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
         if cells["east"]:
-            self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
+            self.source.patch(
+                {name: list(changed.items()) for name, changed in cells.items() if changed}
+            )
 
-    def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
+    def _add_points(
+        self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track
+    ) -> None:
         history, number = track
         step, ring = self._step, self._slots
         seen, end = self._seen[index], history.written  # read once: another thread adds points
         if end == seen:
             return
         self._seen[index] = end
-        names = (_TRUTH_LINE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBTFUL_LINE)
+        names = (
+            (_TRUTH_LINE,)
+            if address.topic == TRUTH
+            else (f"valid{number % PALETTE}", _DOUBTFUL_LINE)
+        )
 
         def put(slot: int, point: Mapping[str, float]) -> None:
             for name in ("east", *names):
-                for place in (0, ring) if slot == 0 else (slot,):  # the copy continues the line after the last slot
+                # the copy continues the line after the last slot
+                for place in (0, ring) if slot == 0 else (slot,):
                     cells[name][index * (ring + 2) + place] = point.get(name, math.nan)
 
         points = history.points(seen // step * step, end)
@@ -94,5 +112,8 @@ class Tracks:
             doubtful = point[_DOUBTFUL]
             broken = math.isnan(east) or (broken and position % step > 0)
             kind = names[-1 if doubtful > 0 else 0]
-            put(position // step % ring, {"east": round(east, 2), kind: math.nan if broken else round(north, 2)})
+            put(
+                position // step % ring,
+                {"east": round(east, 2), kind: math.nan if broken else round(north, 2)},
+            )
         put(((end - 1) // step + 1) % ring, {})

@@ -11,7 +11,8 @@ from nedbus.vehicle_events import EventLog, spans_of, stories_of, story_of, verd
 
 PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
-_MAX_CACHED: Final = 2000  # stories and verdicts; more than the vehicles of an event log, which `faults` looks up
+# stories and verdicts; more than the vehicles of an event log, which `faults` looks up
+_MAX_CACHED: Final = 2000
 _URL_RESOLUTION: Final = 0.1  # s; times in the URL are rounded to this
 
 
@@ -21,7 +22,9 @@ class EventTimeline:
     `clock_offset`: added to event times to get the time on the axes [s]; `unit`: the name of the axes' clock.
     """
 
-    def __init__(self, event_log: EventLog, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
+    def __init__(
+        self, event_log: EventLog, *, before: Sequence[Event] = (), times: Times | None = None
+    ) -> None:
         self.event_log = event_log
         self.times = times or Times(is_live=True)
         self.clock_offset, self.unit = 0.0, Times.unit("host" if self.times.is_live else "start")
@@ -30,7 +33,8 @@ class EventTimeline:
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
-        self._find_stories_cached = functools.lru_cache(_MAX_CACHED)(self._find_stories)  # for all viewers
+        # for all viewers
+        self._find_stories_cached = functools.lru_cache(_MAX_CACHED)(self._find_stories)
         self._verdicts: dict[tuple[str, float | None], tuple[float, Verdict]] = {}
 
     @property
@@ -59,10 +63,16 @@ class EventTimeline:
 
     def format_clock(self, seconds: float) -> str:
         """Format an event time with the name of its clock; for a recording, add the seconds since its start."""
-        since = "" if self.times.is_live or not self.clock_offset else f", {seconds:.1f} {Times.unit('start')}"
+        since = (
+            ""
+            if self.times.is_live or not self.clock_offset
+            else f", {seconds:.1f} {Times.unit('start')}"
+        )
         return f"{self.format_time(seconds)} {self.unit}{since}"
 
-    def story(self, vehicle: str, now: float, at: Event | float | None, active: Sequence[Condition]) -> Story | None:
+    def story(
+        self, vehicle: str, now: float, at: Event | float | None, active: Sequence[Condition]
+    ) -> Story | None:
         """Return the story of the event or time `at`; if None, of the current state or the latest recent condition.
 
         `active`: the active conditions; the first determines the state.
@@ -72,7 +82,11 @@ class EventTimeline:
             at = active[0].begin
         stories = self._find_stories_cached(vehicle, at)
         if at is None:
-            stories = [story for story in stories if story.since <= now and now - (story.until or now) < PAST][::-1]
+            stories = [
+                story
+                for story in stories
+                if story.since <= now and now - (story.until or now) < PAST
+            ][::-1]
         return next(iter(stories), None)
 
     def verdict(self, vehicle: str, end: float, at: float | None = None) -> Verdict:
@@ -80,11 +94,16 @@ class EventTimeline:
         self._refresh()
         computed, verdict = self._verdicts.get((vehicle, at), (-math.inf, None))
         if verdict is None or end - computed >= 1.0:
-            events, (topics, held) = self._by_vehicle.get(vehicle, [])[-_MAX_EVENTS:], self._evidence(vehicle)
-            events = [event for event in events if event.time > end - PAST or not self.times.is_live]
+            events = self._by_vehicle.get(vehicle, [])[-_MAX_EVENTS:]
+            (topics, held) = self._evidence(vehicle)
+            events = [
+                event for event in events if event.time > end - PAST or not self.times.is_live
+            ]
             known = self.event_log.vehicles.get(vehicle)
             since = max(known.first, end - PAST) if known is not None else None
-            verdict = verdict_of(vehicle, events, held, topics=topics, times=self.times, end=end, at=at, since=since)
+            verdict = verdict_of(
+                vehicle, events, held, topics=topics, times=self.times, end=end, at=at, since=since
+            )
             self._verdicts[vehicle, at] = end, verdict
             if len(self._verdicts) > _MAX_CACHED:
                 del self._verdicts[next(iter(self._verdicts))]
@@ -94,7 +113,11 @@ class EventTimeline:
     def faults(self) -> Sequence[tuple[str, Story]]:
         """The vehicle and story of each fault, in chronological order."""
         self._refresh()
-        stories = [(name, story) for name in self._by_vehicle for story in self._find_stories_cached(name, None)]
+        stories = [
+            (name, story)
+            for name in self._by_vehicle
+            for story in self._find_stories_cached(name, None)
+        ]
         return sorted(stories, key=lambda each: each[1].since)
 
     def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:

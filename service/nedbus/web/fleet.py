@@ -30,7 +30,8 @@ from nedbus_msgs.messages import VehicleStatus
 from .stream import LONG, Origin, PageStream, is_position
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
-MAX_STREAMS: Final = 1000  # streams shown on a page, positions first; further streams are only counted
+# streams shown on a page, positions first; further streams are only counted
+MAX_STREAMS: Final = 1000
 _SILENT: Final = 60.0  # s without a message after which a stream may be evicted
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
@@ -82,7 +83,9 @@ class VehicleView:
     @property
     def attitude(self) -> StreamView | None:
         """The stream of its attitude, None if it sends none."""
-        return next((stream for stream in self.streams if stream.address.topic == "vehicle_attitude"), None)
+        return next(
+            (stream for stream in self.streams if stream.address.topic == "vehicle_attitude"), None
+        )
 
     @property
     def grade(self) -> str:
@@ -155,7 +158,11 @@ class Fleet:
     """
 
     def __init__(
-        self, monitor: Monitor | None = None, *, origin: Origin | None = None, long: tuple[int, float] = LONG
+        self,
+        monitor: Monitor | None = None,
+        *,
+        origin: Origin | None = None,
+        long: tuple[int, float] = LONG,
     ) -> None:
         self.monitor, self.origin = Monitor() if monitor is None else monitor, origin or Origin()
         self.streams: dict[Address, PageStream] = {}
@@ -210,20 +217,36 @@ class Fleet:
         views: dict[str, list[StreamView]] = {}
         for address, stream in streams:
             health = now.healths.get(address) or newest[address].health
-            state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
-            view = StreamView(address, stream, newest[address], health, state, self._rejected[address])
+            state = stream_state(
+                health, publishers=None if alive is None else alive[address], connected=not now.link
+            )
+            view = StreamView(
+                address, stream, newest[address], health, state, self._rejected[address]
+            )
             views.setdefault(address.vehicle, []).append(view)
         vehicles = []
         for name, each in views.items():
-            main = min(each, key=lambda view: (view.address.topic != DEFAULT_TOPIC, not is_position(view.address)))
+            main = min(
+                each,
+                key=lambda view: (
+                    view.address.topic != DEFAULT_TOPIC,
+                    not is_position(view.address),
+                ),
+            )
             vehicle_state, number = states.get(name, _OK), self._number_of(name)
             status, log = _status(each), logs.get(name)
-            vehicle = VehicleView(name, vehicle_state, main, tuple(each), status, number, log, fusion.get(name))
+            vehicle = VehicleView(
+                name, vehicle_state, main, tuple(each), status, number, log, fusion.get(name)
+            )
             vehicles.append(vehicle)
         vehicles.sort(key=lambda view: rank_vehicle(view.vehicle, view.state.severity))
-        alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
+        alarms = [
+            each for each in (now.link, now.behind.replace("this reader", "this page")) if each
+        ]
         rejected, left_out = self._rejected.total(), len(newest) - len(streams)
-        self.snapshot = FleetSnapshot(now.time, vehicles, tuple(self._reports), rejected, left_out, alarms)
+        self.snapshot = FleetSnapshot(
+            now.time, vehicles, tuple(self._reports), rejected, left_out, alarms
+        )
 
     def _evict(self, time: float) -> bool:
         """Evict the longest-silent stream, positions last and only if silent; return True if one was evicted."""
@@ -239,12 +262,25 @@ def _status(views: Sequence[StreamView]) -> dict[str, StatusValue]:
 
     def value_of(topic: str, describe: Callable[[Any], str]) -> StatusValue:
         view = known.get((topic, 0))
-        return StatusValue() if view is None else StatusValue(describe(view.newest.message), view.silence)
+        return (
+            StatusValue()
+            if view is None
+            else StatusValue(describe(view.newest.message), view.silence)
+        )
 
     gps = "vehicle_gps_position" if ("vehicle_gps_position", 0) in known else "sensor_gps"
     return {
-        "mode": value_of("vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))),
-        "armed": value_of("vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"),
-        "battery": value_of("battery_status", lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else ""),
-        "gps": value_of(gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"),
+        "mode": value_of(
+            "vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))
+        ),
+        "armed": value_of(
+            "vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"
+        ),
+        "battery": value_of(
+            "battery_status",
+            lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else "",
+        ),
+        "gps": value_of(
+            gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"
+        ),
     }

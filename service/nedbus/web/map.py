@@ -20,11 +20,15 @@ from .stream import Position
 from .style import MARKERS, Style
 
 FOCUSES: Final = ("all", "follow", "vehicle")
-MIN_SIDE: Final = 20.0  # minimum side of the map [m]; a smaller one would magnify the noise of a vehicle at rest
+# minimum side of the map [m]; a smaller one would magnify the noise of a vehicle at rest
+MIN_SIDE: Final = 20.0
 _MIN_ZOOM: Final = 0.01  # m; smallest visible range accepted from the browser
 _MARGIN: Final = 0.08  # margin on each side, as a fraction of the extent
 _FOLLOWED_SIDE: Final = 60.0  # m; side of the map while following a vehicle
-_LETTER, _HEIGHT, _MARK = 6.5, 12.0, 5.0  # pixels; width of a character, height of a label, radius of a marker
+# pixels; width of a character, height of a label, radius of a marker
+_LETTER = 6.5
+_HEIGHT = 12.0
+_MARK = 5.0
 _MAX_EVENTS: Final = 60  # latest events marked on the map
 _Placed = Sequence[tuple[VehicleView, Position]]
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
@@ -39,7 +43,18 @@ class Map:
 
     def __init__(self, style: Style, background: Background | None) -> None:
         self.marks = table(
-            "east", "north", "angle", "shape", "colour", "edge", "fill", "label", "name", "words", "align", "offset"
+            "east",
+            "north",
+            "angle",
+            "shape",
+            "colour",
+            "edge",
+            "fill",
+            "label",
+            "name",
+            "words",
+            "align",
+            "offset",
         )
         self.events = table("east", "north", "marker", "colour", "words")
         self.shown: list[str] = []
@@ -61,9 +76,16 @@ class Map:
             for stream in each.streams:
                 if stream is each.main or (self.truth and stream.address.topic == TRUTH):
                     stored = overview.streams.get(stream.address) if self.is_long else None
-                    tracks[stream.address] = stored.long if stored is not None else stream.stream.minute, each.number
+                    tracks[stream.address] = (
+                        stored.long if stored is not None else stream.stream.minute,
+                        each.number,
+                    )
         self._tracks.update(tracks)
-        placed = [(each, position) for each in snapshot.vehicles if (position := each.main.stream.valid) is not None]
+        placed = [
+            (each, position)
+            for each in snapshot.vehicles
+            if (position := each.main.stream.valid) is not None
+        ]
         focused = [(each, position) for each, position in placed if each is chosen]
         frame = self._extent(focused or placed if self.focus == "vehicle" else placed, tracks)
         if self.focus == "follow" and focused:
@@ -71,23 +93,33 @@ class Map:
             frame = [[middle - half, middle + half] for middle in focused[0][1][:2]]
         replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
         labels = self._labels(placed, chosen, frame)
-        replace(self.marks, [self._marker(each, position, labels.get(each.vehicle)) for each, position in placed])
+        replace(
+            self.marks,
+            [self._marker(each, position, labels.get(each.vehicle)) for each, position in placed],
+        )
         self.shown = [each.vehicle for each, _ in placed]
         ephs = [each.main.newest.message.eph for each, _ in focused]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
-        replace(self._ring, [{"east": at.east, "north": at.north, "radius": radius} for _, at in focused])
+        replace(
+            self._ring,
+            [{"east": at.east, "north": at.north, "radius": radius} for _, at in focused],
+        )
         if self._background is not None and overview.origin.projection is not None:
             self._background.draw(self.figure, self._style, overview.origin.projection)
             self._background = None
 
-    def mark_events(self, events: Sequence[Event], chosen: VehicleView | None, overview: Fleet) -> None:
+    def mark_events(
+        self, events: Sequence[Event], chosen: VehicleView | None, overview: Fleet
+    ) -> None:
         """Mark where the selected vehicle was at each of its events."""
         placed: list[tuple[Event, Position]] = []
         if chosen is not None:
             stream = overview.streams.get(chosen.main.address, chosen.main.stream)
             events = events[-_MAX_EVENTS:]
             positions = stream.positions_at([event.time for event in events])
-            placed = [(event, at) for event, at in zip(events, positions, strict=True) if at is not None]
+            placed = [
+                (event, at) for event, at in zip(events, positions, strict=True) if at is not None
+            ]
         self.shown_events = [event for event, _ in placed]
         marks = [
             {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.words[:80],
@@ -107,24 +139,36 @@ class Map:
         points += [tracks[each.main.address][0].points()[:, 1:3] for each, _ in shown]
         found = np.concatenate(points)
         sides = []
-        for low, high in zip(np.nanmin(found, axis=0).tolist(), np.nanmax(found, axis=0).tolist(), strict=True):
+        for low, high in zip(
+            np.nanmin(found, axis=0).tolist(), np.nanmax(found, axis=0).tolist(), strict=True
+        ):
             grow = max(MIN_SIDE - (high - low), 2 * _MARGIN * (high - low)) / 2
             step = max(1.0, (high - low) / 20)  # move the map in steps, not continuously
-            sides.append([math.floor((low - grow) / step) * step, math.ceil((high + grow) / step) * step])
+            sides.append(
+                [math.floor((low - grow) / step) * step, math.ceil((high + grow) / step) * step]
+            )
         return sides
 
-    def _labels(self, shown: _Placed, chosen: VehicleView | None, frame: list[list[float]]) -> dict[str, bool]:
+    def _labels(
+        self, shown: _Placed, chosen: VehicleView | None, frame: list[list[float]]
+    ) -> dict[str, bool]:
         """Return the vehicles whose labels fit, most severe first; True if the label is left of its marker."""
         (west, east), (south, north) = frame
         width, height = self.size
         scale, right = max((east - west) / width, (north - south) / height), east  # m per pixel
         start, end = (getattr(self.figure.x_range, side) for side in ("start", "end"))
-        if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
+        if (
+            isinstance(start, float | int)
+            and isinstance(end, float | int)
+            and end - start > _MIN_ZOOM
+        ):
             scale, right = (end - start) / width, end
         places = [(each, at.east / scale, at.north / scale) for each, at in shown]
         # Labels of these vehicles may cover the markers of all others.
         severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is chosen}
-        taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
+        taken = [
+            (each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places
+        ]
         labels: dict[str, bool] = {}
         for each, x, y in sorted(places, key=lambda known: known[0] is not chosen):
             name = each.vehicle
@@ -164,17 +208,46 @@ class Map:
         for axis in (plot.x_range, plot.y_range):
             axis.update(renderers=[frame], range_padding=0)
         *valid, doubtful, truth = LINE_TYPES
-        plot.line("east", truth, source=tracks, color=colours["truth"], line_dash="dotted", line_width=2)
+        plot.line(
+            "east", truth, source=tracks, color=colours["truth"], line_dash="dotted", line_width=2
+        )
         for number, name in enumerate(valid):
-            plot.line("east", name, source=tracks, color=self._style.vehicle_colour(number), line_width=1.5)
-        plot.line("east", doubtful, source=tracks, color=colours["watch"], line_dash="dashed", line_width=2)
+            plot.line(
+                "east",
+                name,
+                source=tracks,
+                color=self._style.vehicle_colour(number),
+                line_width=1.5,
+            )
+        plot.line(
+            "east",
+            doubtful,
+            source=tracks,
+            color=colours["watch"],
+            line_dash="dashed",
+            line_width=2,
+        )
         plot.circle(
             "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=colours["text"],
             line_dash="dashed",
         )  # fmt: skip
-        plot.scatter("east", "north", source=self._ring, size=30, fill_alpha=0, color=colours["text"], line_width=1.5)
+        plot.scatter(
+            "east",
+            "north",
+            source=self._ring,
+            size=30,
+            fill_alpha=0,
+            color=colours["text"],
+            line_width=1.5,
+        )
         marked = plot.scatter(
-            "east", "north", source=self.events, marker="marker", size=9, color="colour", nonselection_alpha=1.0
+            "east",
+            "north",
+            source=self.events,
+            marker="marker",
+            size=9,
+            color="colour",
+            nonselection_alpha=1.0,
         )
         plot.ray(
             "east", "north", source=self.marks, length=17, length_units="screen", angle="angle", color="edge",
@@ -190,7 +263,9 @@ class Map:
         )  # fmt: skip
         plot.add_layout(ScaleBar(range=plot.x_range, unit="m", location="bottom_left"))
         plot.add_tools(
-            HoverTool(renderers=[marks], tooltips="@name: @words, @north{0.0} m north, @east{0.0} m east"),
+            HoverTool(
+                renderers=[marks], tooltips="@name: @words, @north{0.0} m north, @east{0.0} m east"
+            ),
             HoverTool(renderers=[marked], tooltips="@words"),
             TapTool(renderers=[marks, marked]),
         )

@@ -27,7 +27,8 @@ from .stream import is_position
 _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s of history loaded before the playback position
-_OVERVIEW: Final = 20_000, 0.5  # maximum number of points of a whole flight, and s between two points
+# maximum number of points of a whole flight, and s between two points
+_OVERVIEW: Final = 20_000, 0.5
 _STATUS_TOPICS: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
@@ -65,7 +66,9 @@ class Recording:
             for message, reason, payload in follow_flight(flight, event_log):
                 address, stamp = message.address, message.timestamp or 0
                 entry: bytes | str | int = stamp if reason is None else reason
-                if payload is not None and (is_position(address) or address.topic in _STATUS_TOPICS):
+                if payload is not None and (
+                    is_position(address) or address.topic in _STATUS_TOPICS
+                ):
                     entry = payload
                     if is_position(address):
                         row = codec_of(DEFAULT).decode_row(payload)
@@ -76,7 +79,9 @@ class Recording:
                 self.entries.append((address, entry))
                 self.dues.append(message.at)
             for warning in flight.warnings:
-                _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
+                _log.warning(
+                    "%s", warning, extra=about("damaged", source=self.name, reason=warning)
+                )
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=self.name, reason=str(exc)))
         finally:
@@ -96,12 +101,17 @@ class Player:
         self.recording = recording
         self._next = 0
         self._ticked = time.monotonic()
-        self._shown = 0.0  # last slider value set by the player; differs from the slider's while the user drags it
+        # last slider value set by the player; differs from the slider's while the user drags it
+        self._shown = 0.0
         self._play = Toggle(label="pause", active=True, width=80)
         self._speed = Select(options=_SPEEDS, value="1", width=80)
-        self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
+        self._slider = Slider(
+            start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False
+        )
         self.controls = self._play, self._speed, self._slider
-        self._play.on_change("active", lambda _, __, active: self._play.update(label="pause" if active else "play"))
+        self._play.on_change(
+            "active", lambda _, __, active: self._play.update(label="pause" if active else "play")
+        )
         self._slider.on_change("value_throttled", lambda _, __, value: self.seek(value))
 
     def tick(self) -> None:
@@ -142,8 +152,13 @@ class Player:
         for index in range(self._next, end):
             self._add(index)
         self._next = max(self._next, end)
-        states = {name: state_at(spans, self.time) for name, spans in self.recording.timeline.spans.items()}
-        self.fleet.update(Snapshot(self.time, self.fleet.monitor.snapshot(round(self.time * 1e9))), states, {})
+        states = {
+            name: state_at(spans, self.time)
+            for name, spans in self.recording.timeline.spans.items()
+        }
+        self.fleet.update(
+            Snapshot(self.time, self.fleet.monitor.snapshot(round(self.time * 1e9))), states, {}
+        )
 
     def _add(self, index: int) -> None:
         due, (address, entry) = self.recording.dues[index], self.recording.entries[index]

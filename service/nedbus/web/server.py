@@ -47,12 +47,15 @@ _log = logging.getLogger(__name__)
 MAX_VIEWERS: Final = 32  # pages open at the same time, each with a WebSocket
 _WILDCARDS: Final = {"0.0.0.0", "::"}  # noqa: S104 - only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
-_MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before the Host header is checked
+# request body, normally empty; Tornado buffers it before the Host header is checked
+_MAX_BODY_BYTES: Final = 2**16
 _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
 _MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, including expiring ones
 _MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
-_PING: Final = 15.0  # s between WebSocket pings; without a pong before the next one, the connection is closed
-_UNUSED_LIFETIME: Final = 15_000  # ms for which a page without a connection is kept, e.g. of a suspended browser
+# s between WebSocket pings; without a pong before the next one, the connection is closed
+_PING: Final = 15.0
+# ms for which a page without a connection is kept, e.g. of a suspended browser
+_UNUSED_LIFETIME: Final = 15_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +78,11 @@ def serve_live(
     """
     live = LiveFleet(bus, selection, version=version)
     background = None if options.background is None else Background(options.background)
-    server = WebServer(options, lambda page: Viewer(page, live.fleet, live.timeline, background=background), live.pages)
+    server = WebServer(
+        options,
+        lambda page: Viewer(page, live.fleet, live.timeline, background=background),
+        live.pages,
+    )
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
         reading = pool.submit(live.run, stop)  # a failure of `run` sets `stop`
         on_listening(server.url)
@@ -84,17 +91,29 @@ def serve_live(
 
 
 def serve_recording(
-    paths: Sequence[Path], options: PageOptions, *, stop: threading.Event, on_listening: Callable[[str], object]
+    paths: Sequence[Path],
+    options: PageOptions,
+    *,
+    stop: threading.Event,
+    on_listening: Callable[[str], object],
 ) -> None:
     """Serve a page of recordings until `stop` is set; each viewer has its own playback position.
 
     Raises ConfigError or SourceError if a file cannot be read, and the errors of `serve_live`.
     """
-    recording, background = Recording(*paths), None if options.background is None else Background(options.background)
+    recording = Recording(*paths)
+    background = None if options.background is None else Background(options.background)
 
     def open_page(document: Document) -> None:
         player = Player(recording)
-        Viewer(document, player.fleet, recording.timeline, title=recording.name, background=background, player=player)
+        Viewer(
+            document,
+            player.fleet,
+            recording.timeline,
+            title=recording.name,
+            background=background,
+            player=player,
+        )
 
     server = WebServer(options, open_page, {"/healthz": lambda: Page.text("ok")})
     on_listening(server.url)
@@ -108,7 +127,11 @@ class LiveFleet(Exporter):
         super().__init__(bus, selection, version=version)
         self.fleet, self._vision = Fleet(self.monitor), VisionWatch()
         now = clock.utc()
-        reports = [each for each in bus.accounts(within=PAST) if any(map(selection.matches_vehicle, each.vehicles))]
+        reports = [
+            each
+            for each in bus.accounts(within=PAST)
+            if any(map(selection.matches_vehicle, each.vehicles))
+        ]
         remembered = [event for _, event in once_per_service(reports) if event.time < now]
         self.timeline = EventTimeline(self.event_log, before=remembered)
 
@@ -125,7 +148,9 @@ class LiveFleet(Exporter):
         self.timeline.clock_offset, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
         vehicles = {*event_log.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: event_log.state(vehicle, snapshot.time) for vehicle in vehicles}
-        self.fleet.update(snapshot, states, self.log_streams, self._vision.reports(vehicles, self.positions))
+        self.fleet.update(
+            snapshot, states, self.log_streams, self._vision.reports(vehicles, self.positions)
+        )
         return snapshot
 
 
@@ -138,7 +163,10 @@ class WebServer:
     """
 
     def __init__(
-        self, options: PageOptions, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
+        self,
+        options: PageOptions,
+        open_page: Callable[[Document], object],
+        pages: Mapping[str, Callable[[], Page]],
     ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
             logging.getLogger(name).setLevel(logging.ERROR)  # else they warn about each closed tab
@@ -165,7 +193,8 @@ class WebServer:
         tornado = _Tornado(
             options, {"/": Application(FunctionHandler(open_or_refuse))},
             extra_websocket_origins=["*"], auth_provider=_TokenCheck(),
-            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's keep-alive may drop a busy session
+            # Bokeh's keep-alive may drop a busy session
+            keep_alive_milliseconds=0, websocket_ping_interval=_PING,
             unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
             websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
             extra_patterns=[(path, _TextHandler, {"render": render}) for path, render in pages.items()],
@@ -201,7 +230,9 @@ class _HttpServer(HTTPServer):
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         self._streams = [each for each in self._streams if not each.closed()]
         if len(self._streams) >= self._limit:
-            _log_once("limit of %d connections reached: further connections are closed", self._limit)
+            _log_once(
+                "limit of %d connections reached: further connections are closed", self._limit
+            )
             stream.close()
             return
         self._streams.append(stream)
@@ -222,7 +253,9 @@ class _Tornado(BokehTornado):
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
         is_local, origins = is_loopback(self._options.host), self._options.origins
-        refusal = why_refused(request.path, request.headers.get_list, is_local=is_local, origins=origins)
+        refusal = why_refused(
+            request.path, request.headers.get_list, is_local=is_local, origins=origins
+        )
         if not refusal:
             return super().find_handler(request, **kwargs)
         page = Page.text(f"{refusal}; add other names with --origin", status=403)
@@ -236,9 +269,14 @@ class _TokenCheck(NullAuth):
 
     async def get_user_async(self, handler: RequestHandler) -> str:  # type: ignore[override] # a property in Bokeh
         if handler.request.path.endswith("/ws"):
-            name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
+            name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(
+                ","
+            )
             try:
-                is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
+                is_valid = (
+                    name == "bokeh"
+                    and clock.utc() < get_token_payload(token.strip())["session_expiry"]
+                )
             except Exception:  # noqa: BLE001 - Bokeh does not translate the errors of its decoders
                 is_valid = False
             if not is_valid:

@@ -14,7 +14,8 @@ from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPo
 from nedbus_msgs.frames import CommonOrigin, to_global
 
 POINTS: Final = 600  # number of points in the history of the last minute
-LONG: Final = 900, 1.0  # number of points in the long history, and seconds between two points: 15 minutes
+# number of points in the long history, and seconds between two points: 15 minutes
+LONG: Final = 900, 1.0
 COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
 """Columns of a history, NaN where the message was not valid.
 
@@ -56,7 +57,8 @@ class History:
     def __init__(self, size: int, step: float) -> None:
         self.size, self.step = size, step
         self.written = 0
-        self._points = np.empty((size, len(COLUMNS)))  # uses no memory until written, and only positions are written
+        # uses no memory until written, and only positions are written
+        self._points = np.empty((size, len(COLUMNS)))
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
         """Return points `begin` to `end` that are not overwritten yet, oldest first; shape (n, columns)."""
@@ -79,12 +81,16 @@ class Origin(CommonOrigin):
         position = to_global(message)
         north, east = message.x, message.y
         if position:
-            north, east = self.update(address, message).project(position.latitude, position.longitude)
+            north, east = self.update(address, message).project(
+                position.latitude, position.longitude
+            )
         if not (message.xy_valid or "xy_valid" in missing):
             north = east = math.nan
         altitude = (message.ref_alt if message.z_global else 0.0) - message.z
         has_height = message.z_valid or "z_valid" in missing
-        return Position(east, north, altitude if has_height else math.nan, bool(position), message.z_global)
+        return Position(
+            east, north, altitude if has_height else math.nan, bool(position), message.z_global
+        )
 
 
 class PageStream:
@@ -94,7 +100,12 @@ class PageStream:
     """
 
     def __init__(
-        self, sample: Sample[Any], time: float, truth: PageStream | None, origin: Origin, long: tuple[int, float]
+        self,
+        sample: Sample[Any],
+        time: float,
+        truth: PageStream | None,
+        origin: Origin,
+        long: tuple[int, float],
     ) -> None:
         self.minute, self.long = History(POINTS, _STEP), History(*long)
         self.end: Sample[Any] | None = None
@@ -116,10 +127,12 @@ class PageStream:
             if time - self._sampled < _STEP:
                 return
         elif before is not None:
-            self._tracker.add(before.message)  # the tracker needs the last message before the change
+            # the tracker needs the last message before the change
+            self._tracker.add(before.message)
         self._state, self._sampled = state, time
         message, missing = sample.message, sample.provenance.missing
-        track, position = self._tracker.add(message), self.origin.locate(sample.address, message, missing)
+        track = self._tracker.add(message)
+        position = self.origin.locate(sample.address, message, missing)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
             gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
             self.minute.write(gap)
@@ -128,10 +141,24 @@ class PageStream:
         if math.isfinite(position.north):
             self.valid = position
         height = -message.z if message.z_valid or "z_valid" in missing else math.nan
-        speed = math.hypot(message.vx, message.vy) if message.v_xy_valid or "v_xy_valid" in missing else math.nan
+        speed = (
+            math.hypot(message.vx, message.vy)
+            if message.v_xy_valid or "v_xy_valid" in missing
+            else math.nan
+        )
         error = _distance(position, message, truth)
         doubtful = float(message.dead_reckoning or "xy_valid" in missing)
-        point = [time * 1e3, position.east, position.north, height, speed, message.eph, message.epv, error, doubtful]
+        point = [
+            time * 1e3,
+            position.east,
+            position.north,
+            height,
+            speed,
+            message.eph,
+            message.epv,
+            error,
+            doubtful,
+        ]
         self.minute.write(point)
         if time - self._sampled_long >= self.long.step:
             self._sampled_long = time
@@ -145,7 +172,9 @@ class PageStream:
         numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
         found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
         return [
-            None if point is None else Position(point[0], point[1], math.nan, common=True, is_altitude_global=False)
+            None
+            if point is None
+            else Position(point[0], point[1], math.nan, common=True, is_altitude_global=False)
             for point in found
         ]
 
@@ -156,7 +185,9 @@ def _distance(position: Position, message: VehicleLocalPosition, truth: PageStre
         return math.nan
     real = truth.end.message
     other = truth.origin.locate(truth.end.address, real)
-    seconds = ((message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)) / 1e6
+    seconds = (
+        (message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)
+    ) / 1e6
     if other.common != position.common or abs(seconds) > _MAX_TRUTH_AGE:
         return math.nan
     offsets = [

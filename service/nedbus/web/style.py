@@ -19,7 +19,12 @@ from .stream import is_position
 
 SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "info": "●"}
 """Text symbol of a grade or event severity."""
-MARKERS: Final[Mapping[str, str]] = {"bad": "square", "watch": "triangle", "ok": "circle", "info": "circle"}
+MARKERS: Final[Mapping[str, str]] = {
+    "bad": "square",
+    "watch": "triangle",
+    "ok": "circle",
+    "info": "circle",
+}
 """Bokeh marker of the same shape."""
 PALETTE: Final = 8  # number of vehicle colours; none is a state colour
 
@@ -51,7 +56,9 @@ def panels() -> jinja2.Template:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=format_duration, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)
-    environment.globals.update(MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, describe=describe_stream, derive=derive)
+    environment.globals.update(
+        MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, describe=describe_stream, derive=derive
+    )
     return environment.from_string(re.sub(r"(?<=[>}])\n\s*(?=[<{])", "", read_asset("panels.html")))
 
 

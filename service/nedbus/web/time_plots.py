@@ -39,7 +39,11 @@ _TRUTH_COLUMNS: Final = {"height", "speed"}
 def notable(events: Iterable[Event]) -> list[Event]:
     """Return the events to mark: faults and flight phases; if more than 2,000, only the latest faults."""
     shown = [event for event in events if event.severity != "info" or KINDS[event.kind].phase]
-    return shown if len(shown) <= _MAX_MARKS else [each for each in shown if each.severity != "info"][-_MAX_MARKS:]
+    return (
+        shown
+        if len(shown) <= _MAX_MARKS
+        else [each for each in shown if each.severity != "info"][-_MAX_MARKS:]
+    )
 
 
 def set_time_range(axis: Range1d, begin: float, end: float) -> None:
@@ -58,18 +62,29 @@ class TimelinePlot:
         self._colours = style.colours
         self._ticker = FixedTicker()
         self.range = Range1d()
-        options: dict[str, Any] = {"y_range": Range1d(), "height": 100, "css_classes": ["time"], "title": _LEGEND}
+        options: dict[str, Any] = {
+            "y_range": Range1d(),
+            "height": 100,
+            "css_classes": ["time"],
+            "title": _LEGEND,
+        }
         self.figure = _time_figure(self.range, clock, **options)
         self.figure.yaxis.ticker = self._ticker
         self.figure.xaxis.ticker = DatetimeTicker(desired_num_ticks=4)
         self.figure.ygrid.grid_line_color = None
-        self.figure.hbar("row", 0.28, "end", "begin", source=self._spans, color="colour", alpha=0.75)
+        self.figure.hbar(
+            "row", 0.28, "end", "begin", source=self._spans, color="colour", alpha=0.75
+        )
         marks = self.figure.scatter(
             "time", "row", source=self.marks, marker="marker", size=11, fill_color="colour",
             line_color=style.colours["ground"], nonselection_alpha=1.0,
         )  # fmt: skip
-        self.figure.vspan(x="time", source=self._now, line_color=style.colours["text"], line_dash="dotted")
-        self.figure.add_tools(HoverTool(renderers=[marks], tooltips="@vehicle: @words"), TapTool(renderers=[marks]))
+        self.figure.vspan(
+            x="time", source=self._now, line_color=style.colours["text"], line_dash="dotted"
+        )
+        self.figure.add_tools(
+            HoverTool(renderers=[marks], tooltips="@vehicle: @words"), TapTool(renderers=[marks])
+        )
 
     def update(
         self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
@@ -82,9 +97,13 @@ class TimelinePlot:
             for severity in ("watch", "bad")
             for name in vehicles
             for span in spans.get(name, ())
-            if span.severity == severity and span.until != span.since and (span.until is None or span.until > begin)
+            if span.severity == severity
+            and span.until != span.since
+            and (span.until is None or span.until > begin)
         ]
-        affected = {event.vehicle for event in events if event.severity != "info"} | {name for name, _ in held}
+        affected = {event.vehicle for event in events if event.severity != "info"} | {
+            name for name, _ in held
+        }
         others = sorted(vehicles[1:], key=lambda name: name not in affected)
         names = [*([ALL] if ALL in affected else []), *vehicles[:1], *others]
         hidden = len(names) - _MAX_ROWS + 1 if len(names) > _MAX_ROWS else 0
@@ -104,12 +123,16 @@ class TimelinePlot:
         ]  # fmt: skip
         replace(self._spans, bars)
         replace(self._now, [{"time": now * 1e3}])
-        labels: dict[Any, Any] = {row: "link, page" if name == ALL else name[:14] for name, row in rows.items()}
+        labels: dict[Any, Any] = {
+            row: "link, page" if name == ALL else name[:14] for name, row in rows.items()
+        }
         labels |= {0: f"+{hidden} more"} if hidden else {}
         self._ticker.ticks = list(labels)
         self.figure.yaxis.major_label_overrides = labels
         padding = max(_MIN_ROWS - len(names), 0) / 2
-        self.figure.y_range.update(start=0.4 - padding - bool(hidden), end=len(names) + 0.6 + padding)
+        self.figure.y_range.update(
+            start=0.4 - padding - bool(hidden), end=len(names) + 0.6 + padding
+        )
 
 
 class Plots:
@@ -129,11 +152,19 @@ class Plots:
 
     def update(self, chosen: History | None, truth: History | None) -> None:
         """Add the new points of the selected stream and of its ground truth."""
-        for source, history in ((self.chosen, chosen), (self._truth, truth if truth is not chosen else None)):
+        for source, history in (
+            (self.chosen, chosen),
+            (self._truth, truth if truth is not chosen else None),
+        ):
             shown, seen = self._shown.get(source, (None, 0))
-            end = history.written if history is not None else 0  # read once: another thread adds points
+            # read once: another thread adds points
+            end = history.written if history is not None else 0
             self._shown[source] = history, end
-            points = _NO_POINTS if history is None else history.points(seen if history is shown else 0, end)
+            points = (
+                _NO_POINTS
+                if history is None
+                else history.points(seen if history is shown else 0, end)
+            )
             columns: dict[str, Any] = dict(zip(COLUMNS, points.T, strict=True))
             if history is not shown:
                 source.data = columns
@@ -143,7 +174,10 @@ class Plots:
     def mark_events(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
         """Mark the events of the vehicle and shade its conditions; active ones end at `end` [s]."""
         colours = self._style.colours
-        replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
+        replace(
+            self._marks,
+            [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events],
+        )
         held = [
             {"begin": span.since * 1e3, "end": (end if span.until is None else span.until) * 1e3,
              "colour": colours[span.severity]}
@@ -154,16 +188,31 @@ class Plots:
     def _draw(self, titles: Mapping[str, str]) -> figure:
         title = next(iter(titles.values())) if len(titles) == 1 else None  # otherwise the legend
         plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
-        plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
+        plot.vstrip(
+            x0="begin",
+            x1="end",
+            source=self._spans,
+            fill_color="colour",
+            fill_alpha=0.12,
+            line_alpha=0.0,
+        )
         entries: list[Any] = []
         for (name, label), colour in zip(titles.items(), self._style.vehicles, strict=False):
             line: Any = plot.line("time", name, source=self.chosen, color=colour, line_width=1.5)
             entries.append(LegendItem(label=label, renderers=[line]))
             if name in _TRUTH_COLUMNS:
                 truth = self._style.colours["truth"]
-                plot.line("time", name, source=self._truth, color=truth, line_dash="dotted", line_width=1.5)
+                plot.line(
+                    "time",
+                    name,
+                    source=self._truth,
+                    color=truth,
+                    line_dash="dotted",
+                    line_width=1.5,
+                )
         if title is None:
-            plot.add_layout(Legend(items=entries), "above")  # inside the frame it would cover the lines
+            # inside the frame it would cover the lines
+            plot.add_layout(Legend(items=entries), "above")
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
         plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)
@@ -172,7 +221,12 @@ class Plots:
 
 def _time_figure(span: Range1d, clock: Any, **options: Any) -> figure:
     plot = figure(
-        x_range=span, x_axis_type="datetime", tools="", toolbar_location=None, sizing_mode="stretch_both", **options
+        x_range=span,
+        x_axis_type="datetime",
+        tools="",
+        toolbar_location=None,
+        sizing_mode="stretch_both",
+        **options,
     )
     plot.xaxis.formatter = clock
     return plot

@@ -12,7 +12,13 @@ from urllib.parse import urlencode
 from bokeh.document import Document
 from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, GlobalInlineStyleSheet, LayoutDOM
+from bokeh.models import (
+    ColumnDataSource,
+    CustomJS,
+    CustomJSTickFormatter,
+    GlobalInlineStyleSheet,
+    LayoutDOM,
+)
 from bokeh.models.widgets import Div, TextInput
 from bokeh.themes import Theme
 
@@ -53,7 +59,11 @@ class Viewer:
     ) -> None:  # fmt: skip
         request = getattr(document.session_context, "request", None)  # None without a browser
         given = request.arguments.items() if request is not None else ()
-        query = {name: values[0].decode(errors="replace")[:_MAX_MESSAGE] for name, values in given if values}
+        query = {
+            name: values[0].decode(errors="replace")[:_MAX_MESSAGE]
+            for name, values in given
+            if values
+        }
         self.chosen: str | None = query.get("vehicle")
         self.pinned: float | None = None  # selected moment of live vehicles
         time = query.get("time", "")
@@ -63,11 +73,17 @@ class Viewer:
         self._is_open = False  # True if the table of streams is open
         self._listed: list[str] = []
         self._faults: list[Event] = []
-        self._fleet, self._timeline, self._player = fleet, timeline, player
+        self._fleet = fleet
+        self._timeline = timeline
+        self._player = player
         self._overview = player.recording.overview if player is not None else fleet
-        self._style, self._name, self._document = LIGHT if query.get("theme") == "light" else DARK, title, document
+        self._style = LIGHT if query.get("theme") == "light" else DARK
+        self._name = title
+        self._document = document
         self._ticks = self._sent = 0
-        self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0, "clock": ""})
+        self._clock = CustomJSTickFormatter(
+            code=read_asset("clock.js"), args={"start": 0.0, "clock": ""}
+        )
         self._timeline_plot = TimelinePlot(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
         self._undrawn = self._plots.draw()
@@ -82,10 +98,14 @@ class Viewer:
         self._search = TextInput(placeholder="search vehicle  /", css_classes=["find"], **wide)
         self._grid = column(sizing_mode="stretch_both", css_classes=["plots"], visible=False)
         # Hidden inputs exchange values with the browser: update number, last update drawn, action, URL.
-        self._update_number, self._drawn, self._message, self._url = (TextInput(visible=False) for _ in range(4))
+        self._update_number, self._drawn, self._message, self._url = (
+            TextInput(visible=False) for _ in range(4)
+        )
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
         self._update_number.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
-        self._url.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
+        self._url.js_on_change(
+            "value", CustomJS(code='history.replaceState(null, "", cb_obj.value)')
+        )
         self._message.on_change("value", lambda _, __, message: self._act(message))
         self._search.on_change("value_input", lambda _, __, ___: self._update_text_soon())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
@@ -111,13 +131,17 @@ class Viewer:
         if drawn.isdecimal() and self._sent - int(drawn) >= _MAX_AHEAD:
             return
         self._sent += 1
-        if self._drawn.value and (plot := next(self._undrawn, None)):  # plots follow one by one after map and list
+        # plots follow one by one after map and list
+        if self._drawn.value and (plot := next(self._undrawn, None)):
             self._grid.children = [*self._grid.children, plot]
         snapshot = self._fleet.snapshot
-        if not self._is_choice and snapshot.vehicles:  # select the most severe vehicle until the user selects one
+        # select the most severe vehicle until the user selects one
+        if not self._is_choice and snapshot.vehicles:
             self.chosen = snapshot.vehicles[0].vehicle
         chosen = snapshot.vehicle(self.chosen)
-        self._grid.visible = bool(self._grid.children) and chosen is not None and is_position(chosen.main.address)
+        self._grid.visible = (
+            bool(self._grid.children) and chosen is not None and is_position(chosen.main.address)
+        )
         self._map.update(snapshot, self._overview, chosen)
         if self._ticks % _TEXT_TICKS == 0:
             self._go_to_requested()
@@ -137,7 +161,9 @@ class Viewer:
         self._event = event if event.vehicle != ALL else None
 
     def _choose(self, vehicle: str) -> None:
-        self.chosen, self._is_choice, self._event = vehicle, True, None
+        self.chosen = vehicle
+        self._is_choice = True
+        self._event = None
 
     def _go_to(self, seconds: float | None) -> None:
         """Show a moment [s], or the current time if None."""
@@ -150,7 +176,9 @@ class Viewer:
     def _go_to_requested(self) -> None:
         """Show the moment in the URL once the recording has been read that far."""
         time, player = self._requested_time, self._player
-        if time is not None and (player is None or player.recording.is_read or time <= player.recording.length):
+        if time is not None and (
+            player is None or player.recording.is_read or time <= player.recording.length
+        ):
             if player is not None:
                 player.toggle(pause=True)
             self._go_to(time)
@@ -163,17 +191,32 @@ class Viewer:
         self._clock.args = {"start": self._timeline.clock_offset, "clock": self._timeline.unit}
         clock = self._timeline.format_clock(snapshot.time) if snapshot.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
-        rows = [each for each in snapshot.vehicles if wanted in f"{each.vehicle}\n{each.state.text}".lower()]
+        rows = [
+            each
+            for each in snapshot.vehicles
+            if wanted in f"{each.vehicle}\n{each.state.text}".lower()
+        ]
         self._listed = [each.vehicle for each in rows]
-        story, verdict, then, end = None, None, chosen, player.recording.length if player else snapshot.time
+        story = None
+        verdict = None
+        then = chosen
+        end = player.recording.length if player else snapshot.time
         if chosen is not None:
-            at = self._event if self._event is not None and abs(now - self._event.time) < 1.0 else self.pinned
+            at = (
+                self._event
+                if self._event is not None and abs(now - self._event.time) < 1.0
+                else self.pinned
+            )
             story = self._timeline.story(chosen.vehicle, now, at, chosen.state.conditions)
             if story is not None:
                 is_now = player is None and self.pinned is None
-                verdict = self._timeline.verdict(chosen.vehicle, end, None if is_now else story.since)
+                verdict = self._timeline.verdict(
+                    chosen.vehicle, end, None if is_now else story.since
+                )
             if self.pinned is not None:
-                then = replace(chosen, state=state_at(self._timeline.spans.get(chosen.vehicle, ()), now))
+                then = replace(
+                    chosen, state=state_at(self._timeline.spans.get(chosen.vehicle, ()), now)
+                )
         self._text["head"].text = panels.head(self._name, snapshot, clock)
         listed = panels.vehicles(rows, self.chosen)
         if player is not None:
@@ -185,7 +228,9 @@ class Viewer:
         self._text["nums"].text = panels.numbers(chosen)
         self._text["more"].text = panels.streams(chosen, snapshot.reports, self._is_open)
         long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
-        self._text["tool"].text = panels.toolbar(self._map, long, self.pinned, snapshot.vehicles, projection)
+        self._text["tool"].text = panels.toolbar(
+            self._map, long, self.pinned, snapshot.vehicles, projection
+        )
         query = {
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
@@ -193,18 +238,28 @@ class Viewer:
             "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
         if self._drawn.value:  # a browser that is not connected yet would miss the change
-            self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
+            self._url.value = (
+                f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
+            )
 
-    def _update_plots(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
+    def _update_plots(
+        self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float
+    ) -> None:
         vehicle, is_long_trail = self.chosen or "", self._map.is_long
         is_long = is_long_trail or now < snapshot.time - _MINUTE
         main = truth = None
         if chosen is not None and is_position(chosen.main.address):
             streams = self._overview.streams if is_long else self._fleet.streams
             pair = streams.get(chosen.main.address), streams.get(Address(vehicle, TRUTH))
-            main, truth = (None if each is None else each.long if is_long else each.minute for each in pair)
+            main, truth = (
+                None if each is None else each.long if is_long else each.minute for each in pair
+            )
         self._plots.update(main, truth)
-        begin, end = (0.0, self._player.recording.length) if self._player else (snapshot.time - PAST, snapshot.time)
+        begin, end = (
+            (0.0, self._player.recording.length)
+            if self._player
+            else (snapshot.time - PAST, snapshot.time)
+        )
         if self.pinned is not None:
             set_time_range(self._plots.range, now - _AROUND, now + _AROUND)
         elif is_long_trail:
@@ -217,14 +272,23 @@ class Viewer:
             begin = max(begin, min(first, now - _MINUTE) - 1.0)
         events = self._events_of_chosen()
         self._plots.mark_events(events, self._timeline.spans.get(vehicle, ()), end)
-        order = [*filter(None, [vehicle]), *(each.vehicle for each in snapshot.vehicles if each.vehicle != vehicle)]
-        self._timeline_plot.update(self._timeline.events, self._timeline.spans, order, begin=begin, end=end, now=now)
+        order = [
+            *filter(None, [vehicle]),
+            *(each.vehicle for each in snapshot.vehicles if each.vehicle != vehicle),
+        ]
+        self._timeline_plot.update(
+            self._timeline.events, self._timeline.spans, order, begin=begin, end=end, now=now
+        )
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:
             set_time_range(self._timeline_plot.range, begin, max(end, begin + 1.0))
         if self._player is not None:
-            self._text["marks"].text = self._panels.strip(self._timeline_plot.shown, self._player.recording.length)
+            self._text["marks"].text = self._panels.strip(
+                self._timeline_plot.shown, self._player.recording.length
+            )
         since = 0.0 if is_long_trail else now - _MINUTE
-        self._map.mark_events([event for event in events if since < event.time <= now + 1.0], chosen, self._overview)
+        self._map.mark_events(
+            [event for event in events if since < event.time <= now + 1.0], chosen, self._overview
+        )
 
     def _events_of_chosen(self) -> list[Event]:
         return notable(event for event in self._timeline.events if event.vehicle == self.chosen)
@@ -239,7 +303,9 @@ class Viewer:
             case "vehicle" if self._fleet.snapshot.vehicle(value) is not None:
                 self._choose(value)
             case "event" | "fault" if value.isdecimal():
-                for event in (self._timeline_plot.shown if name == "event" else self._faults)[int(value) :][:1]:
+                for event in (self._timeline_plot.shown if name == "event" else self._faults)[
+                    int(value) :
+                ][:1]:
                     self._show(event)
             case "focus" if option in FOCUSES:
                 self._map.focus = option
@@ -263,7 +329,9 @@ class Viewer:
 
     def _choose_next(self, step: int) -> None:
         if names := self._listed:  # wraps around
-            self._choose(names[(names.index(self.chosen) + step if self.chosen in names else 0) % len(names)])
+            self._choose(
+                names[(names.index(self.chosen) + step if self.chosen in names else 0) % len(names)]
+            )
 
     def _show_next(self, *, is_later: bool) -> None:
         now, events = self._player.time if self._player else self.pinned, self._events_of_chosen()
@@ -272,7 +340,12 @@ class Viewer:
         for event in later[:1] if is_later else earlier[-1:]:
             self._show(event)
 
-    def _on_tap(self, source: ColumnDataSource, shown: Callable[[], list[Any]], show: Callable[[Any], object]) -> None:
+    def _on_tap(
+        self,
+        source: ColumnDataSource,
+        shown: Callable[[], list[Any]],
+        show: Callable[[Any], object],
+    ) -> None:
         """Call `show` for each tapped row; clear the selection, otherwise a second tap would not be reported."""
 
         def tap(_: str, __: object, rows: list[int]) -> None:
@@ -285,14 +358,28 @@ class Viewer:
 
     def _lay_out(self, sheets: list[Any]) -> LayoutDOM:
         text = self._text
-        parts: list[LayoutDOM] = [text["head"], self._search, text["list"], text["why"], text["tool"]]
-        parts += [self._map.figure, self._timeline_plot.figure, text["nums"], self._grid, text["more"]]
+        parts: list[LayoutDOM] = [
+            text["head"],
+            self._search,
+            text["list"],
+            text["why"],
+            text["tool"],
+        ]
+        parts += [
+            self._map.figure,
+            self._timeline_plot.figure,
+            text["nums"],
+            self._grid,
+            text["more"],
+        ]
         if self._player is not None:
             *controls, slider = self._player.controls
             for control in self._player.controls:
                 control.stylesheets = sheets
             marked = column(slider, text["marks"], sizing_mode="stretch_width")
-            parts.insert(1, row(*controls, marked, sizing_mode="stretch_width", css_classes=["ctrl"]))
+            parts.insert(
+                1, row(*controls, marked, sizing_mode="stretch_width", css_classes=["ctrl"])
+            )
         parts += [self._update_number, self._drawn, self._message, self._url]
         variables = " ".join(f"--{name}: {colour};" for name, colour in self._style.colours.items())
         css = f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"

@@ -33,7 +33,9 @@ def talk(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any
     while not publisher.pub.matching_status.matching:
         time.sleep(0.01)
     for row in rows:
-        publisher.publish(**{name: np.array(v, np.float32) if name in PAIRS else v for name, v in row.items()})
+        publisher.publish(
+            **{name: np.array(v, np.float32) if name in PAIRS else v for name, v in row.items()}
+        )
     threading.Event().wait()  # until the parent process kills this one
 
 
@@ -52,7 +54,9 @@ def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: A
         if not left:
             done.set()
 
-    subscriber = ROS2Subscriber(topic=topic, msg_type=TYPE, msg_definition=definition, callback=on_message, **options)
+    subscriber = ROS2Subscriber(
+        topic=topic, msg_type=TYPE, msg_definition=definition, callback=on_message, **options
+    )
     done.wait()
     options.pop("type_hash", None)
     write(get_topic_names_and_types(**options))

@@ -27,7 +27,8 @@ from tests.peers.ports import free_port
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
-X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"  # protobuf tags of the double fields 1, 2 and 3
+# protobuf tags of the double fields 1, 2 and 3
+X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"
 HALF = math.sqrt(0.5)
 ORIGIN = {"xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 400.0}
 
@@ -86,23 +87,38 @@ class Client:
 @contextmanager
 def connected(url: str) -> Iterator[Client]:
     protocols = [Subprotocol("foxglove.sdk.v1")]
-    with connect(url, subprotocols=protocols, max_size=None, compression=None, proxy=None) as socket:
+    with connect(
+        url, subprotocols=protocols, max_size=None, compression=None, proxy=None
+    ) as socket:
         yield Client(socket)
 
 
-def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_channels_follow_vehicles_and_carry_every_field(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """Channels appear and disappear with their vehicles; their data is the message in CDR, with its definition."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
-    wait_for(lambda: f"enter {url}" in process.err or process.popen.poll() is not None, what="the server")
+    process = run_nedbus(
+        "foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False
+    )
+    wait_for(
+        lambda: f"enter {url}" in process.err or process.popen.poll() is not None, what="the server"
+    )
     topic = "/7/estimator_local_position/1"
     sent = message(5, x=0.25, vxy_max=float("inf"))
-    with connected(url) as client, bus.publisher("estimator_local_position", vehicle="7", instance=1) as publisher:
+    with (
+        connected(url) as client,
+        bus.publisher("estimator_local_position", vehicle="7", instance=1) as publisher,
+    ):
         assert client.info["op"] == "serverInfo"
         publisher.publish(sent)
         client.until(lambda: topic in client.topics)
         channel = client.channels[client.topics[topic]]
-        assert (channel["encoding"], channel["schemaEncoding"], channel["schemaName"]) == ("cdr", "ros2msg", ROS2_TYPE)
+        assert (channel["encoding"], channel["schemaEncoding"], channel["schemaName"]) == (
+            "cdr",
+            "ros2msg",
+            ROS2_TYPE,
+        )
         assert channel["schema"] == message_definition(CURRENT.name)
         client.subscribe(topic)
         while topic not in client.data:  # a subscription takes effect some time after it was sent
@@ -120,8 +136,12 @@ def test_message_without_nominal_rate_reaches_the_first_subscriber(
 ) -> None:
     """A home position is sent only once, before its channel can have subscribers, so it is kept for the first one."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
-    wait_for(lambda: f"enter {url}" in process.err or process.popen.poll() is not None, what="the server")
+    process = run_nedbus(
+        "foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False
+    )
+    wait_for(
+        lambda: f"enter {url}" in process.err or process.popen.poll() is not None, what="the server"
+    )
     topic = "/7/home_position"
     with connected(url) as client, bus.publisher("home_position", vehicle="7") as publisher:
         publisher.publish({"timestamp": 2_000_000, "alt": 488.0})
@@ -167,7 +187,8 @@ def test_poses_and_locations_are_published(bus: nedbus.Bus, wild: dict[str, floa
         ((-HALF, 0.0, 0.0, -HALF), -500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # the same rotation
         ((HALF, 0.0, HALF, 0.0), 0, 0.0, (0, 0, 1), (-1, 0, 0)),  # north, and the nose up
         ((HALF, HALF, 0.0, 0.0), 0, 0.0, (0, 1, 0), (0, 0, 1)),  # north, and the right wing down
-        ((HALF, HALF, 0.0, 0.0), 500_001, math.pi / 2, (1, 0, 0), (0, 1, 0)),  # too old, so the heading is used
+        # too old, so the heading is used
+        ((HALF, HALF, 0.0, 0.0), 500_001, math.pi / 2, (1, 0, 0), (0, 1, 0)),
         ((math.nan,) * 4, 0, math.pi / 2, (1, 0, 0), (0, 1, 0)),
     ],
 )
@@ -177,17 +198,26 @@ def test_orientation_falls_back_to_heading_without_recent_attitude(
     """The orientation is the attitude q (FRD to NED) if it is within 0.5 s of the position, otherwise the heading."""
     attitude = VehicleAttitude.model_validate({"timestamp": 10_000_000 - age, "q": q})
     x, y, z, w = orientation_of(message(10_000_000, heading=heading), attitude)
-    assert (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)) == pytest.approx(forward, abs=1e-6)
-    assert (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)) == pytest.approx(left, abs=1e-6)
+    assert (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)) == pytest.approx(
+        forward, abs=1e-6
+    )
+    assert (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)) == pytest.approx(
+        left, abs=1e-6
+    )
 
 
 def test_pose_uses_attitude_of_its_own_vehicle(bus: nedbus.Bus) -> None:
     """A pose uses the newest vehicle_attitude of its own vehicle, not of another vehicle or the ground truth."""
-    level, rolled = (VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)))
+    level, rolled = (
+        VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0))
+    )
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
         for q in (level, rolled):
             server._newest.add(Sample(q, Address("1", "vehicle_attitude"), received=1))
-        for other in (Address("2", "vehicle_attitude"), Address("1", "vehicle_attitude_groundtruth")):
+        for other in (
+            Address("2", "vehicle_attitude"),
+            Address("1", "vehicle_attitude_groundtruth"),
+        ):
             server._newest.add(Sample(level, other, received=1))
         sample = Sample(message(1, x=1.0, y=2.0, z=3.0), Address("1", VLP), received=1)
         server.log(sample)
@@ -198,7 +228,10 @@ def test_pose_uses_attitude_of_its_own_vehicle(bus: nedbus.Bus) -> None:
             client.receive_soon()
     x, y, z, _ = orientation_of(sample.message, rolled)
     assert (x, y, z) == pytest.approx((0.5, 0.5, 0.5))
-    assert all(tag + struct.pack("<d", each) in client.data["/1/pose"][1] for tag, each in ((X, x), (Y, y), (Z, z)))
+    assert all(
+        tag + struct.pack("<d", each) in client.data["/1/pose"][1]
+        for tag, each in ((X, x), (Y, y), (Z, z))
+    )
 
 
 def test_port_in_use_is_reported(bus: nedbus.Bus, endpoint: str) -> None:

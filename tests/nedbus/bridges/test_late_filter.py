@@ -17,7 +17,9 @@ SECOND = 10**9
 NOW = 1_790_000_000 * SECOND  # ns, the vehicle's clock
 
 
-def sample(sent: int | None, *, by: int = 7, address: Address = ONE, retained: bool = False) -> nedbus.Sample:
+def sample(
+    sent: int | None, *, by: int = 7, address: Address = ONE, retained: bool = False
+) -> nedbus.Sample:
     """Return a sample with this publisher timestamp [ns]."""
     stamp = None
     if sent is not None:
@@ -29,7 +31,10 @@ def sample(sent: int | None, *, by: int = 7, address: Address = ONE, retained: b
 
 def admitted(late: LateFilter, *times: tuple[float, float]) -> list[bool]:
     """Return whether each sample is admitted, given the times at which it was sent and received [s]."""
-    return [late.admits(sample(NOW + round(sent * SECOND)), arrived=round(arrived * SECOND)) for sent, arrived in times]
+    return [
+        late.admits(sample(NOW + round(sent * SECOND)), arrived=round(arrived * SECOND))
+        for sent, arrived in times
+    ]
 
 
 @pytest.mark.parametrize("ahead", [-86_400 * 365 * 20, -1.5, 0.0, 1.5, 86_400])
@@ -48,7 +53,9 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
     assert burst == sorted(burst), "after the first current sample all are current"
     assert 900 <= burst.count(False) <= 960
     assert all(admitted(late, *((13 + each / 100, 13 + each / 100) for each in range(200))))
-    assert late.report() == f"held back {burst.count(False)} old messages of {ONE}, up to 10.0 s late"
+    assert (
+        late.report() == f"held back {burst.count(False)} old messages of {ONE}, up to 10.0 s late"
+    )
     assert late.report() is None
 
 
@@ -116,7 +123,9 @@ def test_report_names_one_address_and_counts_the_others() -> None:
     """A report of late messages is one line, however many vehicles have sent them."""
     late = LateFilter()
     for name in "abc":
-        assert not late.admits(sample(NOW, address=Address(name, ONE.topic), retained=True), arrived=0)
+        assert not late.admits(
+            sample(NOW, address=Address(name, ONE.topic), retained=True), arrived=0
+        )
     assert late.report() == "held back 3 old messages of a/vehicle_local_position and 2 more"
 
 

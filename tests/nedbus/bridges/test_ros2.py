@@ -34,7 +34,15 @@ from nedbus_msgs import (
     split_ros2_topic,
     upgrade_with,
 )
-from tests.flights.local_position import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, encode, type_hash, upgrade
+from tests.flights.local_position import (
+    LAYOUTS,
+    ROS2_TYPE,
+    decode_cdr,
+    downgrade,
+    encode,
+    type_hash,
+    upgrade,
+)
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
@@ -54,7 +62,11 @@ RunBridge = Callable[..., None]
 
 def flight() -> list[VehicleLocalPosition]:
     """Return estimates of a simulated flight, with NaN, infinities and a reset."""
-    messages = (each for each in open_replay("sim:?seed=3&duration=20").messages if each.address.topic == VLP)
+    messages = (
+        each
+        for each in open_replay("sim:?seed=3&duration=20").messages
+        if each.address.topic == VLP
+    )
     return [upgrade(each.fields) for each in islice(messages, 0, None, 20)]
 
 
@@ -64,7 +76,9 @@ def definition(layout: str) -> str:
 
 
 @pytest.fixture
-def run_bridge(endpoint: str, timings: Timings, caplog: pytest.LogCaptureFixture) -> Iterator[RunBridge]:
+def run_bridge(
+    endpoint: str, timings: Timings, caplog: pytest.LogCaptureFixture
+) -> Iterator[RunBridge]:
     """Run bridges that poll 20 times per second, each in a thread with its own bus."""
     caplog.set_level("INFO")
     timings.bridge_poll = 0.05
@@ -90,7 +104,9 @@ def plain_session(endpoint: str) -> AbstractContextManager[Session]:
 def tokens(zenoh_session: Session, kind: str) -> list[str]:
     """Return the ROS 2 liveliness tokens of a kind in domain 0: NN of nodes, MP of publishers."""
     return [
-        str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get(f"@ros2_lv/0/*/*/*/{kind}/**") if reply.ok
+        str(reply.ok.key_expr)
+        for reply in zenoh_session.liveliness().get(f"@ros2_lv/0/*/*/*/{kind}/**")
+        if reply.ok
     ]
 
 
@@ -100,7 +116,12 @@ def peer(start: Start, endpoint: str, tmp_path: Path) -> Peer:
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
 
     def start_peer(role: str, layout: str, **options: object) -> Process:
-        given = {"definition": definition(layout), "router_ip": host, "router_port": int(port), **options}
+        given = {
+            "definition": definition(layout),
+            "router_ip": host,
+            "router_port": int(port),
+            **options,
+        }
         path = tmp_path / "peer.json"
         path.write_text(json.dumps(given))
         return start(PEER, role, str(path))
@@ -113,7 +134,9 @@ def as_json(fields: dict[str, object]) -> str:
     return json.dumps(fields, sort_keys=True)
 
 
-def test_message_of_a_ros2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus) -> None:
+def test_message_of_a_ros2_node_is_received(
+    run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus
+) -> None:
     """All fields of the messages of a ROS 2 node are received; the layout is found by its type hash."""
     rows = [downgrade(each, "1.14") for each in flight()]
     with bus.subscribe(mode="every") as subscription:
@@ -122,7 +145,11 @@ def test_message_of_a_ros2_node_is_received(run_nedbus: Start, peer: Peer, endpo
         for row in rows:
             sample = subscription.receive(DEADLINE)
             assert sample.message == upgrade(row)
-            assert (sample.vehicle, sample.topic, sample.source) == ("domain4-drone", VLP, "px4-zenoh")
+            assert (sample.vehicle, sample.topic, sample.source) == (
+                "domain4-drone",
+                VLP,
+                "px4-zenoh",
+            )
         assert subscription.counts.lost == 0
 
 
@@ -139,18 +166,25 @@ def test_ros2_node_receives_messages_and_lists_topics(
     node = peer("listen", layout, topic=topic, rows=expected, domain_id=3)
     wait_for_matching(zenoh_session, f"3{topic}/{dds_type(ROS2_TYPE)}/{type_hash(layout)}")
     run_bridge(layout=layout, domain=3)
-    wait_for(lambda: len(list(zenoh_session.liveliness().get("@ros2_lv/3/*/*/*/MP/**"))) == 2, what="the bridge")
+    wait_for(
+        lambda: len(list(zenoh_session.liveliness().get("@ros2_lv/3/*/*/*/MP/**"))) == 2,
+        what="the bridge",
+    )
     wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
     for each in messages:
         publisher.publish(each)
     assert node.wait() == 0, node.err
     *received, listed = [json.loads(line) for line in node.out.splitlines()]
-    assert [as_json(row) for row in received] == [as_json(json.loads(json.dumps(row))) for row in expected]
+    assert [as_json(row) for row in received] == [
+        as_json(json.loads(json.dumps(row))) for row in expected
+    ]
     assert [topic, [ROS2_TYPE]] in listed
     assert ["/px4_7/fmu/out/estimator_local_position_1", [ROS2_TYPE]] in listed
 
 
-def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_bridge_publishes_like_px4(
+    run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """Key, payload, attachment and liveliness tokens have the format of PX4's Zenoh module."""
     publisher = bus.publisher(VLP, vehicle="1")
     run_bridge()
@@ -161,7 +195,9 @@ def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, zenoh
         publisher.publish(message(timestamp))
     one, two = (subscriber.handler.recv() for _ in range(2))
     assert len(one.payload) == 220
-    first, second = (Attachment.parse(sample.attachment.to_bytes()) for sample in (one, two) if sample.attachment)
+    first, second = (
+        Attachment.parse(sample.attachment.to_bytes()) for sample in (one, two) if sample.attachment
+    )
     assert (first.sequence, second.sequence, first.gid == second.gid) == (1, 2, True)
     assert second.time > first.time > 1_700_000_000_000_000_000
     (token,) = tokens(zenoh_session, "MP")
@@ -173,7 +209,11 @@ def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, zenoh
 @pytest.mark.skipif(not TWELVE_MESSAGES.exists(), reason=f"no PX4 log at {TWELVE_MESSAGES}")
 @pytest.mark.parametrize("release", ["1.13", "1.15", "main"])
 def test_messages_have_the_layout_of_the_release(
-    run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture, release: str
+    run_bridge: RunBridge,
+    bus: nedbus.Bus,
+    zenoh_session: Session,
+    caplog: pytest.LogCaptureFixture,
+    release: str,
 ) -> None:
     """Key, type hash and CDR fields of every topic in a real log match the selected release.
 
@@ -181,14 +221,18 @@ def test_messages_have_the_layout_of_the_release(
     """
     last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE_MESSAGES}").messages}
     messages = {each: upgrade_with(BY_TOPIC[each.topic], fields) for each, fields in last.items()}
-    publishers = [bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in messages]
+    publishers = [
+        bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in messages
+    ]
     for publisher, each in zip(publishers, messages.values(), strict=True):
         publisher.publish(each)
     wait_for(lambda: len(bus.latest(ANY)) == len(messages), what="the last values")
     subscriber = zenoh_session.declare_subscriber("0/fmu/out/**", zenoh.handlers.FifoChannel(1000))
     run_bridge(layout=release)
     missing = {each for each in messages if BY_TOPIC[each.topic].layout_of_release(release) is None}
-    wait_for(lambda: len(tokens(zenoh_session, "MP")) == len(messages) - len(missing), what="the bridge")
+    wait_for(
+        lambda: len(tokens(zenoh_session, "MP")) == len(messages) - len(missing), what="the bridge"
+    )
     received = {str(subscriber.handler.recv().key_expr).split("/")[3] for _ in range(2)}
     assert received == {"home_position", "log_message"}
     for publisher, each in zip(publishers, messages.values(), strict=True):
@@ -205,10 +249,20 @@ def test_messages_have_the_layout_of_the_release(
         assert layout is not None
         assert repr(fields) == repr(BY_TOPIC[topic].downgrade(sent.__dict__, layout))
         received.add(key.topic.rpartition("/")[2])
-    assert {"battery_status", "sensor_gps", "estimator_status_flags", "estimator_status_flags_1"} <= received
+    assert {
+        "battery_status",
+        "sensor_gps",
+        "estimator_status_flags",
+        "estimator_status_flags_1",
+    } <= received
     assert len(received) == len(messages) - len(missing)
     for address in missing:
-        assert caplog.text.count(f"{address} is not published to ROS 2: PX4 {release} has no such message") == 1
+        assert (
+            caplog.text.count(
+                f"{address} is not published to ROS 2: PX4 {release} has no such message"
+            )
+            == 1
+        )
 
 
 def test_first_home_position_of_a_new_vehicle_is_bridged(
@@ -249,7 +303,10 @@ def test_retained_message_is_not_bridged(
     wait_for(bus.latest, what="the last value")
     subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1000))
     run_bridge()
-    wait_for(lambda: "->" in caplog.text and "held back 1 old message" in caplog.text, what="the topic and the report")
+    wait_for(
+        lambda: "->" in caplog.text and "held back 1 old message" in caplog.text,
+        what="the topic and the report",
+    )
     wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")
     for timestamp in range(2, 402):
         publisher.publish(message(timestamp))
@@ -259,7 +316,10 @@ def test_retained_message_is_not_bridged(
 
 
 def test_late_messages_of_a_returning_vehicle_are_held_back(
-    run_bridge: RunBridge, zenoh_session: Session, timings: Timings, caplog: pytest.LogCaptureFixture
+    run_bridge: RunBridge,
+    zenoh_session: Session,
+    timings: Timings,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Messages recovered after a vehicle was briefly gone, as in a router restart, are held back."""
     timings.lateness = 0.2
@@ -291,7 +351,10 @@ def test_late_messages_of_a_returning_vehicle_are_held_back(
     with repeating(
         lambda: put(next(current), zenoh_session.new_timestamp().get_time())
     ):  # on a busy host some are late
-        assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] != 2
+        assert (
+            decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"]
+            != 2
+        )
     token.undeclare()
 
 
@@ -315,7 +378,9 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
 
         def has_received(timestamp: int) -> bool:
             while (sample := subscriber.handler.try_recv()) is not None:
-                received.append(int(str(decode_cdr(sample.payload.to_bytes(), layout="1.16")["timestamp"])))
+                received.append(
+                    int(str(decode_cdr(sample.payload.to_bytes(), layout="1.16")["timestamp"]))
+                )
             return bool(received) and received[-1] >= timestamp
 
         with ThreadPoolExecutor() as threads, ExitStack() as landing:
@@ -326,7 +391,10 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
             first = len(published)
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
-            wait_for(lambda: " s late; ROS 2 nodes would treat old messages as" in bridge.err, what="the recovery")
+            wait_for(
+                lambda: " s late; ROS 2 nodes would treat old messages as" in bridge.err,
+                what="the recovery",
+            )
             last = len(published)
             wait_for(lambda: has_received(last), what="a current message")
         flight.result()
@@ -364,7 +432,10 @@ def test_topic_of_another_node_is_not_published_twice(
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
-    refused, published = f"because node px4_0001 already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
+    refused, published = (
+        f"because node px4_0001 already publishes /fmu/out/{VLP}",
+        f"-> /fmu/out/{VLP}, ",
+    )
     run_bridge(layout="1.14")
     wait_for(lambda: refused in caplog.text, what="the warning")
     assert published not in caplog.text
@@ -414,11 +485,24 @@ def test_command_bridges_one_instance_for_humble(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session
 ) -> None:
     """`nedbus ros2` bridges one instance to another domain with the keys of Humble, and reports a topic conflict."""
-    publishers = [bus.publisher("estimator_local_position", vehicle="a-b", instance=number) for number in (0, 1)]
+    publishers = [
+        bus.publisher("estimator_local_position", vehicle="a-b", instance=number)
+        for number in (0, 1)
+    ]
     bus.publisher("estimator_local_position", vehicle="a_b", instance=0)
     key = f"3/a_b/fmu/out/estimator_local_position_0/{dds_type(ROS2_TYPE)}/TypeHashNotSupported"
     subscriber = zenoh_session.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
-    options = ("--humble", "--layout", "1.14", "--domain", "3", "-t", "estimator_local_position", "-i", "0")
+    options = (
+        "--humble",
+        "--layout",
+        "1.14",
+        "--domain",
+        "3",
+        "-t",
+        "estimator_local_position",
+        "-i",
+        "0",
+    )
     bridge = run_nedbus("ros2", "-c", endpoint, *options)
     wait_for(lambda: "set --namespace" in bridge.err, what="the conflict")
     wait_for_matching(zenoh_session, "nedbus/a_b/estimator_local_position/0")
@@ -434,10 +518,19 @@ def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path)
     """The bridge detects that a router's access control silently denies ROS 2 keys, and stops."""
     timings.token_visible = 0.2
     endpoint, file = free_endpoint(), tmp_path / "router.json5"
-    rules = [{"id": "no", "permission": "deny", "messages": ["liveliness_token"], "key_exprs": ["@ros2_lv/**"]}]
+    rules = [
+        {
+            "id": "no",
+            "permission": "deny",
+            "messages": ["liveliness_token"],
+            "key_exprs": ["@ros2_lv/**"],
+        }
+    ]
     policies = [{"rules": ["no"], "subjects": ["all"]}]
     access = {"enabled": True, "default_permission": "allow", "rules": rules, "policies": policies}
-    file.write_text(json.dumps({"mode": "router", "access_control": {**access, "subjects": [{"id": "all"}]}}))
+    file.write_text(
+        json.dumps({"mode": "router", "access_control": {**access, "subjects": [{"id": "all"}]}})
+    )
     with (
         closing(open_router(listen=(endpoint,), config_file=file)),
         nedbus.connect(endpoint) as bus,
@@ -451,8 +544,16 @@ def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path)
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "text"),
     [
-        (["--to", "tcp/127.0.0.1:1"], 1, "no router answers at tcp/127.0.0.1:1: start ROS 2's router there"),
-        (["--layout", "1.12"], 2, "unknown layout '1.12': choose from 1.13, 1.14, 1.15, 1.16, 1.17, 1.18, main, V0"),
+        (
+            ["--to", "tcp/127.0.0.1:1"],
+            1,
+            "no router answers at tcp/127.0.0.1:1: start ROS 2's router there",
+        ),
+        (
+            ["--layout", "1.12"],
+            2,
+            "unknown layout '1.12': choose from 1.13, 1.14, 1.15, 1.16, 1.17, 1.18, main, V0",
+        ),
         (["--namespace", "1:7up"], 2, "namespace '7up' is not valid"),
         (["--namespace", "7up"], 2, "VEHICLE:NAMESPACE"),
     ],

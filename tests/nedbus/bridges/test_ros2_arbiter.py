@@ -21,7 +21,11 @@ def make(namespaces: Mapping[str, str] | None = None) -> Ros2Arbiter:
 
 
 def actions(
-    arbiter: Ros2Arbiter, addresses: Collection[Address], nodes: Mapping[Address, str] | None = None, *, now: float
+    arbiter: Ros2Arbiter,
+    addresses: Collection[Address],
+    nodes: Mapping[Address, str] | None = None,
+    *,
+    now: float,
 ) -> list[tuple[str, str]]:
     """Return action and topic of each decision."""
     return [(each.action, each.topic) for each in arbiter.update(addresses, nodes or {}, now=now)]
@@ -33,7 +37,9 @@ def test_topic_namespace_is_derived_from_vehicle() -> None:
     estimator = Address("wing-2", "estimator_local_position", 1)
     assert arbiter.topic_of(estimator) == "wing_2/fmu/out/estimator_local_position_1"
     namespaces = {"1": "", "7": "px4_7/", "wing": "wing/", "named": "fleet/a/", "bare": ""}
-    assert {name: arbiter.topic_of(Address(name, VLP)).removesuffix(TOPIC) for name in namespaces} == namespaces
+    assert {
+        name: arbiter.topic_of(Address(name, VLP)).removesuffix(TOPIC) for name in namespaces
+    } == namespaces
 
 
 @pytest.mark.parametrize("namespace", ["7up", "a b", "a//b", "a-b", "/1/"])
@@ -97,7 +103,10 @@ def test_addresses_with_the_same_topic_conflict() -> None:
     assert [*arbiter.published] == [first]
     assert actions(arbiter, [second], now=2.0) == [("withdraw", topic), ("publish", topic)]
     # A later address does not displace a published one, whatever their order.
-    assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
+    assert arbiter.update([first, second], {}, now=3.0) == [
+        Decision("conflict", first, topic, str(second))
+    ]
     assert actions(arbiter, [first, second], {second: "px4"}, now=4.0) == [("defer", topic)]
     assert actions(arbiter, [first, second], now=5.0) == [("publish", topic)]
-    assert actions(arbiter, [first, second], now=5.0 + TIMINGS.take_over) == [("conflict", topic)]  # reported again
+    # reported again
+    assert actions(arbiter, [first, second], now=5.0 + TIMINGS.take_over) == [("conflict", topic)]

@@ -24,4 +24,6 @@ def test_only_given_commands_are_imported() -> None:
     """The application lists all commands, and has the options of those in the arguments."""
     listed = {each.name: each.callback for each in make_app(["why", "--help"]).registered_commands}
     assert {*listed, "pki"} == {*_COMMANDS}
-    assert [name for name, callback in listed.items() if callback.__module__ != "nedbus.cli.app"] == ["why"]
+    assert [
+        name for name, callback in listed.items() if callback.__module__ != "nedbus.cli.app"
+    ] == ["why"]

@@ -17,7 +17,9 @@ def fail(*_: object, **__: object) -> None:
     raise EOFError("marshal data too short")
 
 
-@pytest.mark.parametrize("function", ["nedbus.settings.load_settings", "nedbus.cli.output.logs.log_to_stderr"])
+@pytest.mark.parametrize(
+    "function", ["nedbus.settings.load_settings", "nedbus.cli.output.logs.log_to_stderr"]
+)
 def test_end_of_data_names_the_cause(monkeypatch: pytest.MonkeyPatch, function: str) -> None:
     """An EOFError, as of truncated bytecode, is one line with a remedy."""
     monkeypatch.setattr(function, fail)

@@ -68,12 +68,20 @@ def is_ready(datagram: Datagram) -> bool:
 
 @contextmanager
 def notified(
-    systemd: Systemd, *sources: str, connect: str | None = None, watchdog: str | None = None, patience: float = DEADLINE
+    systemd: Systemd,
+    *sources: str,
+    connect: str | None = None,
+    watchdog: str | None = None,
+    patience: float = DEADLINE,
 ) -> Iterator[tuple[Daemon, Notifier]]:
     """Run a daemon in a thread with notifications to systemd: a router, or with `connect` a client."""
     listen, routers = (None, (connect,)) if connect else ((free_endpoint(),), None)
-    daemon = Daemon(load_settings(source=sources or ("sim:",), listen=listen, connect=routers), version="0")
-    environment = {"NOTIFY_SOCKET": systemd.address} | ({"WATCHDOG_USEC": watchdog} if watchdog else {})
+    daemon = Daemon(
+        load_settings(source=sources or ("sim:",), listen=listen, connect=routers), version="0"
+    )
+    environment = {"NOTIFY_SOCKET": systemd.address} | (
+        {"WATCHDOG_USEC": watchdog} if watchdog else {}
+    )
     thread = threading.Thread(target=daemon.run)
     thread.start()
     try:
@@ -92,7 +100,9 @@ def frequent_status(timings: Timings) -> None:
     timings.systemd_status = 0.2
 
 
-@pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
+@pytest.mark.parametrize(
+    "systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"]
+)
 def test_ready_is_sent_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
     """READY is sent once, when the router accepts connections, then WATCHDOG periodically; SIGTERM sends STOPPING."""
     endpoint = free_endpoint()
@@ -102,7 +112,11 @@ def test_ready_is_sent_when_router_listens(run_nedbus: Start, systemd: Systemd) 
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
     socket.create_connection((host, int(port))).close()
     assert "1 source, " in before[-1]["STATUS"]
-    after = [each for _ in range(3) for each in systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)]
+    after = [
+        each
+        for _ in range(3)
+        for each in systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
+    ]
     process.signal(signal.SIGTERM)
     after += systemd.receive_until(lambda datagram: "STOPPING" in datagram)
     assert not any(map(is_ready, after))
@@ -122,7 +136,9 @@ def test_silent_source_does_not_delay_ready(systemd: Systemd) -> None:
     """A silent source does not delay READY; the status text names it."""
     link = f"mavlink:udpin:127.0.0.1:{free_port()}"
     with notified(systemd, "sim:", link):
-        received = systemd.receive_until(lambda datagram: "nothing arrives" in datagram.get("STATUS", ""))
+        received = systemd.receive_until(
+            lambda datagram: "nothing arrives" in datagram.get("STATUS", "")
+        )
     assert any(map(is_ready, received))
     status = received[-1]["STATUS"]
     assert status.startswith("2 sources, ")
@@ -148,7 +164,10 @@ def test_status_continues_after_a_panic(systemd: Systemd, monkeypatch: pytest.Mo
 
 def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
     """Return whether the status text has counts, and reports a rejected configuration if and only if `is_wrong`."""
-    return "messages/s" in datagram["STATUS"] and ("configuration rejected" in datagram["STATUS"]) == is_wrong
+    return (
+        "messages/s" in datagram["STATUS"]
+        and ("configuration rejected" in datagram["STATUS"]) == is_wrong
+    )
 
 
 def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_path: Path) -> None:
@@ -160,7 +179,9 @@ def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_p
     text = f'listen = "{free_endpoint()}"\nsource = ["sim:"]\n'
     file.write_text(text)
     frequent = Timings(systemd_status=0.2)
-    process = start_with_timings(start, frequent, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
+    process = start_with_timings(
+        start, frequent, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address
+    )
     systemd.receive_until(is_ready)
     for content, is_wrong in ((text, False), ("source = [", True), (text, False)):
         file.write_text(content)
@@ -181,7 +202,8 @@ def test_watchdog_is_not_sent_without_ticks(systemd: Systemd) -> None:
     """While the main thread hangs, no WATCHDOG is sent, but the status text is still sent."""
     with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
-        stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # sent after ten times the limit
+        # sent after ten times the limit
+        stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)
         assert not any("WATCHDOG" in datagram for datagram in stuck)
         notifier.tick()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
@@ -213,7 +235,10 @@ def test_watchdog_is_not_sent_while_a_source_is_stuck(
     limit = 0.1  # s
     timings.source_tick = limit / 2  # period of a source's loop
     entered, opened = block(monkeypatch, method)
-    with notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier), repeating(notifier.tick):
+    with (
+        notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier),
+        repeating(notifier.tick),
+    ):
         systemd.receive_until(is_ready)
         wait_for(entered.is_set, what="the source to block")
         wait_for(lambda: daemon.busy > limit, what="the limit")
@@ -228,7 +253,9 @@ def test_watchdog_is_not_sent_while_a_source_is_stuck(
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
-def test_watchdog_is_sent_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_is_sent_while_replay_waits_for_readers(
+    systemd: Systemd, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """WATCHDOG is sent while a replay at speed=max waits for slow readers, because it is not stuck."""
     entered, opened = block(monkeypatch, "publish_replay")
     with (
@@ -254,7 +281,9 @@ def test_watchdog_is_sent_while_replay_waits_for_readers(systemd: Systemd, monke
         ("", None, None),
     ],
 )
-def test_watchdog_interval_is_half_the_limit(limit: str, process: str | None, interval: float | None) -> None:
+def test_watchdog_interval_is_half_the_limit(
+    limit: str, process: str | None, interval: float | None
+) -> None:
     """The interval is half of WATCHDOG_USEC if systemd watches this process, and otherwise None."""
     environment = {"WATCHDOG_USEC": limit} | ({} if process is None else {"WATCHDOG_PID": process})
     assert watchdog_interval(environment) == interval
@@ -275,10 +304,14 @@ def test_client_waits_for_its_router(systemd: Systemd) -> None:
 def test_client_without_router_is_ready_after_a_timeout(systemd: Systemd) -> None:
     """A client whose router does not answer sends READY after a timeout, so that it does not delay the boot."""
     with notified(systemd, connect=free_endpoint(), patience=0.1):
-        assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waiting for a router at tcp/")
+        assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith(
+            "waiting for a router at tcp/"
+        )
 
 
-@pytest.mark.parametrize("address", [{}, {"NOTIFY_SOCKET": "vsock:2:1234"}], ids=["none", "another kind"])
+@pytest.mark.parametrize(
+    "address", [{}, {"NOTIFY_SOCKET": "vsock:2:1234"}], ids=["none", "another kind"]
+)
 def test_notifier_is_inactive_without_notify_socket(address: dict[str, str]) -> None:
     """Without NOTIFY_SOCKET, or with an unsupported address, no thread is started and nothing is sent."""
     daemon = Daemon(load_settings(source=("sim:",)), version="0")
@@ -291,7 +324,8 @@ def test_notifier_is_inactive_without_notify_socket(address: dict[str, str]) -> 
 
 def test_notify_returns_false_if_queue_is_full(systemd: Systemd) -> None:
     """`notify` returns False, and does not block, if systemd's queue is full or its socket does not exist."""
-    accepted = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))  # until the queue is full
+    # until the queue is full
+    accepted = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))
     for _ in range(accepted):
         systemd.receive()
     assert notify(systemd.address, READY=1)
@@ -328,7 +362,9 @@ def test_ready_is_repeated_until_accepted(systemd: Systemd) -> None:
 UNITS = Path(__file__).parents[3] / "packaging" / "systemd"
 EXECUTABLE = "/opt/nedbus/bin/nedbus"
 EXPOSURE = 2.0  # of 10; systemd's limit for "OK"
-with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing")
+with_systemd = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing"
+)
 
 
 @pytest.fixture(params=["nedbus.service", "nedbus@.service", "nedbus-reader@.service"])
@@ -343,7 +379,9 @@ def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 def analyze(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run systemd-analyze."""
-    return subprocess.run(["systemd-analyze", *arguments], capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        ["systemd-analyze", *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 @pytest.mark.process
@@ -355,12 +393,18 @@ def test_unit_is_valid_and_hardened(unit: Path) -> None:
     assert (done.returncode, warnings) == (0, []), done.stderr
     done = analyze("security", "--offline=true", f"--threshold={EXPOSURE * 10:.0f}", unit)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert float(done.stdout.split("Overall exposure level for")[1].split(":")[1].split()[0]) < EXPOSURE
+    assert (
+        float(done.stdout.split("Overall exposure level for")[1].split(":")[1].split()[0])
+        < EXPOSURE
+    )
 
 
 def test_template_unit_differs_only_in_its_file() -> None:
     """The template unit equals the plain one except for the settings file and the description."""
-    plain, template = ((UNITS / name).read_text().split("\n", 1)[1] for name in ("nedbus.service", "nedbus@.service"))
+    plain, template = (
+        (UNITS / name).read_text().split("\n", 1)[1]
+        for name in ("nedbus.service", "nedbus@.service")
+    )
     assert template == plain.replace("/nedbus.toml", "/%i.toml").replace("(nedbus)", "(nedbus %i)")
 
 
@@ -371,7 +415,11 @@ def test_reader_unit_expands_options_like_a_shell(tmp_path: Path) -> None:
     hardening = text.partition("\nUser=")[2]
     assert hardening == (UNITS / "nedbus.service").read_text().partition("\nUser=")[2]
     [command] = re.findall(r"^ExecStart=/bin/sh -c '(.*)'$", text, re.MULTILINE)
-    script = command.replace(EXECUTABLE, "echo nedbus").replace("exec echo", "echo").replace("%i", "record")
+    script = (
+        command.replace(EXECUTABLE, "echo nedbus")
+        .replace("exec echo", "echo")
+        .replace("%i", "record")
+    )
     options = {"OPTIONS": "--output $(printf 7).mcap -t '*'"}
     done = subprocess.run(
         ["/bin/sh", "-c", script.replace("$$", "$")],

@@ -58,7 +58,9 @@ class Link:
                 far = socket.create_connection((self._to[0], int(self._to[1])))
                 self._sockets += [near, far]
                 for source, target in ((near, far), (far, near)):
-                    threading.Thread(target=self._forward, args=(source, target), daemon=True).start()
+                    threading.Thread(
+                        target=self._forward, args=(source, target), daemon=True
+                    ).start()
 
     def _forward(self, source: socket.socket, target: socket.socket) -> None:
         with suppress(OSError):  # the socket is closed
@@ -95,7 +97,8 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 def has_downsampling_reader(publisher: nedbus.Publisher) -> bool:
     """Return True if a reader has requested downsampled streams of the publisher's vehicle."""
-    return publisher._downsampler.vehicle_listener.is_matched()  # a publisher checks it only in `publish`
+    # a publisher checks it only in `publish`
+    return publisher._downsampler.vehicle_listener.is_matched()
 
 
 def wait_for_downsampling_reader(publisher: nedbus.Publisher) -> None:

@@ -28,14 +28,20 @@ class LossyQueue(Inbox):
         return super().may_recover
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        rest = [raw for raw in batch if raw.source_info is None or raw.source_info.source_sn not in self.missing]
+        rest = [
+            raw
+            for raw in batch
+            if raw.source_info is None or raw.source_info.source_sn not in self.missing
+        ]
         super().put(rest, overflowed=overflowed)
 
 
 class Lossy:
     """A subscription with a lossy queue. `requests`: retransmission requests; the first `unanswered` get no reply."""
 
-    def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
+    def __init__(
+        self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher
+    ) -> None:
         self.session = session
         self.publish = partial(publish, publisher)
         self.queue = queue
@@ -45,13 +51,17 @@ class Lossy:
         self.unanswered = 0
         self.open = self.max_open = 0
 
-    def request(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
+    def request(
+        self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float
+    ) -> object:
         self.requests.append((key, numbers.start, numbers.stop))
         if len(self.requests) <= self.unanswered:
             return SimpleNamespace(ended=True, poll=dict)
         self.open += 1
         self.max_open = max(self.max_open, self.open)
-        return CountedRequest(RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self)
+        return CountedRequest(
+            RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self
+        )
 
 
 class CountedRequest:

@@ -29,7 +29,8 @@ def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
 
 def has_subscriber(publisher: nedbus.Publisher) -> bool:
     """Return True if a publisher has a matching subscriber."""
-    probe = publisher._writer.session.declare_publisher(publisher.key)  # the status depends on the session
+    # the status depends on the session
+    probe = publisher._writer.session.declare_publisher(publisher.key)
     status = cast("zenoh.MatchingStatus", probe.matching_status)
     probe.undeclare()
     return status.matching

@@ -50,7 +50,12 @@ def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, mode: Mo
     sample = subscription.receive(DEADLINE)
     assert encode(sample.message) == encode(sent)
     assert sample.address == Address("7", "estimator_local_position", 1)
-    assert (sample.vehicle, sample.topic, sample.instance, sample.lost) == ("7", "estimator_local_position", 1, 0)
+    assert (sample.vehicle, sample.topic, sample.instance, sample.lost) == (
+        "7",
+        "estimator_local_position",
+        1,
+        0,
+    )
     assert sample.sent is not None
     assert abs(sample.received - time.time_ns()) < 60e9
     assert sample.latency is not None
@@ -69,7 +74,10 @@ def test_sample_published_before_the_subscription_is_retained(
     wait_for_subscriber(publisher) if max_rate is None else wait_for_downsampling_reader(publisher)
     publish(publisher, 2)
     second = subscription.receive(DEADLINE)
-    assert [(each.message.timestamp, each.retained) for each in (first, second)] == [(1, True), (2, False)]
+    assert [(each.message.timestamp, each.retained) for each in (first, second)] == [
+        (1, True),
+        (2, False),
+    ]
     assert pickle.loads(pickle.dumps(first)).retained
     assert [each.retained for each in client.latest()] == [True]
 
@@ -81,7 +89,8 @@ def test_latency_does_not_include_the_time_until_reading(
     """`received` is the time at which a sample left Zenoh's ring: a script that reads late does not add latency."""
     subscription, publisher = client.subscribe(mode=mode), bus.publisher(VLP, vehicle="1")
     with suppress(nedbus.NoDataError):
-        subscription.receive(0.01)  # opens the subscription, and starts the thread that drains the ring
+        # opens the subscription, and starts the thread that drains the ring
+        subscription.receive(0.01)
     wait_for_subscriber(publisher)
     publish(publisher, 1)
     wait_for(lambda: subscription.waiting, what="the message")
@@ -114,8 +123,16 @@ def test_topic_vehicle_and_instance_select_streams(client: nedbus.Bus, bus: nedb
     for arguments, options, addresses in (
         ([], {}, [f"1/{VLP}", f"2/{VLP}"]),
         ([], {"vehicle": 2}, [f"2/{VLP}"]),
-        (["estimator_local_position"], {"vehicle": "2"}, [f"2/estimator_local_position/{each}" for each in (0, 1)]),
-        (["estimator_local_position"], {"instance": 1}, [f"{each}/estimator_local_position/1" for each in (1, 2)]),
+        (
+            ["estimator_local_position"],
+            {"vehicle": "2"},
+            [f"2/estimator_local_position/{each}" for each in (0, 1)],
+        ),
+        (
+            ["estimator_local_position"],
+            {"instance": 1},
+            [f"{each}/estimator_local_position/1" for each in (1, 2)],
+        ),
         (["*"], {"vehicle": 3}, []),
     ):
         assert [str(sample.address) for sample in client.latest(*arguments, **options)] == addresses
@@ -136,7 +153,9 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
     return len(bus.vehicles()) == count
 
 
-def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicles_appear_and_disappear(
+    client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Vehicles appear when their liveliness tokens are declared, and disappear when their publishers close.
 
     The bus never queries all tokens, because such a query would load all clients of the router.
@@ -156,7 +175,10 @@ def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkey
             wait_for(partial(has_vehicles, client, count), what=f"vehicle {vehicle}")
         other.publisher(VLP, vehicle="7")
         wait_for(lambda: len(client.vehicles()["7"]) == 2, what="another address")
-        assert client.vehicles()["7"] == [Address("7", "estimator_local_position", 2), Address("7", VLP)]
+        assert client.vehicles()["7"] == [
+            Address("7", "estimator_local_position", 2),
+            Address("7", VLP),
+        ]
     wait_for(lambda: not client.vehicles(), what="the vehicles to disappear")
     assert not queried
 
@@ -179,26 +201,41 @@ def test_vehicles_are_listed_again_after_an_overflow(
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first vehicle")
     gone.undeclare()
     for number in range(12):
-        zenoh_session.liveliness().declare_token(f"nedbus/gone-{number}/@alive/1a/{VLP}").undeclare()
-    tokens = [zenoh_session.liveliness().declare_token(f"nedbus/{number}/@alive/1a/{VLP}") for number in range(12)]
+        zenoh_session.liveliness().declare_token(
+            f"nedbus/gone-{number}/@alive/1a/{VLP}"
+        ).undeclare()
+    tokens = [
+        zenoh_session.liveliness().declare_token(f"nedbus/{number}/@alive/1a/{VLP}")
+        for number in range(12)
+    ]
     with nedbus.connect(endpoint) as other:
         wait_for(partial(has_vehicles, other, len(tokens)), what="all new vehicles on another bus")
     wait_for(partial(has_vehicles, bus, len(tokens)), what="all new vehicles")
 
 
 def test_truncated_list_of_vehicles_is_incomplete_and_logged(
-    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
+    endpoint: str,
+    bus: nedbus.Bus,
+    monkeypatch: pytest.MonkeyPatch,
+    timings: Timings,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A list of vehicles truncated at the limit is incomplete and logged once; it is complete once all vehicles fit."""
     monkeypatch.setattr(liveliness, "MAX_REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with nedbus.connect(endpoint) as other:
-        wait_for(lambda: other.vehicles() and "more than 2 liveliness tokens" in caplog.text, what="a warning")
+        wait_for(
+            lambda: other.vehicles() and "more than 2 liveliness tokens" in caplog.text,
+            what="a warning",
+        )
         assert len(other.vehicles()) == 2
         assert not other.vehicles().complete
         next(each for each in publishers if str(each.address.vehicle) in other.vehicles()).close()
-        wait_for(lambda: len(vehicles := other.vehicles()) == 2 and vehicles.complete, what="the third vehicle")
+        wait_for(
+            lambda: len(vehicles := other.vehicles()) == 2 and vehicles.complete,
+            what="the third vehicle",
+        )
     assert caplog.text.count("liveliness tokens") == 1
 
 
@@ -245,7 +282,9 @@ def count_replies(zenoh_session: Session, key: str) -> int:
     return sum(reply.ok is not None for reply in zenoh_session.get(key))
 
 
-def test_two_processes_of_one_vehicle_both_reply(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
+def test_two_processes_of_one_vehicle_both_reply(
+    bus: nedbus.Bus, endpoint: str, zenoh_session: Session
+) -> None:
     """All publishers reply to a plain Zenoh get, even if two processes publish the same vehicle."""
     with nedbus.connect(endpoint) as other:
         for each, topic in ((bus, VLP), (other, "external_ins_local_position")):
@@ -276,15 +315,22 @@ def test_latest_prefers_a_live_message_to_a_stored_one(
     publish(bus.publisher(VLP, vehicle="1"), 1)
 
     def found() -> list[tuple[str, int, bool]]:
-        return [(sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()]
+        return [
+            (sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()
+        ]
 
     with answer_queries(zenoh_session, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
-        wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="a live and a stored message")
+        wait_for(
+            lambda: found() == [("1", 1, False), ("2", 99, True)],
+            what="a live and a stored message",
+        )
 
 
 def reply_with_statuses(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
     """Return a handler that replies to each query for services with all payloads in `answers`, keyed by service id."""
-    return reply_with({f"nedbus/@service/1/{name}/status": payload for name, payload in answers.items()})
+    return reply_with(
+        {f"nedbus/@service/1/{name}/status": payload for name, payload in answers.items()}
+    )
 
 
 def test_malformed_status_is_ignored(
@@ -295,11 +341,16 @@ def test_malformed_status_is_ignored(
     with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with_statuses(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
+    assert [
+        text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned
+    ] == [True]
 
 
 def test_memory_for_parsed_status_is_bounded(
-    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus,
+    zenoh_session: Session,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Parsed JSON may need 30 times its length: replies beyond the memory limit, here 4 MiB, are ignored and logged."""
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
@@ -312,9 +363,21 @@ def test_memory_for_parsed_status_is_bounded(
     assert "over the memory limit (18 in total)" in caplog.text
 
 
-def test_status_of_hostile_or_newer_service_is_sanitized(client: nedbus.Bus, zenoh_session: Session) -> None:
+def test_status_of_hostile_or_newer_service_is_sanitized(
+    client: nedbus.Bus, zenoh_session: Session
+) -> None:
     """The id of a status is taken from its key, unknown fields are ignored, and invalid values and rows dropped."""
-    sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
+    sources = [
+        5,
+        {
+            "source": "sim:",
+            "state": "new",
+            "published": [],
+            "addresses": ["1/x", 5],
+            "streams": [{}],
+            "z": 1,
+        },
+    ]
     content = {
         "service": "forged",
         "host": "here",
@@ -338,7 +401,10 @@ def test_status_of_hostile_or_newer_service_is_sanitized(client: nedbus.Bus, zen
 
 
 def test_bytes_of_replies_are_bounded(
-    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus,
+    zenoh_session: Session,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The bytes of replies to one query are bounded, and the number of ignored replies is logged."""
     monkeypatch.setattr("nedbus.transport.queries.MAX_QUERY_BYTES", 10_500)
@@ -356,7 +422,9 @@ def test_flood_of_statuses_hides_no_other_vehicle(
 ) -> None:
     """Statuses on keys of one vehicle, or on those without a vehicle, use up the limits without hiding vehicle 2."""
     monkeypatch.setattr("nedbus.transport.queries.MAX_REPLIES", 40)
-    own = json.dumps({"host": "h", "refused": ["3"], "sources": [{"warnings": ["x" * 500]}]}).encode()
+    own = json.dumps(
+        {"host": "h", "refused": ["3"], "sources": [{"warnings": ["x" * 500]}]}
+    ).encode()
     flood = {key.format(number): b"{}" for number in range(100)}
     answers = {**flood, "nedbus/@service/2/own/status": own}
     with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with(answers)):
@@ -380,7 +448,9 @@ def test_memory_for_replies_is_taken_from_the_largest_vehicle(
     assert "honest" in [each.host for each in services]
 
 
-def test_refusal_of_a_vehicle_reports_nothing_else_about_it(bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_refusal_of_a_vehicle_reports_nothing_else_about_it(
+    bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """A status of vehicle 1 that says it is refused as vehicle 2 has its streams, but no links of vehicle 2."""
     health = asdict(StreamHealth(VLP).snapshot())
     sources = [
@@ -401,12 +471,17 @@ def test_refusal_of_a_vehicle_reports_nothing_else_about_it(bus: nedbus.Bus, zen
 
 
 def test_vehicle_with_many_streams_hides_no_other(
-    client: nedbus.Bus, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    client: nedbus.Bus,
+    bus: nedbus.Bus,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Beyond the limits of a query for last messages, the vehicle with the most loses some; no other vehicle does."""
     monkeypatch.setattr("nedbus.transport.queries.MAX_REPLIES", 5)
     for instance in range(20):
-        bus.publisher("estimator_local_position", vehicle="loud", instance=instance).publish({"timestamp": 1})
+        bus.publisher("estimator_local_position", vehicle="loud", instance=instance).publish(
+            {"timestamp": 1}
+        )
     for vehicle in ("a", "z"):
         bus.publisher(VLP, vehicle=vehicle).publish({"timestamp": 1})
     wait_for(lambda: len(bus.publishers()) == 22, what="the publishers")
@@ -444,7 +519,9 @@ def test_second_publisher_of_an_address_raises(client: nedbus.Bus) -> None:
     publish(publisher, 1)
 
 
-def test_concurrent_publishers_of_an_address_raise(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_publishers_of_an_address_raise(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """If two threads open a publisher for the same address at the same time, exactly one of them raises."""
     both = threading.Barrier(2)
 
@@ -463,7 +540,9 @@ def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> No
     """An invalid topic, vehicle, instance or mode raises ValueError immediately, instead of subscribing to nothing."""
     with pytest.raises(nedbus.AddressError, match="vehicle_local_positon"):
         client.subscribe("vehicle_local_positon")
-    with pytest.raises(nedbus.ArgumentError, match="mode 'newest' is not valid: expected one of latest, ev") as error:
+    with pytest.raises(
+        nedbus.ArgumentError, match="mode 'newest' is not valid: expected one of latest, ev"
+    ) as error:
         client.subscribe("*", mode=cast("Mode", "newest"))
     assert isinstance(error.value, ValueError)
     assert isinstance(error.value, nedbus.NedbusError)
@@ -487,7 +566,10 @@ def test_several_vehicles_are_selected_by_a_list(client: nedbus.Bus) -> None:
 
 def test_prefixes_separate_fleets(endpoint: str) -> None:
     """Fleets with different prefixes on one router do not see each other."""
-    with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
+    with (
+        nedbus.connect(endpoint, prefix="fleet/a") as one,
+        nedbus.connect(endpoint, prefix="fleet/b") as two,
+    ):
         publish(one.publisher(VLP, vehicle="1"), 1)
         assert [sample.vehicle for sample in one.latest("*")] == ["1"]
         assert list(one.vehicles()) == ["1"]
@@ -534,7 +616,10 @@ def test_async_reader_yields_to_other_tasks(endpoint: str, bus: nedbus.Bus) -> N
                 turns += 1
                 await asyncio.sleep(0)
 
-        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        async with (
+            nedbus.connect_async(endpoint) as other,
+            other.subscribe(VLP, mode="every") as subscription,
+        ):
             await asyncio.to_thread(wait_for_subscriber, publisher)
             publish(publisher, *range(1, 1001))
             counter = asyncio.create_task(count_turns())
@@ -556,7 +641,10 @@ def test_async_receive_timeout_loses_no_sample(endpoint: str, bus: nedbus.Bus) -
 
     async def scenario() -> list[int]:
         taken: list[int] = []
-        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        async with (
+            nedbus.connect_async(endpoint) as other,
+            other.subscribe(VLP, mode="every") as subscription,
+        ):
             taken.append((await subscription.receive(DEADLINE)).message.timestamp)
             publish(publisher, *range(2, 641))
             while taken[-1] != 640:
@@ -592,8 +680,12 @@ def test_threads_reading_one_subscription_share_its_messages(bus: nedbus.Bus, mo
     assert len(taken) == len(set(taken)) == subscription.counts.received
 
 
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))])
-def test_sample_can_be_copied_pickled_and_hashed(bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]) -> None:
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))]
+)
+def test_sample_can_be_copied_pickled_and_hashed(
+    bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]
+) -> None:
     """A copied or pickled sample equals the original, has the same hash, and keeps its exact time of sending."""
     bus.publisher(VLP, vehicle="1", source="test").publish(message(1, x=math.nan))
     sample = bus.subscribe().receive(DEADLINE)

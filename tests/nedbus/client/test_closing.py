@@ -83,7 +83,9 @@ def test_ctrl_c_at_any_step_of_a_read_releases_all_locks(
             for step in range(1, _STEPS):
                 steps = iter(range(step))
 
-                def interrupt(_: object, event: str, __: object, steps: Iterator[int] = steps) -> None:
+                def interrupt(
+                    _: object, event: str, __: object, steps: Iterator[int] = steps
+                ) -> None:
                     if event in ("call", "c_return") and next(steps, None) is None:
                         raise KeyboardInterrupt
 
@@ -115,7 +117,9 @@ def test_cancelled_connect_leaves_no_thread() -> None:
     async def scenario() -> None:
         asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
         with pytest.raises(TimeoutError):
-            await asyncio.wait_for(nedbus.connect_async(free_endpoint(), timeout=None).__aenter__(), 0.1)
+            await asyncio.wait_for(
+                nedbus.connect_async(free_endpoint(), timeout=None).__aenter__(), 0.1
+            )
         while len(asyncio.all_tasks()) > 1:
             await asyncio.sleep(0.01)
         gc.collect()
@@ -143,14 +147,18 @@ def test_bus_that_opens_while_it_is_cancelled_is_closed() -> None:
         with suppress(asyncio.CancelledError):
             await entering
         may_open.set()
-        await asyncio.to_thread(wait_for, lambda: opened and opened[0].closed, what="the closed bus")
+        await asyncio.to_thread(
+            wait_for, lambda: opened and opened[0].closed, what="the closed bus"
+        )
 
     with open_router(listen=[endpoint]):
         asyncio.run(scenario())
 
 
 @pytest.mark.parametrize("is_open", [False, True], ids=["before it is open", "after it is open"])
-def test_cancelled_publisher_frees_its_address(endpoint: str, monkeypatch: pytest.MonkeyPatch, is_open: bool) -> None:
+def test_cancelled_publisher_frees_its_address(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, is_open: bool
+) -> None:
     """A cancelled `await bus.publisher(...)` closes the publisher, opened before or after the cancellation."""
     is_opening, may_open, is_returned = threading.Event(), threading.Event(), threading.Event()
     original = nedbus.Bus.publisher
@@ -184,7 +192,9 @@ def test_cancelled_publisher_frees_its_address(endpoint: str, monkeypatch: pytes
     asyncio.run(scenario())
 
 
-def test_connect_uses_first_answering_endpoint_or_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connect_uses_first_answering_endpoint_or_environment(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`connect` uses the first endpoint that answers; a script without an endpoint uses NEDBUS_CONNECT."""
     with nedbus.connect([free_endpoint(), endpoint]) as bus:
         assert bus.connected
@@ -259,7 +269,9 @@ def test_failed_session_raises_in_iteration(
         closer = threading.Thread(target=bus._zenoh.close)
         closer.start()
         for _ in range(2):
-            with pytest.raises(nedbus.ReceiveError, match=r"its Zenoh session was closed.*subscribe again"):
+            with pytest.raises(
+                nedbus.ReceiveError, match=r"its Zenoh session was closed.*subscribe again"
+            ):
                 list(forms(subscription))
         closer.join()
         subscription.close()
@@ -284,7 +296,9 @@ def test_failed_session_raises_in_asyncio(endpoint: str) -> None:
     asyncio.run(scenario())
 
 
-def test_failed_pump_raises_in_iteration(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_pump_raises_in_iteration(
+    client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An unexpected error in the pump thread raises ReceiveError, with the text of the error, in the reading thread."""
 
     def fail(*_: object) -> None:
@@ -333,7 +347,13 @@ def test_calls_on_a_closed_bus_raise(client: nedbus.Bus) -> None:
     assert list(islice(subscription, 1)) == []
     with pytest.raises(nedbus.ClosedError):
         publisher.publish(message())
-    for call in (client.latest, client.vehicles, client.services, lambda: client.connected, client.subscribe):
+    for call in (
+        client.latest,
+        client.vehicles,
+        client.services,
+        lambda: client.connected,
+        client.subscribe,
+    ):
         with pytest.raises(nedbus.ClosedError):
             call()
 
@@ -342,13 +362,18 @@ def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
     """A bus closes once neither the bus nor any of its publishers and subscriptions is referenced."""
     unreferenced = nedbus.connect(endpoint)
     reference = weakref.ref(unreferenced)
-    publisher, subscription = unreferenced.publisher(VLP, vehicle="1"), unreferenced.subscribe(mode="every")
+    publisher, subscription = (
+        unreferenced.publisher(VLP, vehicle="1"),
+        unreferenced.subscribe(mode="every"),
+    )
     publish(publisher, 1)
     assert subscription.receive(DEADLINE).message.timestamp == 1
     del unreferenced, subscription
     gc.collect()
     publish(publisher, 2)
-    wait_for(lambda: [sample.message.timestamp for sample in bus.latest()] == [2], what="the message")
+    wait_for(
+        lambda: [sample.message.timestamp for sample in bus.latest()] == [2], what="the message"
+    )
     del publisher
     gc.collect()
     assert reference() is None
@@ -374,10 +399,14 @@ def test_garbage_collection_closes_on_the_closer_thread() -> None:
     assert closed != [threading.current_thread()]
 
 
-def test_ctrl_c_ends_a_query_without_a_reply(start: Start, endpoint: str, zenoh_session: Session) -> None:
+def test_ctrl_c_ends_a_query_without_a_reply(
+    start: Start, endpoint: str, zenoh_session: Session
+) -> None:
     """Ctrl-C ends the wait for a queryable that never replies."""
     queries: list[zenoh.Query] = []
-    code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
+    code = (
+        'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
+    )
     with answer_queries(zenoh_session, "nedbus/**", queries.append):
         process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
         wait_for(lambda: queries, what="the query")
@@ -385,7 +414,9 @@ def test_ctrl_c_ends_a_query_without_a_reply(start: Start, endpoint: str, zenoh_
         assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_ctrl_c_during_thread_start_is_raised(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_during_thread_start_is_raised(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ctrl-C during the start of the pump thread is raised, and `close` waits for the thread, which starts anyway."""
     start, late = threading.Thread.start, list[threading.Thread]()
 

@@ -18,6 +18,12 @@ def test_opening_and_closing_publishers_does_not_deadlock(start: Start) -> None:
     """
     options = ["--seconds", "15", "--restart", "6", "--busy", "0", "--limit", "5"]
     process = start(
-        "-m", "tests.stress", *options, "--port", str(free_port()), coverage=False, PYTHONPATH=":".join(sys.path)
+        "-m",
+        "tests.stress",
+        *options,
+        "--port",
+        str(free_port()),
+        coverage=False,
+        PYTHONPATH=":".join(sys.path),
     )
     assert process.wait(110.0) == 0, process.out + process.err

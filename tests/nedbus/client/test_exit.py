@@ -16,7 +16,8 @@ from tests.flights.messages import VLP, message
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, Stopwatch, repeating, wait_for
 
-LIMIT = 5.0  # s that the main thread sleeps after its last line; a blocked close of Zenoh takes 10 s
+# s that the main thread sleeps after its last line; a blocked close of Zenoh takes 10 s
+LIMIT = 5.0
 
 PREAMBLE = """
 import sys, threading, time
@@ -47,14 +48,17 @@ SCRIPTS = {
     "raises": PREAMBLE + 'print("end", flush=True); raise RuntimeError("on purpose")',
     "exits": PREAMBLE + 'print("end", flush=True); sys.exit(3)',
     "never reads": PREAMBLE + "time.sleep(1.0); " + END,
-    "reads in a thread": PREAMBLE + "threading.Thread(target=lambda: list(subscription), daemon=True).start(); " + END,
+    "reads in a thread": PREAMBLE
+    + "threading.Thread(target=lambda: list(subscription), daemon=True).start(); "
+    + END,
     "has a pump thread": PREAMBLE + "subscription.receive(5.0); " + END,
     "queries and closes nothing": PREAMBLE + 'bus.latest("*"); bus.vehicles(); ' + END,
     "async closes nothing": ASYNC.replace("END", "pass"),
     "async raises": ASYNC.replace("END", 'raise RuntimeError("on purpose")'),
 }
 CODES = {"raises": 1, "async raises": 1, "exits": 3}
-MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]  # "every" starts all threads of "latest", and more
+# "every" starts all threads of "latest", and more
+MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]
 
 
 @pytest.fixture
@@ -69,7 +73,9 @@ def flood(endpoint: str, bus: nedbus.Bus) -> Iterator[str]:
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_script_without_close_exits(start: Start, flood: str, script: str, mode: str) -> None:
     """A bus that is never closed, blocking or asyncio, does not delay process exit, however full its queues are."""
-    process = start("-c", SCRIPTS[script].replace("MODE", repr(mode)), NEDBUS_CONNECT=flood, coverage=False)
+    process = start(
+        "-c", SCRIPTS[script].replace("MODE", repr(mode)), NEDBUS_CONNECT=flood, coverage=False
+    )
     wait_for(lambda: "end" in process.out, what=f"the script to reach its end: {process.err}")
     with Stopwatch(process.popen.pid) as watch:
         assert process.wait() == CODES.get(script, 0), process.err
@@ -104,14 +110,19 @@ for sample in subscription:
 
 @pytest.mark.parametrize("timeout", [600, None])
 @pytest.mark.parametrize(
-    "how", ["nedbus.connect(timeout=T)", "asyncio.run(nedbus.connect_async(timeout=T).__aenter__())"]
+    "how",
+    ["nedbus.connect(timeout=T)", "asyncio.run(nedbus.connect_async(timeout=T).__aenter__())"],
 )
-def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, timeout: float | None) -> None:
+def test_signal_ends_a_script_that_waits_for_a_router(
+    start: Start, how: str, timeout: float | None
+) -> None:
     """Ctrl-C ends the wait for a router that does not answer."""
     code = f"import asyncio, nedbus; T = {timeout}; {how}"
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(DEADLINE)
-        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{server.getsockname()[1]}", coverage=False)
+        process = start(
+            "-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{server.getsockname()[1]}", coverage=False
+        )
         server.accept()[0].close()  # the script is connecting
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
@@ -132,7 +143,9 @@ asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{server.getsockname()[1]}", tim
     assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_vehicle_of_a_killed_script_disappears(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_vehicle_of_a_killed_script_disappears(
+    start: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """The vehicle of a script that ends by SIGKILL, without closing anything, disappears from the list."""
     code = """
 import nedbus, time
@@ -146,7 +159,9 @@ time.sleep(600)
     wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to disappear")
 
 
-def test_close_waits_for_threads_inside_zenoh(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_close_waits_for_threads_inside_zenoh(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`close` waits for threads inside Zenoh, because one that returns during interpreter exit aborts the process."""
     joined: list[str] = []
     join = threading.Thread.join

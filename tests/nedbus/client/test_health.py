@@ -22,13 +22,21 @@ Fields = Mapping[str, object]
 
 
 def stream_at(
-    *times: float, boot: float = 0.0, every: float = 0.01, latency: float | None = None, fields: Fields = VALID
+    *times: float,
+    boot: float = 0.0,
+    every: float = 0.01,
+    latency: float | None = None,
+    fields: Fields = VALID,
 ) -> StreamHealth:
     """Return a stream with these arrival times [s]; PX4's timestamps start at `boot` [s]."""
     stream = StreamHealth(VLP)
     for index, arrival in enumerate(times):
         seconds = boot + index * every
-        stream.add(message(round(seconds * 1e6), **fields), received=round(arrival * SECOND), latency=latency)
+        stream.add(
+            message(round(seconds * 1e6), **fields),
+            received=round(arrival * SECOND),
+            latency=latency,
+        )
     return stream
 
 
@@ -59,7 +67,12 @@ def test_health_does_not_depend_on_when_it_is_read() -> None:
     for number in range(500):
         for stream in often, once:
             latency = number % 7 / 100
-            stream.add(message(number * 8000), received=number * SECOND // 125, latency=latency, lost=number % 3)
+            stream.add(
+                message(number * 8000),
+                received=number * SECOND // 125,
+                latency=latency,
+                lost=number % 3,
+            )
         assert len(once._waiting) <= 32
         if number in (4, 5):
             assert often.usual_interval == pytest.approx(None if number == 4 else 0.008)
@@ -125,7 +138,9 @@ def test_silent_stream_has_age_but_no_rate() -> None:
         ("battery_status", 2.0, "slow"),
     ],
 )
-def test_on_change_stream_is_stale_only_below_its_minimum_rate(topic: str, silence: float, state: str) -> None:
+def test_on_change_stream_is_stale_only_below_its_minimum_rate(
+    topic: str, silence: float, state: str
+) -> None:
     """A stream published on change is slow or stale only below its minimum rate, and never has gaps.
 
     Streams of messages other than positions have neither flags nor resets.
@@ -185,7 +200,11 @@ def test_missing_reset_counters_do_not_count_as_zero() -> None:
             fields: dict[str, object] = {"timestamp": index * 10_000}
             if missing:
                 values = dict.fromkeys(missing, count)
-                stream.add(message(index * 10_000, **values), received=0, missing=missing if count == 0 else ())
+                stream.add(
+                    message(index * 10_000, **values),
+                    received=0,
+                    missing=missing if count == 0 else (),
+                )
             else:
                 fields |= {"xy_reset_counter": count, "z_reset_counter": count} if count else {}
                 stream.add(fields, received=0)
@@ -226,13 +245,19 @@ def test_flag_shares_are_fractions_of_messages() -> None:
         stream.add(message(index * 10_000, **fields), received=index * SECOND // 100)
     health = stream.snapshot(4 * SECOND)
     assert health.flags == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 1.0}
-    assert health.flags_ever == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 0.5, "dead_reckoning": 0.5}
+    assert health.flags_ever == {
+        **dict.fromkeys(DOUBT_FLAGS, 0.0),
+        "xy_valid": 0.5,
+        "dead_reckoning": 0.5,
+    }
 
 
 def test_flag_share_ignores_messages_without_the_flag() -> None:
     """The share of a flag is computed over the messages whose source provides the flag."""
     stream = StreamHealth(VLP)
-    stream.add(message(1, x=0.0, y=0.0, xy_valid=True), received=0, missing={"z_valid", "dead_reckoning"})
+    stream.add(
+        message(1, x=0.0, y=0.0, xy_valid=True), received=0, missing={"z_valid", "dead_reckoning"}
+    )
     stream.add({"timestamp": 2, "xy_valid": False}, received=1)
     assert stream.snapshot(1).flags == {"xy_valid": 0.5, "v_xy_valid": 0.0, "v_z_valid": 0.0}
 
@@ -261,7 +286,9 @@ def test_usual_rate_reveals_a_slow_stream() -> None:
 def test_stale_timeout_is_longer_for_slow_streams() -> None:
     """A stream is stale after 3 s without a message, or after three usual intervals if that is longer."""
     assert stream_at(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
-    assert stream_at(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(15.0)
+    assert stream_at(*(index * 5.0 for index in range(10))).snapshot(
+        0
+    ).stale_after == pytest.approx(15.0)
 
 
 def test_rare_topic_without_nominal_rate_is_never_stale() -> None:
@@ -269,7 +296,9 @@ def test_rare_topic_without_nominal_rate_is_never_stale() -> None:
     for period, expected in ((0.01, 3.0), (5.0, math.inf)):
         stream = StreamHealth("vehicle_command")
         for index in range(300):
-            stream.add(message(round(index * period * 1e6)), received=round(index * period * SECOND))
+            stream.add(
+                message(round(index * period * 1e6)), received=round(index * period * SECOND)
+            )
         assert stream.snapshot(0).stale_after == expected
     assert StreamHealth("vehicle_command").snapshot(0).stale_after == math.inf
 
@@ -284,7 +313,11 @@ def custom_stream(*times: float) -> StreamHealth:
 
 def test_topic_sent_on_change_is_neither_stale_nor_has_gaps() -> None:
     """Without a nominal rate, irregular intervals mean publishing on change, whatever the mean rate is."""
-    bursts = [burst * 10.0 + index * step for burst in range(5) for index, step in enumerate((0.0, 0.06, 0.25, 0.5))]
+    bursts = [
+        burst * 10.0 + index * step
+        for burst in range(5)
+        for index, step in enumerate((0.0, 0.06, 0.25, 0.5))
+    ]
     health = custom_stream(*sorted(bursts)).snapshot(100 * SECOND)
     assert health.on_change
     assert health.stale_after == math.inf
@@ -295,7 +328,11 @@ def test_topic_sent_on_change_is_neither_stale_nor_has_gaps() -> None:
 def test_periodic_topic_without_nominal_rate_is_stale_despite_a_few_gaps() -> None:
     """At 5 Hz, silence of 20 s is stale, also if two of the last intervals were gaps, which are counted."""
     times = [index * 0.2 for index in range(50)]
-    times = [seconds for seconds in times if seconds not in {times[index] for index in (40, 41, 42, 45, 46, 47)}]
+    times = [
+        seconds
+        for seconds in times
+        if seconds not in {times[index] for index in (40, 41, 42, 45, 46, 47)}
+    ]
     health = custom_stream(*times).snapshot(round((times[-1] + 20) * SECOND))
     assert (health.on_change, health.gaps) == (False, 2)
     assert str(stream_state(health, publishers=1)) == "stale: nothing for 20.0 s"
@@ -314,7 +351,9 @@ def test_description_mentions_a_reboot_for_a_minute() -> None:
     stream = stream_at(*(index / 100 for index in range(300)), boot=100.0)
     for index in range(7000):
         seconds = 3 + index / 100
-        stream.add(message(round((1 + index / 100) * 1e6), **VALID), received=round(seconds * SECOND))
+        stream.add(
+            message(round((1 + index / 100) * 1e6), **VALID), received=round(seconds * SECOND)
+        )
         if index == 1000:
             early = stream.snapshot(round(seconds * SECOND))
     later = stream.snapshot(73 * SECOND)
@@ -334,15 +373,22 @@ def test_on_change_topics_of_a_real_flight_are_never_stale() -> None:
             stream = streams.setdefault(sample.topic, StreamHealth(sample.topic))
             end = sample.message.timestamp * 1000
             stream.add(sample.message, received=end)
-    states = {topic: stream_state(stream.snapshot(end + 30 * SECOND)).name for topic, stream in streams.items()}
+    states = {
+        topic: stream_state(stream.snapshot(end + 30 * SECOND)).name
+        for topic, stream in streams.items()
+    }
     assert states == {"event": "ok", "vehicle_command_ack": "ok", "vehicle_magnetometer": "stale"}
 
 
 def test_stream_has_the_worst_state_that_applies() -> None:
     """The state of a stream is the worst one that applies; each state except "ok" has a reason."""
     second = [index / 100 for index in range(300)]
-    fresh, late = (stream_at(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
-    stream = stream_at(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
+    fresh, late = (
+        stream_at(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4)
+    )
+    stream = stream_at(
+        *(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15))
+    )
     silent, longer = (stream.snapshot(seconds * SECOND) for seconds in (40, 3 * 3600))
     cases: tuple[tuple[Health, dict[str, Any], str], ...] = (
         (fresh, {}, "ok"),
@@ -359,15 +405,22 @@ def test_stream_has_the_worst_state_that_applies() -> None:
     for health, options, text in cases:
         assert str(stream_state(health, **options)) == text
     assert str(stream_state(stream.snapshot(33 * SECOND))).startswith("slow: 5.0 Hz, usually ")
-    assert stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
+    assert (
+        stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
+    )
 
 
 def test_description_lists_state_flags_and_faults() -> None:
     """A description lists state, invalid flags, gaps, out-of-order messages and reboots; without faults it is "ok"."""
     health = stream_at(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
-    doubtful = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
-    assert describe_stream(doubtful, stream_state(doubtful)) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"
+    doubtful = stream_at(
+        0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}
+    ).snapshot(4 * SECOND)
+    assert (
+        describe_stream(doubtful, stream_state(doubtful))
+        == "stale: nothing for 4.0 s, xy invalid, 2 reboots"
+    )
     mixed = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0).snapshot(SECOND // 10)
     assert "reboots" not in describe_stream(mixed, stream_state(mixed, publishers=2)), (
         "two publishers look like reboots"

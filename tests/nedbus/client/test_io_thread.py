@@ -178,7 +178,9 @@ def test_failed_call_does_not_stop_the_thread(caplog: pytest.LogCaptureFixture) 
     thread.put(done.set)
     assert done.wait(DEADLINE)
     logged = [record for record in caplog.records if record.levelno >= logging.WARNING]
-    assert [record.getMessage() for record in logged] == ["unexpected error in thread nedbus-test (logged once)"]
+    assert [record.getMessage() for record in logged] == [
+        "unexpected error in thread nedbus-test (logged once)"
+    ]
 
 
 def test_queryable_replies_after_a_panic(bus: nedbus.Bus, zenoh_session: Session) -> None:

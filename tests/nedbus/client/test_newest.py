@@ -62,7 +62,9 @@ def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: 
 
 
 @pytest.mark.parametrize("step", [3600, -3600])
-def test_age_ignores_a_wall_clock_step_before_reading(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+def test_age_ignores_a_wall_clock_step_before_reading(
+    monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
     """A message that waits while the wall clock is set has its real age, not that of the message before it."""
     now = utc = 10_000 * SECOND
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
@@ -93,13 +95,20 @@ def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_number_of_monitored_streams_is_bounded() -> None:
     """In a flood of keys, the monitor keeps the 10,000 most recently updated streams, including an active one."""
     monitor, real = Monitor(), sample("real")
-    flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(10_900)]
+    flood = [
+        dataclasses.replace(real, address=Address(f"flood-{number}", VLP))
+        for number in range(10_900)
+    ]
     for number, each in enumerate(flood):
         monitor.add(each)
         if number % 10 == 0:
             monitor.add(real)
     streams = monitor.snapshot()
-    assert (len(streams), streams[real.address].messages, monitor.evicted) == (MAX_KEYS, 1090, 10_901 - MAX_KEYS)
+    assert (len(streams), streams[real.address].messages, monitor.evicted) == (
+        MAX_KEYS,
+        1090,
+        10_901 - MAX_KEYS,
+    )
     assert flood[1 - MAX_KEYS].address in streams
     assert flood[-MAX_KEYS].address not in streams
     monitor.forget(real.address)
@@ -119,7 +128,9 @@ def test_retained_sample_is_shown_until_a_live_one() -> None:
     """Its age is the time since it was sent, infinite without a time; it replaces older retained messages only."""
     monitor, now = Monitor(), time.time_ns()
     retained = [
-        dataclasses.replace(sample("1", number), retained=True, _sent=None if age is None else now - age * SECOND)
+        dataclasses.replace(
+            sample("1", number), retained=True, _sent=None if age is None else now - age * SECOND
+        )
         for number, age in enumerate((None, 60, 90, 50, 2))
     ]
     shown = []
@@ -150,7 +161,10 @@ def test_stream_is_selected_by_address_class_or_topic() -> None:
     assert monitor.get(VehicleAttitude) is None
     monitor.add(sample("2", 2))
     for several in (VLP, nedbus.VehicleLocalPosition):
-        with pytest.raises(ArgumentError, match=f"has several streams: expected an address, such as 1/{VLP}, 2/{VLP}"):
+        with pytest.raises(
+            ArgumentError,
+            match=f"has several streams: expected an address, such as 1/{VLP}, 2/{VLP}",
+        ):
             monitor.get(several)
     assert [(str(address), each.message.timestamp) for address, each in monitor.items()] == [
         (f"1/{VLP}", 1),
@@ -177,7 +191,11 @@ def test_stream_is_selected_by_address_class_or_topic() -> None:
     ],
 )
 def test_stream_is_alive_unless_disconnected_gone_or_stale(
-    monkeypatch: pytest.MonkeyPatch, topic: str, silence: float, network: tuple[bool, int | None], alive: bool
+    monkeypatch: pytest.MonkeyPatch,
+    topic: str,
+    silence: float,
+    network: tuple[bool, int | None],
+    alive: bool,
 ) -> None:
     """The rule is that of `stream_state`, after the first second; None publishers: their list is incomplete."""
     (connected, publishers), now, start = network, 0, time.time_ns()
@@ -213,7 +231,9 @@ def test_network_is_asked_once_per_second_at_most() -> None:
     assert all(each.alive for each in monitor.values())
     assert not asked
     for vehicle in range(100):
-        monitor.add(dataclasses.replace(sample(f"old-{vehicle}"), received=0, retained=True, _sent=0))
+        monitor.add(
+            dataclasses.replace(sample(f"old-{vehicle}"), received=0, retained=True, _sent=0)
+        )
     begin = time.monotonic()
     assert sum(each.alive for each in monitor.values()) == 100
     assert len(asked) <= 1 + time.monotonic() - begin
@@ -273,7 +293,10 @@ def test_update_lists_a_stream_once(bus: nedbus.Bus, monkeypatch: pytest.MonkeyP
         inbox = SimpleNamespace(ended=False, waiting=2, pop=lambda: arrived.pop(0))
         monkeypatch.setattr(view, "_inbox", inbox)
         news = view._read(waited)
-        assert [(each.sample.vehicle, each.message.timestamp) for each in news] == [("1", 6), ("2", 7)]
+        assert [(each.sample.vehicle, each.message.timestamp) for each in news] == [
+            ("1", 6),
+            ("2", 7),
+        ]
 
 
 def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: nedbus.Bus) -> None:
@@ -288,7 +311,11 @@ def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: n
         with client.newest(VehicleAttitude, "sensor_gps", vehicle=1) as view:
             assert [each.sample.topic for each in view.update(DEADLINE)] == ["vehicle_attitude"]
             retained = view[VehicleAttitude]
-            assert (retained.message, retained.sample.retained, retained.updated) == (ATTITUDE, True, True)
+            assert (retained.message, retained.sample.retained, retained.updated) == (
+                ATTITUDE,
+                True,
+                True,
+            )
             assert retained.alive
             assert view.update() == []
             assert not retained.updated
@@ -297,14 +324,21 @@ def test_loop_reads_the_newest_message_of_each_stream(client: nedbus.Bus, bus: n
                 wait_for_subscriber(publisher)
             for number in range(100):
                 gps.publish(SensorGps(timestamp=1000 + number))
-            wait_for(lambda: view.update() and view["sensor_gps"].message.timestamp == 1099, what="the last message")
+            wait_for(
+                lambda: view.update() and view["sensor_gps"].message.timestamp == 1099,
+                what="the last message",
+            )
             assert view["sensor_gps"].updated
             assert view["sensor_gps"].age < DEADLINE
             assert view["sensor_gps"].health.messages == view.counts.received - 1
             assert not retained.updated
-            assert {str(each) for each, _ in view.items()} == {"1/vehicle_attitude", "1/sensor_gps/0"}
+            assert {str(each) for each, _ in view.items()} == {
+                "1/vehicle_attitude",
+                "1/sensor_gps/0",
+            }
             with pytest.raises(
-                ArgumentError, match=f"'{VLP}' is not valid: expected one of this view: sensor_gps, veh"
+                ArgumentError,
+                match=f"'{VLP}' is not valid: expected one of this view: sensor_gps, veh",
             ):
                 view.get(VLP)
             assert view.update(0.001) == []
@@ -322,14 +356,19 @@ def test_invalid_arguments_raise_at_once(client: nedbus.Bus, bus: nedbus.Bus) ->
             client.newest(wrong)  # type: ignore[arg-type] # neither a class nor a topic
     with pytest.raises(ArgumentError, match="max_rate 0"):
         client.newest(max_rate=0)
-    with bus.publisher(VLP, vehicle=1) as publisher, client.newest(*(f"none_{each}" for each in range(7)), VLP) as view:
+    with (
+        bus.publisher(VLP, vehicle=1) as publisher,
+        client.newest(*(f"none_{each}" for each in range(7)), VLP) as view,
+    ):
         publish(publisher, 1)
         wait_for(lambda: view.update(0.1), what="the message")
         assert view.get("none_3") is None
         assert view[VLP].message.timestamp == 1
 
 
-def test_more_streams_than_the_limit_in_one_update(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_streams_than_the_limit_in_one_update(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`update` returns every message that it has read, although the least recently updated streams are evicted."""
     monkeypatch.setattr("nedbus.client.newest.MAX_KEYS", 3)
     publishers = [bus.publisher(VLP, vehicle=number) for number in range(5)]
@@ -358,7 +397,9 @@ def test_invalid_message_does_not_replace_a_valid_one(bus: nedbus.Bus, client: n
         assert (view[VLP].message.timestamp, view.counts.invalid) == (1, 1)
 
 
-def test_stream_of_another_process_is_gone_with_it(client: nedbus.Bus, endpoint: str, start: Start) -> None:
+def test_stream_of_another_process_is_gone_with_it(
+    client: nedbus.Bus, endpoint: str, start: Start
+) -> None:
     """A position is alive while its publisher's process sends, and no longer when the process has been killed."""
     process = start("-c", PUBLISHING, endpoint, coverage=False)
     with client.newest(vehicle=1) as view:

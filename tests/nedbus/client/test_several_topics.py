@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 import nedbus
-from nedbus import Counts, Mode, SensorGps, VehicleAttitude
-from nedbus.client.receiving import unread
+from nedbus import Counts, Mode, SensorGps, VehicleAttitude, limits
 from nedbus.errors import AddressError, ArgumentError
 from nedbus.transport import open_router
 from tests.flights.messages import VLP, message
@@ -44,7 +43,9 @@ def test_several_topics_are_received_in_one_loop(
 
 
 @pytest.mark.parametrize("max_rate", [None, 5])
-def test_several_vehicles_are_received_in_one_loop(bus: nedbus.Bus, endpoint: str, max_rate: float | None) -> None:
+def test_several_vehicles_are_received_in_one_loop(
+    bus: nedbus.Bus, endpoint: str, max_rate: float | None
+) -> None:
     """`vehicle=["a", "b"]` selects both vehicles and no other, in subscriptions, views and queries."""
     for vehicle in ("a", "b", "c"):
         bus.publisher(VLP, vehicle=vehicle).publish(message(1))
@@ -88,7 +89,10 @@ def test_asyncio_reads_several_topics(bus: nedbus.Bus, endpoint: str) -> None:
     bus.publisher(VLP, vehicle=1).publish(message(1))
 
     async def scenario() -> set[str]:
-        async with nedbus.connect_async(endpoint) as reader, reader.subscribe(VehicleAttitude, VLP) as subscription:
+        async with (
+            nedbus.connect_async(endpoint) as reader,
+            reader.subscribe(VehicleAttitude, VLP) as subscription,
+        ):
             return {(await subscription.receive(DEADLINE)).topic for _ in range(2)}
 
     assert asyncio.run(scenario()) == {"vehicle_attitude", VLP}
@@ -103,7 +107,15 @@ def test_all_topics_include_the_others(client: nedbus.Bus) -> None:
 
 def test_one_unknown_topic_of_eight_raises(client: nedbus.Bus) -> None:
     """A subscription to eight topics, one of which does not exist, raises and names it."""
-    topics = ["vehicle_attitude", VLP, "sensor_gps", "actuator_motors", "home_position", "vehicle_status", "cpuload"]
+    topics = [
+        "vehicle_attitude",
+        VLP,
+        "sensor_gps",
+        "actuator_motors",
+        "home_position",
+        "vehicle_status",
+        "cpuload",
+    ]
     with pytest.raises(AddressError, match="No Topic"):
         client.subscribe(*topics, "No Topic")
 
@@ -127,11 +139,16 @@ def test_limit_below_one_message_raises(client: nedbus.Bus, count: Any) -> None:
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
-def test_unread_messages_beyond_the_limit_are_dropped(mode: Mode, caplog: pytest.LogCaptureFixture) -> None:
+def test_unread_messages_beyond_the_limit_are_dropped(
+    mode: Mode, caplog: pytest.LogCaptureFixture
+) -> None:
     """Beyond `limit` unread messages, the oldest are dropped and counted; a warning gives the reason once."""
     inbox = make_queue(mode, limit=1)
     put(inbox, [raw(0), raw(0, key=OTHER_KEY, publisher="b")])
-    reason = {"latest": "more keys than the limit of 1 have an unread message", "every": "slower than the data"}[mode]
+    reason = {
+        "latest": "more keys than the limit of 1 have an unread message",
+        "every": "slower than the data",
+    }[mode]
     assert [reason in text for text in caplog.messages] == [True]
     assert [sample.vehicle for sample in drain(inbox)] == ["2"]
     assert inbox.counts == Counts(received=1, dropped=1)
@@ -140,7 +157,7 @@ def test_unread_messages_beyond_the_limit_are_dropped(mode: Mode, caplog: pytest
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_bytes_of_unread_messages_are_bounded(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond a number of bytes, the oldest unread messages are dropped and counted; reading makes room again."""
-    monkeypatch.setattr(unread, "MAX_UNREAD_BYTES", 3 * len(VALID))
+    monkeypatch.setattr(limits, "UNREAD_BYTES", 3 * len(VALID))
     inbox = make_queue(mode)
     for _ in range(2):
         put(inbox, [raw(None, key=f"nedbus/{vehicle}/{VLP}") for vehicle in "12345"])
@@ -154,7 +171,10 @@ def test_batches_have_at_most_max_messages(mode: Mode) -> None:
     """`max_messages` limits a batch in both modes; the rest follows in order."""
     inbox = make_queue(mode)
     put(inbox, [raw(None, key=f"nedbus/{vehicle}/{VLP}") for vehicle in "12345"])
-    read = [[each.vehicle for each in batch.addresses] for batch in iter(lambda: inbox.pop_batch(2), None)]
+    read = [
+        [each.vehicle for each in batch.addresses]
+        for batch in iter(lambda: inbox.pop_batch(2), None)
+    ]
     assert read == [["1", "2"], ["3", "4"], ["5"]]
 
 
@@ -203,9 +223,13 @@ def test_changes_of_the_link_are_reported() -> None:
         async with nedbus.connect_async(endpoint) as bus:
             bus.on_link(in_loop.append)
             await asyncio.to_thread(first.close)
-            await asyncio.to_thread(wait_for, lambda: in_loop == [False], what="the loss of the link")
+            await asyncio.to_thread(
+                wait_for, lambda: in_loop == [False], what="the loss of the link"
+            )
             with open_router(listen=[endpoint]):
-                await asyncio.to_thread(wait_for, lambda: in_loop == changes == [False, True], what="the link")
+                await asyncio.to_thread(
+                    wait_for, lambda: in_loop == changes == [False, True], what="the link"
+                )
 
     first = open_router(listen=[endpoint])
     with nedbus.connect(endpoint) as bus:

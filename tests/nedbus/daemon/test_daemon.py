@@ -84,7 +84,9 @@ def real_logs() -> list[Path]:
 def test_plain_zenoh_reader_receives_every_message(run_nedbus: Start, endpoint: str) -> None:
     """A reader in any language, with Zenoh, msgpack and the documented keys, receives each message as an array."""
     path = next(log for log in real_logs() if "1.13" in log.name)
-    config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
+    config = zenoh.Config.from_json5(
+        json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}})
+    )
     with zenoh.open(config) as session:
         subscriber = session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(2000))
         source = f"ulog:{path}?speed=max&wait=1&topics=VehicleLocalPosition"
@@ -94,12 +96,16 @@ def test_plain_zenoh_reader_receives_every_message(run_nedbus: Start, endpoint: 
     encodings = {str(sample.encoding) for sample in samples}
     missing = FIELD_TYPES.keys() - {*LAYOUTS["1.13"].fields, "hagl_max_z", "hagl_max_xy"}
     assert {encoding.split(";source=")[0] for encoding in encodings} == {ENCODING}
-    assert {provenance_of(encoding) for encoding in encodings} == {Provenance("ulog", frozenset(missing))}
+    assert {provenance_of(encoding) for encoding in encodings} == {
+        Provenance("ulog", frozenset(missing))
+    }
     received: dict[str, list[list[str]]] = {}
     for sample in samples:
         layout, *values = msgpack.unpackb(sample.payload.to_bytes(), use_list=False)
         assert (layout, len(values)) == (1, 53)
-        received.setdefault(str(sample.key_expr).removeprefix("nedbus/"), []).append([repr(value) for value in values])
+        received.setdefault(str(sample.key_expr).removeprefix("nedbus/"), []).append(
+            [repr(value) for value in values]
+        )
     assert received == expected_rows(path)
 
 
@@ -136,7 +142,9 @@ def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serv
                 last_while_running = number if service.popen.poll() is None else last_while_running
             sample = subscription.receive(DEADLINE)
             assert (sample.message.x, sample.lost) == (number, 0)
-    assert last_while_running > total - 10_000, "only messages in the reader's process may be unread at exit"
+    assert last_while_running > total - 10_000, (
+        "only messages in the reader's process may be unread at exit"
+    )
     assert service.wait() == 0
 
 
@@ -176,8 +184,12 @@ def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: st
     log = write_log(tmp_path / "a.ulg", [0, 1000])
     for name in written.values():
         Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)).write_bytes(log.read_bytes())
-    texts = [f"--source=ulog:{tmp_path}/{text}vehicle={number}" for number, text in enumerate(written)]
-    _, bus = serve(*texts, fresh=locale == "C", LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    texts = [
+        f"--source=ulog:{tmp_path}/{text}vehicle={number}" for number, text in enumerate(written)
+    ]
+    _, bus = serve(
+        *texts, fresh=locale == "C", LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0"
+    )
     for number in range(len(texts)):
         wait_for(has_state(bus, "done", number), what=texts[number])
         status = source_of(bus, number)
@@ -193,7 +205,11 @@ def test_ended_replay_loops_or_retains_its_last_message(tmp_path: Path, serve: S
     assert [sample.message.x for sample in bus.latest(vehicle="2")] == [9.0]
     assert bus.subscribe(vehicle="2").receive(DEADLINE).message.x == 9.0
     with bus.subscribe(vehicle="1", mode="every") as subscription:
-        assert [subscription.receive(DEADLINE).message.x for _ in range(25)] == [*range(10), *range(10), *range(5)]
+        assert [subscription.receive(DEADLINE).message.x for _ in range(25)] == [
+            *range(10),
+            *range(10),
+            *range(5),
+        ]
 
 
 def test_invalid_message_is_rejected_counted_and_reported(
@@ -206,12 +222,16 @@ def test_invalid_message_is_rejected_counted_and_reported(
         broken = number in {3, 4}
         writer.add(VLP, message(number), z_valid=int(broken), z=math.nan if broken else 1.0)
     path = writer.write(tmp_path / "a.ulg")
-    listener = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.RingChannel(10))
+    listener = zenoh_session.declare_subscriber(
+        "nedbus/@rejected/**", zenoh.handlers.RingChannel(10)
+    )
     service = run_nedbus("serve", "-c", endpoint, "-s", f"ulog:{path}?wait=1")
     with bus.subscribe(VLP, mode="every") as subscription:
         received = [subscription.receive(DEADLINE).message.timestamp for _ in range(8)]
     assert received == [0, 1, 2, 5, 6, 7, 8, 9]
-    report, _ = [json.loads(sample.payload.to_bytes()) for sample in receive_samples(listener.handler, 2)]
+    report, _ = [
+        json.loads(sample.payload.to_bytes()) for sample in receive_samples(listener.handler, 2)
+    ]
     assert "z: must be finite while z_valid is true" in report["reason"]
     assert (report["fields"]["timestamp"], report["fields"]["z"]) == (3, "NaN")
     assert source_of(bus).rejected == 2
@@ -241,10 +261,17 @@ def test_until_done_exits_with_1_after_a_failure(tmp_path: Path, run_nedbus: Sta
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_signal_stops_the_service(tmp_path: Path, serve: Serve, number: signal.Signals, code: int) -> None:
+def test_signal_stops_the_service(
+    tmp_path: Path, serve: Serve, number: signal.Signals, code: int
+) -> None:
     """SIGTERM and SIGINT stop the service in any state of its sources, without a traceback or lost messages."""
     path = write_log(tmp_path / "a.ulg", range(0, 10_000_000, 10_000))
-    sources = ("sim:", f"ulog:{path}?vehicle=2", f"ulog:{path}?vehicle=3&speed=max&loop=1", "ulog:/nowhere.ulg")
+    sources = (
+        "sim:",
+        f"ulog:{path}?vehicle=2",
+        f"ulog:{path}?vehicle=3&speed=max&loop=1",
+        "ulog:/nowhere.ulg",
+    )
     service, bus = serve(*(f"--source={source}" for source in sources), coverage=False)
     for index, state in enumerate(("running", "running", "running", "retrying")):
         wait_for(has_state(bus, state, index), what=sources[index])
@@ -273,7 +300,9 @@ def test_signal_stops_a_replay_blocked_by_a_stuck_reader(tmp_path: Path, serve: 
 def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -> None:
     """With --connect a service waits for its router, reconnects after a router crash, and stops on a signal."""
     endpoint = free_endpoint()
-    interrupted, service = (run_nedbus("serve", "--connect", endpoint, "-s", "sim:") for _ in range(2))
+    interrupted, service = (
+        run_nedbus("serve", "--connect", endpoint, "-s", "sim:") for _ in range(2)
+    )
     wait_for(lambda: "connecting to" in interrupted.err, what="the service to wait")
     interrupted.signal(signal.SIGTERM)
     assert interrupted.wait() == 0
@@ -289,13 +318,17 @@ def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -
         while (samples[-1].sent or 0) < recovered:
             samples.append(subscription.receive(DEADLINE))
         first = samples[0].message.timestamp
-        assert [each.message.timestamp for each in samples] == [first + 10_000 * step for step in range(len(samples))]
+        assert [each.message.timestamp for each in samples] == [
+            first + 10_000 * step for step in range(len(samples))
+        ]
         assert subscription.counts.lost == 0
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
 
 
-def test_client_service_logs_the_origin_of_connect(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+def test_client_service_logs_the_origin_of_connect(
+    run_nedbus: Start, endpoint: str, tmp_path: Path
+) -> None:
     """A service that is a client because of NEDBUS_CONNECT or a file logs this, and how to run a router instead."""
     hint = "use --listen to run a router instead"
     file, here = tmp_path / "some.toml", free_endpoint()
@@ -305,12 +338,19 @@ def test_client_service_logs_the_origin_of_connect(run_nedbus: Start, endpoint: 
         text: run_nedbus("serve", "-s", "ulog:/gone.ulg", *flags, **environment)
         for flags, environment, text in (
             ((), variable, f"connecting to a router at {endpoint}, set by NEDBUS_CONNECT; {hint}"),
-            (("--config", str(file)), {}, f"connecting to a router at {endpoint}, set by {file}; {hint}"),
+            (
+                ("--config", str(file)),
+                {},
+                f"connecting to a router at {endpoint}, set by {file}; {hint}",
+            ),
             (("--connect", endpoint), {}, f"connecting to a router at {endpoint}\n"),
             (("--listen", here), variable, f"router on {here}, joining {endpoint}"),
         )
     }
-    wait_for(lambda: all(text in service.err for text, service in services.items()), what=f"all of {[*services]}")
+    wait_for(
+        lambda: all(text in service.err for text, service in services.items()),
+        what=f"all of {[*services]}",
+    )
 
 
 def test_uplink_state_of_a_router_is_logged(caplog: pytest.LogCaptureFixture) -> None:
@@ -359,7 +399,9 @@ def test_uplink_state_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) ->
         wait_for(lambda: has_logged("lost: reconnecting"), what="the loss")
         now = 12.0
         router = open_router(listen=(here,))
-        wait_for(lambda: has_logged("lost: reconnecting", "up after 12 s"), what="the link to recover")
+        wait_for(
+            lambda: has_logged("lost: reconnecting", "up after 12 s"), what="the link to recover"
+        )
     router.close()
 
 
@@ -388,7 +430,9 @@ def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -
     """If the port is in use, the error states the endpoint, the reason and two remedies."""
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:")
     assert service.wait() == 1
-    remedy = "choose another endpoint with --listen, or join the router that runs there with --connect"
+    remedy = (
+        "choose another endpoint with --listen, or join the router that runs there with --connect"
+    )
     reason = f"nedbus: cannot listen on {endpoint} (address already in use)"
     assert service.err.strip().splitlines()[-1] == f"{reason}: {remedy}"
 
@@ -396,12 +440,18 @@ def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ("", "source: no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"),
+        (
+            "",
+            "source: no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK",
+        ),
         ("-s foo:x", "source 'foo:x': unknown kind 'foo'; choose from sim, ulog"),
         ("-s a/b.ulg", "write ulog:a/b.ulg"),
         ("-s ulg:a/b.ulg", "unknown kind 'ulg'; write ulog:a/b.ulg"),
         ("-s ulog:", "source 'ulog:': the target is missing or not allowed; write ulog:FILE"),
-        ("-s sim:x", "source 'sim:x': the target is missing or not allowed; write sim:?OPTION=VALUE"),
+        (
+            "-s sim:x",
+            "source 'sim:x': the target is missing or not allowed; write sim:?OPTION=VALUE",
+        ),
         ("-s sim:?sed=1", "source 'sim:?sed=1': unknown option 'sed'"),
         ("-s sim:?seed=1&seed=2", "an option occurs twice; remove one"),
         ("-s sim:?speed=0", "speed=0 is invalid; expected a factor from 0.001"),
@@ -432,8 +482,12 @@ def test_service_reads_its_settings_file(tmp_path: Path, run_nedbus: Start) -> N
     """Sources, endpoint and prefix come from the file; flags override the environment, which overrides the file."""
     endpoint = free_endpoint()
     file = tmp_path / "nedbus.toml"
-    file.write_text('source = ["sim:"]\nlisten = ["tcp/127.0.0.1:1"]\nprefix = "fleet"\nvehicle = 7\n')
-    run_nedbus("serve", "--config", str(file), "--vehicle", "9", NEDBUS_LISTEN=endpoint, NEDBUS_VEHICLE="8")
+    file.write_text(
+        'source = ["sim:"]\nlisten = ["tcp/127.0.0.1:1"]\nprefix = "fleet"\nvehicle = 7\n'
+    )
+    run_nedbus(
+        "serve", "--config", str(file), "--vehicle", "9", NEDBUS_LISTEN=endpoint, NEDBUS_VEHICLE="8"
+    )
     with connect(endpoint, prefix="fleet") as bus:
         wait_for(lambda: list(bus.vehicles()) == ["9"], what="vehicle 9")
 
@@ -446,12 +500,20 @@ def test_router_accepts_a_zenohd_file(tmp_path: Path, run_nedbus: Start, command
     file.write_text(f"{{ mode: 'router', listen: {{ endpoints: ['{near}'] }}, // a comment\n}}")
     run_nedbus(*command.split(), str(file))
     with connect(near) as writer:
-        router = run_nedbus(*command.replace("sim:", "sim:?vehicle=2").split(), str(file), "-l", far, "-c", near)
+        router = run_nedbus(
+            *command.replace("sim:", "sim:?vehicle=2").split(), str(file), "-l", far, "-c", near
+        )
         with connect(far) as reader:
             writer.publisher(VLP, vehicle="7").publish(message(1))
             vehicles = {"7", *(["1", "2"] if "sim:" in command else [])}
-            wait_for(lambda: {sample.vehicle for sample in reader.latest()} == vehicles, what="second router")
-            wait_for(lambda: {sample.vehicle for sample in writer.latest()} == vehicles, what="first router")
+            wait_for(
+                lambda: {sample.vehicle for sample in reader.latest()} == vehicles,
+                what="second router",
+            )
+            wait_for(
+                lambda: {sample.vehicle for sample in writer.latest()} == vehicles,
+                what="first router",
+            )
     wait_for(lambda: f"joined {near}" in router.err, what="the link")
 
 
@@ -460,16 +522,34 @@ def query_json(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
     return [json.loads(reply.ok.payload.to_bytes()) for reply in zenoh_session.get(key) if reply.ok]
 
 
-def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, zenoh_session: Session, endpoint: str) -> None:
+def test_plain_zenoh_can_query_status_and_messages(
+    run_nedbus: Start, zenoh_session: Session, endpoint: str
+) -> None:
     """A plain Zenoh client can query service status, schemas, and the last message of each key, with timestamp."""
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?topics=VehicleLocalPosition")
     status_key = "nedbus/@service/*/*/status"
     wait_for(
-        lambda: [s for each in query_json(zenoh_session, status_key) for s in each["sources"] if s["published"]],
+        lambda: [
+            s
+            for each in query_json(zenoh_session, status_key)
+            for s in each["sources"]
+            if s["published"]
+        ],
         what="messages",
     )
     [status] = query_json(zenoh_session, status_key)
-    names = {"service", "vehicle", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"}
+    names = {
+        "service",
+        "vehicle",
+        "host",
+        "version",
+        "started",
+        "now",
+        "role",
+        "endpoints",
+        "refused",
+        "sources",
+    }
     assert set(status) == names
     assert (status["role"], status["endpoints"]) == ("client", [endpoint])
     [source] = status["sources"]
@@ -499,7 +579,9 @@ def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, zenoh_sess
     assert str(reply.ok.key_expr) == "nedbus/1/estimator_local_position/1"
 
 
-def test_duplicate_vehicle_is_logged_and_reported(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_duplicate_vehicle_is_logged_and_reported(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """If two services publish one vehicle, both log it once, and every command reports it until one of them stops."""
     none = run_command("health", "-c", endpoint)
     assert none.exit_code == 1
@@ -510,20 +592,29 @@ def test_duplicate_vehicle_is_logged_and_reported(run_nedbus: Start, endpoint: s
     assert healthy.exit_code == 0, healthy.err
     assert healthy.out.startswith("1 service, 1 source, ")
     second = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    warning = "vehicle 1 is also published by another process: stop one, or give it another --vehicle"
+    warning = (
+        "vehicle 1 is also published by another process: stop one, or give it another --vehicle"
+    )
     for service in (first, second):
         wait_for(partial(lambda each: warning in each.err, service), what="the warning")
     assert bus.publishers()[Address("1", VLP)] == 2
     unhealthy = run_command("health", NEDBUS_CONNECT=endpoint)
     assert unhealthy.exit_code == 1
-    assert "vehicle 1 has several publishers: stop one, or give it another vehicle id" in unhealthy.err
+    assert (
+        "vehicle 1 has several publishers: stop one, or give it another vehicle id" in unhealthy.err
+    )
     measured = run_command("hz", "--duration", "2", "--json", VLP, NEDBUS_CONNECT=endpoint)
     assert '"state": "duplicate", "reason": "2 publishers: ' in measured.out
     assert f"1/{VLP}" in (listed := run_command("list", NEDBUS_CONNECT=endpoint).out)
     assert "duplicate: 2 publishers" in listed
-    wait_for(lambda: [each.vehicles["1"].kinds[0] for each in bus.accounts()] == ["duplicate"] * 2, what="accounts")
+    wait_for(
+        lambda: [each.vehicles["1"].kinds[0] for each in bus.accounts()] == ["duplicate"] * 2,
+        what="accounts",
+    )
     explained = run_command("why", NEDBUS_CONNECT=endpoint).out
-    assert explained.startswith(f"1: several publishers of {VLP}"), "once, though both services report it"
+    assert explained.startswith(f"1: several publishers of {VLP}"), (
+        "once, though both services report it"
+    )
     assert "\n1: " not in explained
     assert "2 publishers of this address" in run_command("doctor", NEDBUS_CONNECT=endpoint).out
     second.signal(signal.SIGTERM)

@@ -65,11 +65,14 @@ def write_recording(path: Path) -> None:
             second = number / RATE
             logged = [start + round(second * 1e9)]
             for vehicle in VEHICLES:
-                booted = 17.0 if vehicle == "delta" and second >= 17.0 else -100.0  # s after the start of the recording
+                # s after the start of the recording
+                booted = 17.0 if vehicle == "delta" and second >= 17.0 else -100.0
                 stamp = round((second - booted) * 1e6) + 1_000_000
                 if vehicle == "alpha":
                     has_fix = not 3.0 <= second < 8.0
-                    message = gps.model(timestamp=stamp, fix_type=3 * has_fix, satellites_used=12 * has_fix)
+                    message = gps.model(
+                        timestamp=stamp, fix_type=3 * has_fix, satellites_used=12 * has_fix
+                    )
                     address = Address(vehicle, GPS)
                     writer.write(
                         arrays_of(gps).of([message]),
@@ -85,7 +88,11 @@ def write_recording(path: Path) -> None:
                 if vehicle == "echo" and 19.0 <= second < 19.3:
                     array["x"] = float("nan")  # invalid, because xy_valid is true
                 writer.write(
-                    array, position, [(Address(vehicle, VLP), Provenance("sim"))], logged=logged, published=logged
+                    array,
+                    position,
+                    [(Address(vehicle, VLP), Provenance("sim"))],
+                    logged=logged,
+                    published=logged,
                 )
 
 
@@ -96,7 +103,9 @@ def events_of(process: Process) -> list[tuple[str, str, str]]:
 
 def wait_for_event(process: Process, vehicle: str, kind: str, change: str) -> None:
     wait_for(
-        lambda: (vehicle, kind, change) in events_of(process), what=f"{vehicle} {kind} {change}", seconds=PAGE_TIMEOUT
+        lambda: (vehicle, kind, change) in events_of(process),
+        what=f"{vehicle} {kind} {change}",
+        seconds=PAGE_TIMEOUT,
     )
 
 
@@ -110,7 +119,9 @@ def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: i
         process.signal(signal.SIGCONT)
 
 
-def test_each_event_is_reported_once_and_in_order(run_nedbus: Start, browser: Browser, tmp_path: Path) -> None:
+def test_each_event_is_reported_once_and_in_order(
+    run_nedbus: Start, browser: Browser, tmp_path: Path
+) -> None:
     """`nedbus events` and the page report each event of a replayed recording once and in order.
 
     One vehicle loses GPS, one resets its estimate, one is silent, one reboots, and one sends invalid messages. Then the
@@ -151,10 +162,16 @@ def test_each_event_is_reported_once_and_in_order(run_nedbus: Start, browser: Br
             wait_for_event(events, *OVERLOAD[1])
         assert events_of(events) == [*EXPECTED, *LINK_LOSS, *OVERLOAD]
         shown = [each for each in (*EXPECTED, *LINK_LOSS, *OVERLOAD) if each[2] != "end"]
-        wait_for(lambda: len(page.rows("vehicle")) >= len(shown), what="all events on the page", seconds=PAGE_TIMEOUT)
+        wait_for(
+            lambda: len(page.rows("vehicle")) >= len(shown),
+            what="all events on the page",
+            seconds=PAGE_TIMEOUT,
+        )
         marks = sorted(page.rows("vehicle"), key=lambda mark: mark["time"])
         assert [mark["vehicle"] for mark in marks] == [vehicle for vehicle, *_ in shown]
-    health = run_command("health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES))
+    health = run_command(
+        "health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES)
+    )
     assert health.exit_code == 1
     faults = [line.partition(": ")[2] for line in health.err.splitlines()]
     assert [fault.partition(":")[0].removeprefix("vehicle ") for fault in faults[:-1]] == [

@@ -42,16 +42,25 @@ SLOW = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE,
 
 def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
     """Return the status of the only log stream; None before it exists."""
-    return next((log for each in bus.services() for source in each.sources for log in source.log_streams), None)
+    return next(
+        (log for each in bus.services() for source in each.sources for log in source.log_streams),
+        None,
+    )
 
 
 @pytest.mark.process
 def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path: Path) -> None:
     """A subscriber receives the complete stream; `info`, /metrics and the saved log agree on the totals."""
-    link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), HttpClient(free_port())
+    link, endpoint, pages = (
+        f"mavlink:udpin:127.0.0.1:{free_port()}",
+        free_endpoint(),
+        HttpClient(free_port()),
+    )
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
-    service = start_with_timings(start, SLOW, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
+    service = start_with_timings(
+        start, SLOW, "serve", "--listen", endpoint, "--http", pages.where, "--source", source
+    )
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,
@@ -59,14 +68,27 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
     ):
         wait_for(peer.finished.is_set, what="the end of the recording")
         total = sum(len(each.data) for each in peer.recording.header) + sum(
-            len(each.content.data) for each in peer.recording.entries if not isinstance(each.content, bytes)
+            len(each.content.data)
+            for each in peer.recording.entries
+            if not isinstance(each.content, bytes)
         )
-        wait_for(lambda: (log := log_stream(bus)) and log.received == total, what=f"the stream: {service.err}")
+        wait_for(
+            lambda: (log := log_stream(bus)) and log.received == total,
+            what=f"the stream: {service.err}",
+        )
         status: Any = log_stream(bus)
-        assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0)
+        assert (status.state, status.gaps, status.lost, status.undecodable) == (
+            "streaming",
+            0,
+            0,
+            0,
+        )
         assert status.header_time > 0.25  # one round trip of 4 ms for each of 125 messages
         run_until_shown("ULog stream of vehicle 1: streaming", "info", "--connect", endpoint)
-        wait_for(lambda: pages.values("nedbus_log_stream_bytes_total", vehicle="1") == [total], what="the metrics")
+        wait_for(
+            lambda: pages.values("nedbus_log_stream_bytes_total", vehicle="1") == [total],
+            what="the metrics",
+        )
         assert pages.values("nedbus_log_stream_active", vehicle="1") == [1]
         assert pages.values("nedbus_log_stream_messages_lost_total", vehicle="1") == [0]
         assert pages.values("nedbus_log_stream_unsaved_bytes_total", vehicle="1") == [0]
@@ -81,23 +103,33 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
         assert service.wait() == 0, service.err
         assert [each for each in peer.commands if each in (START, STOP)][-1] == STOP
     with nedbus.open(saved) as flight:
-        assert {address.topic for address in flight.addresses} >= {"vehicle_local_position", "event"}
+        assert {address.topic for address in flight.addresses} >= {
+            "vehicle_local_position",
+            "event",
+        }
 
 
 @pytest.mark.process
 def test_refused_log_stream_is_reported(run_nedbus: Start) -> None:
     """If another client has the stream, `info`, `doctor` and the log report it; positions come from MAVLink instead."""
     endpoint, port = free_endpoint(), free_port()
-    service = run_nedbus("serve", "--listen", endpoint, "--source", f"mavlink:udpin:127.0.0.1:{port}?log=1")
+    service = run_nedbus(
+        "serve", "--listen", endpoint, "--source", f"mavlink:udpin:127.0.0.1:{port}?log=1"
+    )
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,
         Px4LogStream(read_recording(SHORT), port, refusal=1),
     ):
-        wait_for(lambda: (log := log_stream(bus)) and log.state == "refused", what=f"the refusal: {service.err}")
+        wait_for(
+            lambda: (log := log_stream(bus)) and log.state == "refused",
+            what=f"the refusal: {service.err}",
+        )
         run_until_shown("another client already receives it", "info", "--connect", endpoint)
         doctor = run_until_shown("no ULog stream", "doctor", "--connect", endpoint, "--json")
-        findings = [each for each in json.loads(doctor.out)["findings"] if "no ULog stream" in each["seen"]]
+        findings = [
+            each for each in json.loads(doctor.out)["findings"] if "no ULog stream" in each["seen"]
+        ]
         assert findings, doctor.out
         assert findings[0]["state"] == "warning"
         assert next(iter(positions)).source == "mavlink"
@@ -134,7 +166,9 @@ class Flight1:
         for record in parser.feed(b"".join(self.sent[each].data for each in sorted(self.sent))):
             if isinstance(record, Data) and record.subscription.name == "vehicle_local_position":
                 fields: Any = record.subscription.layout.decode(record.payload)
-                found[fields["timestamp"]] = tuple(fields[name] for name in ("x", "y", "z", "vx", "vy", "vz"))
+                found[fields["timestamp"]] = tuple(
+                    fields[name] for name in ("x", "y", "z", "vx", "vy", "vz")
+                )
         return found
 
     def _on_send(self, frame: bytes) -> None:
@@ -146,7 +180,10 @@ recorded_flight = [
     pytest.mark.slow,
     pytest.mark.process,
     pytest.mark.logs,
-    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
+    pytest.mark.skipif(
+        not STREAMS.exists(),
+        reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist",
+    ),
 ]
 
 
@@ -176,9 +213,13 @@ class TestRestartInFlight:
             service = flight.serve()
             wait_for(lambda: ": listening" in service.err, what="the restarted service")
             ready = max(flight.positions())
-            while (last := sum(each.message.timestamp <= restart for each in received)) > len(received) - 200:
+            while (last := sum(each.message.timestamp <= restart for each in received)) > len(
+                received
+            ) - 200:
                 received.append(next(streamed))
-            wait_for(lambda: (log := log_stream(bus)) and log.gaps, what=f"the status: {service.err}")
+            wait_for(
+                lambda: (log := log_stream(bus)) and log.gaps, what=f"the status: {service.err}"
+            )
             status = log_stream(bus)
             assert status
             assert [each for each in flight.peer.commands if each in (START, STOP)] == [START]
@@ -204,7 +245,9 @@ class TestRestartInFlight:
         assert not any(each.file_corruption for each in saved)
         assert [len(each.dropouts) for each in saved] == [0, 1]
 
-    def test_stream_without_saved_definitions_is_reported(self, start: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    def test_stream_without_saved_definitions_is_reported(
+        self, start: Start, endpoint: str, bus: nedbus.Bus
+    ) -> None:
         """Without the state file, the stream of a killed process is rejected with the remedy, and left alone."""
         flight = Flight1(start, endpoint, "log=1&state=0")
         with bus.subscribe(vehicle="1", mode="every") as positions, flight.peer:
@@ -226,7 +269,10 @@ class TestRestartInFlight:
             flight.kill_service_in_flight(positions)
             flight.peer.change_owner((255, 190))
             service = flight.serve()
-            wait_for(lambda: "system 255 component 190 already receives it" in service.err, what="the owner")
+            wait_for(
+                lambda: "system 255 component 190 already receives it" in service.err,
+                what="the owner",
+            )
             assert set(flight.peer.commands) & {START, STOP} == {START}
             wait_for(lambda: (log := log_stream(bus)) and log.state == "refused", what="the status")
             log = log_stream(bus)

@@ -28,10 +28,16 @@ class FakeOutput:
         self.reports = list[dict[str, object]]()
         self.event_log = EventLog()
         registry = SimpleNamespace(
-            publisher=self._open, publishers={}, reject=lambda _, report: self.reports.append(report)
+            publisher=self._open,
+            publishers={},
+            reject=lambda _, report: self.reports.append(report),
         )
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.event_log
+            "px4",
+            "px4-zenoh:",
+            cast("PublisherRegistry", registry),
+            lambda: self.now,
+            self.event_log,
         )
 
     def receive(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:
@@ -51,7 +57,11 @@ class FakeOutput:
             self.published.append((address, codec_of(definition).decode(payload).timestamp))
 
         return SimpleNamespace(
-            definition=definition, publish_encoded=publish, close=lambda: None, relabel=lambda _: None, source=""
+            definition=definition,
+            publish_encoded=publish,
+            close=lambda: None,
+            relabel=lambda _: None,
+            source="",
         )
 
 
@@ -115,7 +125,9 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, *present, OTHER)
     assert OTHER not in fake.output.addresses
     assert fake.output.rejections == {"too many addresses": 2}
-    assert fake.output.warnings == (f"further addresses: the limit is 1000, and {OTHER} is the first one ignored",)
+    assert fake.output.warnings == (
+        f"further addresses: the limit is 1000, and {OTHER} is the first one ignored",
+    )
     fake.receive(4, *present[1:])
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses
@@ -134,7 +146,9 @@ def test_addresses_of_a_replay_are_limited() -> None:
     for address in (last, last, POSITION):
         fake.output.publish_replay(SourceMessage(0.0, address, {"timestamp": 1}), lossless=True)
     assert fake.output.rejections == {"too many addresses": 3}
-    assert fake.output.warnings == (f"further addresses: the limit is 10000, and {last} is the first one ignored",)
+    assert fake.output.warnings == (
+        f"further addresses: the limit is 10000, and {last} is the first one ignored",
+    )
 
 
 def test_text_of_a_rejection_is_limited(caplog: pytest.LogCaptureFixture) -> None:
@@ -148,14 +162,22 @@ def test_text_of_a_rejection_is_limited(caplog: pytest.LogCaptureFixture) -> Non
     assert [event.text for event in fake.event_log.events] == [f"{VLP} rejected: {reason}"]
 
 
-def test_number_of_rules_and_of_logged_invalid_messages_is_limited(caplog: pytest.LogCaptureFixture) -> None:
+def test_number_of_rules_and_of_logged_invalid_messages_is_limited(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Invalid messages are counted by rule, from the 51st rule on as "other", and the first five are logged."""
     fake = FakeOutput()
     for number in range(60):
         rule = f"field{number}", "must be finite"
-        fake.failure = nedbus.InvalidMessageError(": ".join(rule), [rule], message="VehicleLocalPosition")
+        fake.failure = nedbus.InvalidMessageError(
+            ": ".join(rule), [rule], message="VehicleLocalPosition"
+        )
         fake.receive(0, POSITION)
-    assert (fake.output.rejected, len(fake.output.rejections), fake.output.rejections["other"]) == (60, 51, 10)
+    assert (fake.output.rejected, len(fake.output.rejections), fake.output.rejections["other"]) == (
+        60,
+        51,
+        10,
+    )
     assert [number for number in range(60) if f"field{number}:" in caplog.text] == [0, 1, 2, 3, 4]
 
 

@@ -25,13 +25,23 @@ from tests.waits import wait_for
 def test_overload_is_reported(run_nedbus: Start, bus: nedbus.Bus, endpoint: str) -> None:
     """After 0.8 s in which the process did not run, each command and page reports an overload."""
     port, pages = free_port(), HttpClient(free_port())
-    service = run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
+    service = run_nedbus(
+        "serve",
+        "--connect",
+        endpoint,
+        "--http",
+        pages.where,
+        "-s",
+        f"mavlink:udpin:127.0.0.1:{port}",
+    )
     encoder = dialect.MAVLink(None, 9, 1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
 
         def send() -> None:
             with suppress(ConnectionError):  # before the service listens
-                message = dialect.MAVLink_local_position_ned_message(round(time.monotonic() * 1e3) % 2**31, *range(6))
+                message = dialect.MAVLink_local_position_ned_message(
+                    round(time.monotonic() * 1e3) % 2**31, *range(6)
+                )
                 vehicle.sendto(message.pack(encoder), ("127.0.0.1", port))
             encoder.seq = (encoder.seq + 1) % 256
 
@@ -66,7 +76,9 @@ def test_overload_is_reported(run_nedbus: Start, bus: nedbus.Bus, endpoint: str)
             result = run_command(*arguments, "-c", endpoint)
             return text in result.out + result.err
 
-        wait_for_report(lambda: "host overloaded: messages up to" in source_status(bus).overload, "the status")
+        wait_for_report(
+            lambda: "host overloaded: messages up to" in source_status(bus).overload, "the status"
+        )
         wait_for_report(lambda: "host overloaded" in pages.request("/readyz")[1], "the readiness")
         wait_for_report(lambda: pages.values("nedbus_source_overloaded") == [1], "the metric")
         assert pages.values("nedbus_source_dropped_total") == [0]

@@ -35,11 +35,18 @@ def reload(service: Process, count: int) -> str:
 
 def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path: Path) -> None:
     """Ten vehicles lose no message during ten reloads that add and remove an eleventh."""
-    endpoint, file, vehicles = free_endpoint(), tmp_path / "fleet.toml", [str(number) for number in range(10)]
+    endpoint, file, vehicles = (
+        free_endpoint(),
+        tmp_path / "fleet.toml",
+        [str(number) for number in range(10)],
+    )
     write_settings(file, vehicles)
     service = run_nedbus("serve", "--listen", endpoint, "--config", str(file))
     wait_for(lambda: service.err.count("seed 0") == len(vehicles), what="the vehicles")
-    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(VLP, mode="every") as subscription:
+    with (
+        nedbus.connect(endpoint, timeout=DEADLINE) as bus,
+        bus.subscribe(VLP, mode="every") as subscription,
+    ):
         times: dict[str, list[int]] = {}
 
         def receive_until(vehicle: str) -> None:
@@ -118,7 +125,10 @@ def test_reload_during_startup_is_applied(tmp_path: Path) -> None:
     """A service that is still waiting for its router starts with the latest settings."""
     daemon = Daemon(load_settings(connect=(free_endpoint(),), source=("sim:",)), version="test")
     assert (
-        daemon.reload(load_settings(connect=daemon.endpoints, source=("sim:?vehicle=2",))) == "no source is running yet"
+        daemon.reload(load_settings(connect=daemon.endpoints, source=("sim:?vehicle=2",)))
+        == "no source is running yet"
     )
-    with pytest.raises(ConfigError, match=r"connect cannot be changed by a reload: restart the service"):
+    with pytest.raises(
+        ConfigError, match=r"connect cannot be changed by a reload: restart the service"
+    ):
         daemon.reload(load_settings(connect=(free_endpoint(),), source=("sim:",)))

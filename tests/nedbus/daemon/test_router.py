@@ -14,7 +14,9 @@ from tests.waits import DEADLINE
 
 
 @pytest.mark.router
-def test_router_in_a_program_serves_clients_until_it_is_stopped(caplog: pytest.LogCaptureFixture) -> None:
+def test_router_in_a_program_serves_clients_until_it_is_stopped(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Clients connect to its endpoint, which is logged; `closing` is set before the session is closed."""
     caplog.set_level(logging.INFO)
     endpoint, stop, closing = free_endpoint(), threading.Event(), threading.Event()

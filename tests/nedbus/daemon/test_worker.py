@@ -77,7 +77,9 @@ class FakeRegistry:
             del self.publishers[address]
             self.log.append(f"{self.clock.seconds:g} -{address.vehicle}")
 
-        self.log.append(f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}")
+        self.log.append(
+            f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}"
+        )
         self.publishers[address] = SimpleNamespace(
             publish_encoded=publish,
             close=close,
@@ -114,7 +116,12 @@ class FakeReplay:
         if self.failures:
             raise self.failures.pop(0)
         addresses = {each.address: each.definition for each in self.messages}
-        return ReplayRun(self.run() if self.run else iter(self.messages), addresses, len(self.messages), "a flight")
+        return ReplayRun(
+            self.run() if self.run else iter(self.messages),
+            addresses,
+            len(self.messages),
+            "a flight",
+        )
 
 
 @dataclass
@@ -154,7 +161,10 @@ class Harness:
         self.registry = FakeRegistry(clock)
         self.worker = Worker(
             PlannedSource(
-                0, "ulog:flight.ulg", "1", source.source if isinstance(source, FakeReplay) else cast("Source", source)
+                0,
+                "ulog:flight.ulg",
+                "1",
+                source.source if isinstance(source, FakeReplay) else cast("Source", source),
             ),
             cast("PublisherRegistry", self.registry),
             clock=cast("Clock", clock),
@@ -189,7 +199,13 @@ def test_replay_publishes_each_message_at_its_due_time() -> None:
     harness.worker.run()
     assert harness.times == [0.0, 0.5, 1.5]
     status = harness.status
-    assert (status.state, status.published, status.done, status.total, status.ended) == ("done", 3, 3, 3, True)
+    assert (status.state, status.published, status.done, status.total, status.ended) == (
+        "done",
+        3,
+        3,
+        3,
+        True,
+    )
     assert harness.ends == 1
 
 
@@ -269,9 +285,15 @@ def test_source_retries_or_fails_after_any_exception(
     harness = run(FakeReplay([at(0.0)], [failure] * 9), FakeClock(stop_at=100.0), retry=retry)
     is_expected = isinstance(failure, SourceError)
     text = (reason if is_expected else f"ulog:flight.ulg: {reason}") + "; trying again" * retry
-    errors = [(each.getMessage(), not each.exc_info) for each in caplog.records if each.levelname == "ERROR"]
+    errors = [
+        (each.getMessage(), not each.exc_info)
+        for each in caplog.records
+        if each.levelname == "ERROR"
+    ]
     assert errors == [(text, is_expected)] * (harness.status.retries if retry else 1)
-    assert (harness.status.state, harness.status.ended) == (("retrying", False) if retry else ("failed", True))
+    assert (harness.status.state, harness.status.ended) == (
+        ("retrying", False) if retry else ("failed", True)
+    )
     assert (harness.status.error, harness.ends) == (reason, 1)
 
 
@@ -288,7 +310,10 @@ def test_exception_in_error_handling_fails_the_source() -> None:
 
     harness = Harness(FakeReplay([at(0.0)], run=break_), FakeClock())
     harness.worker.run()
-    assert (harness.status.state, harness.status.error) == ("failed", "unexpected PanicException: poisoned")
+    assert (harness.status.state, harness.status.error) == (
+        "failed",
+        "unexpected PanicException: poisoned",
+    )
     assert harness.ends == 1
 
 
@@ -311,7 +336,9 @@ def test_live_source_is_always_retried() -> None:
     """With --until-done a failed live source, such as a serial port, is still retried; a replay is not."""
     clock = FakeClock(stop_at=100.0)
     harness = run(
-        FakeLive(clock, [at(0.0)], [SourceError("mavlink:/dev/ttyACM0", "the link broke")]), clock, retry=False
+        FakeLive(clock, [at(0.0)], [SourceError("mavlink:/dev/ttyACM0", "the link broke")]),
+        clock,
+        retry=False,
     )
     assert (harness.times, harness.status.state, harness.status.retries) == ([1.0], "done", 1)
 
@@ -330,7 +357,9 @@ def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixtu
     """Invalid messages are counted and reported with reason and fields; only the first five are logged."""
     broken = [at(0.0, z_valid=True), *(at(number, timestamp_sample=10**9) for number in range(7))]
     harness = run(FakeReplay([*broken, at(0.0, z=1.0, z_valid=True)], speed=None))
-    assert list(harness.status.rejections.values()) == [1, 7], "rejections are counted by field and rule, not by value"
+    assert list(harness.status.rejections.values()) == [1, 7], (
+        "rejections are counted by field and rule, not by value"
+    )
     assert (harness.status.published, harness.status.rejected) == (1, 8)
     address, report = harness.registry.rejected[0]
     assert (address, len(harness.registry.rejected)) == (ONE, 8)
@@ -371,7 +400,9 @@ def test_live_source_counts_losses_and_reboots() -> None:
     """The status counts lost messages and vehicle reboots reported by the source."""
     clock = FakeClock(stop_at=100.0)
     reboot = SourceMessage(0.0, ONE, {"timestamp": 0}, 0, True)
-    status = run(FakeLive(clock, [SourceMessage(0.0, ONE, {"timestamp": 1}, lost=4), reboot]), clock).status
+    status = run(
+        FakeLive(clock, [SourceMessage(0.0, ONE, {"timestamp": 1}, lost=4), reboot]), clock
+    ).status
     assert (status.lost, status.reboots, status.streams[0].health.lost) == (4, 1, 4)
 
 
@@ -380,7 +411,11 @@ def test_rejection_warnings_are_bounded(caplog: pytest.LogCaptureFixture) -> Non
     clock = FakeClock(stop_at=100.0)
     script: Script = [Rejection(f"sender {number % 80}", "x" * 1000, ONE) for number in range(200)]
     harness = run(FakeLive(clock, script), clock)
-    assert (harness.status.rejected, len(harness.status.warnings), len(harness.registry.rejected)) == (200, 50, 200)
+    assert (
+        harness.status.rejected,
+        len(harness.status.warnings),
+        len(harness.registry.rejected),
+    ) == (200, 50, 200)
     assert max(map(len, harness.status.warnings)) < 350
     assert sum("rejected" in text for text in caplog.messages) == 50
 
@@ -392,14 +427,18 @@ def test_addresses_of_a_live_source_are_limited(monkeypatch: pytest.MonkeyPatch)
     script: Script = [at(0.0, Address(str(number), VLP)) for number in range(15)]
     status = run(FakeLive(clock, [*script, *script[:10]]), clock).status
     assert (status.published, status.rejected, len(status.addresses)) == (20, 5, 10)
-    ignored = "further addresses: the limit is 10, and 10/vehicle_local_position is the first one ignored"
+    ignored = (
+        "further addresses: the limit is 10, and 10/vehicle_local_position is the first one ignored"
+    )
     assert status.warnings == (ignored,)
 
 
 def test_status_has_100_streams_at_most() -> None:
     """A status has the health of 100 streams at most, because it must fit into one reply; metrics have all of them."""
     clock = FakeClock(stop_at=100.0)
-    harness = run(FakeLive(clock, [at(0.0, Address(str(number), VLP)) for number in range(101)]), clock)
+    harness = run(
+        FakeLive(clock, [at(0.0, Address(str(number), VLP)) for number in range(101)]), clock
+    )
     assert len(harness.status.streams) == 100
     assert len(harness.worker.measures.status.streams) == 101
 

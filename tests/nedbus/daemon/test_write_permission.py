@@ -15,4 +15,7 @@ def test_only_services_with_a_certificate_are_checked() -> None:
     """A service without a client certificate, or without TLS, starts no checks."""
     for tls in (None, SimpleNamespace(certificate=None)):
         settings = cast("Settings", SimpleNamespace(connect=("tls/localhost:1",), tls=tls))
-        assert watch_permission(cast("Session", None), settings, cast("PublisherRegistry", None)) is None
+        assert (
+            watch_permission(cast("Session", None), settings, cast("PublisherRegistry", None))
+            is None
+        )

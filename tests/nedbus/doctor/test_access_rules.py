@@ -13,7 +13,14 @@ from nedbus.doctor import check_router_file
 from nedbus.pki import write_access_rules
 from nedbus.transport import open_client, read_router_config
 from tests.flights.messages import VLP
-from tests.peers.certificates import CONFIG, client_tls, pki, secure_endpoint, tls_options, write_config
+from tests.peers.certificates import (
+    CONFIG,
+    client_tls,
+    pki,
+    secure_endpoint,
+    tls_options,
+    write_config,
+)
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
 from tests.peers.zenohd import start_zenohd
@@ -33,7 +40,9 @@ def mistakes(tmp_path: Path, text: str) -> list[str]:
     """Return the mistakes that `nedbus check --offline` reports of a router's file with this text."""
     file = tmp_path / "router.json5"
     file.write_text(text)
-    return [str(mistake).removeprefix(f"{file}, ") for mistake in check_router_file(file, offline=True)]
+    return [
+        str(mistake).removeprefix(f"{file}, ") for mistake in check_router_file(file, offline=True)
+    ]
 
 
 def test_shipped_rules_have_no_mistakes(tmp_path: Path) -> None:
@@ -45,7 +54,12 @@ def test_shipped_rules_have_no_mistakes(tmp_path: Path) -> None:
     subject, policy = '{ id: "routers",', '{ rules: ["router"],'
     rules = '["vehicle-1-in", "vehicle-2-in", "vehicle-out", "query-in", "query-out"]'
     text = text.replace(subject, f'{{ id: "link", cert_common_names: ["link"] }},\n{subject}')
-    assert mistakes(tmp_path, text.replace(policy, f'{{ rules: {rules}, subjects: ["link"] }},\n{policy}')) == []
+    assert (
+        mistakes(
+            tmp_path, text.replace(policy, f'{{ rules: {rules}, subjects: ["link"] }},\n{policy}')
+        )
+        == []
+    )
 
 
 @pytest.mark.parametrize("renewed", [False, True])
@@ -57,11 +71,17 @@ def test_old_common_rules_are_reported_with_the_remedy(tmp_path: Path, *, renewe
     of_vehicles, of_readers = mistakes(tmp_path, (tmp_path / "router.json5").read_text())
     certificates = "certificates vehicle-1, vehicle-2" if renewed else "certificate vehicle-1"
     assert re.match(
-        rf"line \d+, column \d+: {certificates} may publish a vehicle, but not report about it", of_vehicles
+        rf"line \d+, column \d+: {certificates} may publish a vehicle, but not report about it",
+        of_vehicles,
     )
-    assert re.match(r"line \d+, column \d+: certificates router, router-2, reader and 1 more may read", of_readers)
+    assert re.match(
+        r"line \d+, column \d+: certificates router, router-2, reader and 1 more may read",
+        of_readers,
+    )
     for mistake in (of_vehicles, of_readers):
-        assert "write @service/**/status instead of @service/*/status in the common rules" in mistake
+        assert (
+            "write @service/**/status instead of @service/*/status in the common rules" in mistake
+        )
         assert "run 'nedbus pki rules'" in mistake
 
 
@@ -80,7 +100,9 @@ def test_rule_that_lets_a_vehicle_speak_for_another_is_reported(
 ) -> None:
     """A key that names no vehicle in the rule of a vehicle is a mistake, with the position of its certificate."""
     [mistake] = mistakes(tmp_path, SHIPPED.replace(f'"{own}"', f'"{every}"', 1))
-    line = SHIPPED[: SHIPPED.index('"vehicle-1"', SHIPPED.index("cert_common_names"))].count("\n") + 1
+    line = (
+        SHIPPED[: SHIPPED.index('"vehicle-1"', SHIPPED.index("cert_common_names"))].count("\n") + 1
+    )
     assert mistake.startswith(f"line {line}, column ")
     assert f"certificate vehicle-1 may {verb} every vehicle, not only its own" in mistake
 
@@ -117,12 +139,15 @@ def secure(pki: Path, tmp_path: Path, start: Start) -> tuple[str, Path]:
     endpoint = secure_endpoint()
     file = write_config(pki, tmp_path / "router-secure.json5", endpoint)
     start_zenohd(start, "-c", str(file))
-    open_client([endpoint], tls=client_tls(pki, "reader"), timeout=DEADLINE).close()  # it has read the file
+    # it has read the file
+    open_client([endpoint], tls=client_tls(pki, "reader"), timeout=DEADLINE).close()
     return endpoint, file
 
 
 @pytest.mark.process
-def test_doctor_names_key_certificate_and_rule_of_a_denial(pki: Path, secure: tuple[str, Path]) -> None:
+def test_doctor_names_key_certificate_and_rule_of_a_denial(
+    pki: Path, secure: tuple[str, Path]
+) -> None:
     """With the router's file, the doctor names the key that is denied, the certificate, and the rules without it."""
     endpoint, file = secure
     common = ("doctor", "-c", endpoint, "--rules", str(file))
@@ -132,14 +157,24 @@ def test_doctor_names_key_certificate_and_rule_of_a_denial(pki: Path, secure: tu
         f"warning rules vehicle-1: put on nedbus/2/{VLP} is denied: none of its rules includes this key: vehicle-1-in"
     ) in text
     assert "reply on nedbus/@service/2/1a/status is denied" in text
-    allowed = " ".join(run_command(*common, "--vehicle", "1", *tls_options(pki, "vehicle-1")).out.split())
-    assert f"ok rules vehicle-1: put on nedbus/1/{VLP} is allowed: rule vehicle-1-in allows it" in allowed
+    allowed = " ".join(
+        run_command(*common, "--vehicle", "1", *tls_options(pki, "vehicle-1")).out.split()
+    )
+    assert (
+        f"ok rules vehicle-1: put on nedbus/1/{VLP} is allowed: rule vehicle-1-in allows it"
+        in allowed
+    )
     assert "is denied" not in allowed
-    stranger = " ".join(run_command(*common, "--vehicle", "1", *tls_options(pki, "stranger")).out.split())
+    stranger = " ".join(
+        run_command(*common, "--vehicle", "1", *tls_options(pki, "stranger")).out.split()
+    )
     assert "rules stranger: " in stranger
     assert "is denied: no rule is for such messages of this certificate" in stranger
     reader = " ".join(run_command(*common, *tls_options(pki, "reader")).out.split())
-    assert f"ok rules reader: declare_subscriber on nedbus/*/{VLP} is allowed: rule reader-in allows it" in reader
+    assert (
+        f"ok rules reader: declare_subscriber on nedbus/*/{VLP} is allowed: rule reader-in allows it"
+        in reader
+    )
 
 
 @pytest.mark.process
@@ -175,7 +210,9 @@ def test_decisions_equal_those_of_zenohd(pki: Path, secure: tuple[str, Path]) ->
     keys = [f"nedbus/1/{VLP}", f"nedbus/2/{VLP}", f"nedbus/1/{VLP}/@rate/5", f"nedbus/@rejected/1/{VLP}",
             f"nedbus/@rejected/2/{VLP}", f"nedbus/1/{VLP}/@adv/pub/1a/1/_", "other/1/topic"]  # fmt: skip
     names = ("vehicle-1", "vehicle-2", "reader", "stranger", "router")
-    sessions = {name: open_client([endpoint], tls=client_tls(pki, name), timeout=DEADLINE) for name in names}
+    sessions = {
+        name: open_client([endpoint], tls=client_tls(pki, name), timeout=DEADLINE) for name in names
+    }
     try:
         forwarded = set[tuple[str, str]]()
         receivers = {
@@ -184,7 +221,10 @@ def test_decisions_equal_those_of_zenohd(pki: Path, secure: tuple[str, Path]) ->
             if access.decide("router", "declare_subscriber", "ingress", key).is_allowed
         }
         expected = {
-            (name, key) for name in names for key in receivers if access.decide(name, "put", "ingress", key).is_allowed
+            (name, key)
+            for name in names
+            for key in receivers
+            if access.decide(name, "put", "ingress", key).is_allowed
         }
         assert ("vehicle-1", keys[0]) in expected
         assert ("vehicle-1", keys[1]) not in expected

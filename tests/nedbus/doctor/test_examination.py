@@ -62,7 +62,9 @@ def diagnose(
 def find(findings: list[Finding], check: str, state: State, text: str) -> Finding:
     """Return the matching finding of a check in this state; if there is none, fail and list all findings."""
     for each in findings:
-        if (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen}"):
+        if (each.check, each.state) == (check, state) and re.search(
+            text, f"{each.subject}: {each.seen}"
+        ):
             return each
     pytest.fail(f"no finding {check} {state} {text!r} in\n" + "\n".join(map(str, findings)))
 
@@ -70,7 +72,9 @@ def find(findings: list[Finding], check: str, state: State, text: str) -> Findin
 def diagnose_until(endpoint: str, *texts: str) -> list[Finding]:
     """Run the doctor, doubling the duration until it reports all texts, because a busy machine delays messages."""
     findings, listen = list[Finding](), 0.5
-    while not all(any(re.search(text, f"{each.subject}: {each.seen}") for each in findings) for text in texts):
+    while not all(
+        any(re.search(text, f"{each.subject}: {each.seen}") for each in findings) for text in texts
+    ):
         assert listen < DEADLINE, findings
         findings, listen = diagnose(endpoint, listen=listen), 2 * listen
     return findings
@@ -97,7 +101,12 @@ def publishing(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
 
 @contextmanager
 def service_status(
-    session: Session, name: str = "fake", *, vehicle: str = "1", offset: float = 0.0, **status: object
+    session: Session,
+    name: str = "fake",
+    *,
+    vehicle: str = "1",
+    offset: float = 0.0,
+    **status: object,
 ) -> Iterator[None]:
     """Reply to queries of the status of a vehicle with this status; the service's clock is `offset` seconds ahead."""
     server = QueryServer(session)
@@ -111,14 +120,24 @@ def service_status(
 
 
 def source(**fields: object) -> dict[str, object]:
-    return {"source": "mavlink:x", "state": "running", "addresses": [], "stale": [], "rejected": 0, **fields}
+    return {
+        "source": "mavlink:x",
+        "state": "running",
+        "addresses": [],
+        "stale": [],
+        "rejected": 0,
+        **fields,
+    }
 
 
 def test_unreachable_endpoint_is_wrong_unless_another_router_answers(endpoint: str) -> None:
     """An endpoint that refuses or does not resolve is "wrong", or only a "warning" if another router answers."""
     refused = free_endpoint()
     findings = diagnose(refused, "tcp/no-such-host.invalid:7447", "tcp/a..b:7447")
-    assert "nedbus serve" in find(findings, "endpoint", "wrong", f"{refused}: connection refused").advice
+    assert (
+        "nedbus serve"
+        in find(findings, "endpoint", "wrong", f"{refused}: connection refused").advice
+    )
     find(findings, "endpoint", "wrong", "cannot resolve host name no-such-host")
     find(findings, "endpoint", "wrong", r"cannot resolve host name a\.\.b")
     findings = diagnose(refused, endpoint)
@@ -135,7 +154,12 @@ def test_unexpected_error_in_check_is_a_finding(
         raise ZeroDivisionError("by zero")
 
     monkeypatch.setattr("nedbus.doctor.examination.check_endpoint", fail)
-    failed = find(diagnose(endpoint), "endpoint", "unknown", "check failed: unexpected ZeroDivisionError: by zero")
+    failed = find(
+        diagnose(endpoint),
+        "endpoint",
+        "unknown",
+        "check failed: unexpected ZeroDivisionError: by zero",
+    )
     assert "a bug in nedbus" in failed.advice
     assert f"unexpected error in check endpoint {endpoint}\nTraceback" in caplog.text
 
@@ -149,15 +173,22 @@ def test_server_that_is_not_a_router_is_reported(timings: Timings) -> None:
         http = f"127.0.0.1:{server.server_address[1]}"
         with socket.create_server(("127.0.0.1", 0)) as silent:
             mute = f"127.0.0.1:{silent.getsockname()[1]}"
-            findings = diagnose(*(f"{protocol}/{where}" for protocol in ("tcp", "tls") for where in (http, mute)))
+            findings = diagnose(
+                *(f"{protocol}/{where}" for protocol in ("tcp", "tls") for where in (http, mute))
+            )
         server.shutdown()
         thread.join(DEADLINE)
-    for protocol, reason in (("tcp", "cannot open a Zenoh session"), ("tls", "it does not speak TLS")):
+    for protocol, reason in (
+        ("tcp", "cannot open a Zenoh session"),
+        ("tls", "it does not speak TLS"),
+    ):
         for where in (http, mute):
             find(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
 
 
-def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
+def test_healthy_network_has_no_faults(
+    bus: nedbus.Bus, endpoint: str, zenoh_session: Session
+) -> None:
     """With a publishing vehicle, no finding is "wrong", and each check has a finding "ok"."""
     with publishing(bus), service_status(zenoh_session, sources=[source(addresses=[f"1/{VLP}"])]):
         findings = diagnose(endpoint, vehicle="1", listen=1.0)
@@ -172,8 +203,12 @@ def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
     findings = diagnose(endpoint)
     find(findings, "vehicle", "warning", r"mute/.*silent for \d+ s: no message yet")
-    find(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ m?s old")
-    missing = [each for each in diagnose(endpoint, vehicle="7") if each.seen == "not found under nedbus/"]
+    find(
+        findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ m?s old"
+    )
+    missing = [
+        each for each in diagnose(endpoint, vehicle="7") if each.seen == "not found under nedbus/"
+    ]
     assert [each.advice for each in missing] == [
         "start its source: 'nedbus serve --source ...'; published: asleep, mute"
     ]
@@ -182,7 +217,10 @@ def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str
 @pytest.mark.parametrize(
     ("state", "advice"),
     [
-        ("running", "no source of service fake on elsewhere receives it: check the name, or start its source there"),
+        (
+            "running",
+            "no source of service fake on elsewhere receives it: check the name, or start its source there",
+        ),
         ("waiting", "see the findings on sources"),
     ],
 )
@@ -196,7 +234,9 @@ def test_missing_vehicle_refers_to_findings_on_sources_only_if_there_are_some(
     assert any(each.check == "source" for each in findings) == (state == "waiting")
 
 
-def test_publishers_of_one_address_are_named(zenoh_session: Session, endpoint: str, bus: nedbus.Bus) -> None:
+def test_publishers_of_one_address_are_named(
+    zenoh_session: Session, endpoint: str, bus: nedbus.Bus
+) -> None:
     """Of several publishers of an address, the services are named with host and source, others are counted."""
     address = f"1/{VLP}"
     status = service_status(zenoh_session, "a", sources=[source(addresses=[address])])
@@ -210,7 +250,12 @@ def test_two_publishers_of_one_address_are_reported(bus: nedbus.Bus, endpoint: s
     """Two publishers of one address share a token, but the source info of messages or heartbeats tells them apart."""
     with nedbus.connect(endpoint) as other:
         with publishing(bus), publishing(other):
-            find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
+            find(
+                diagnose_until(endpoint, "2 publishers"),
+                "vehicle",
+                "wrong",
+                f"1/{VLP}: 2 publishers",
+            )
         for each in (bus, other):
             each.publisher(VLP, vehicle="1").publish(message(1))
         find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
@@ -246,9 +291,17 @@ def test_undecodable_payload_is_reported(zenoh_session: Session, endpoint: str) 
 @pytest.mark.parametrize(
     ("clocks", "text", "advice"),
     [
-        ({"ahead": HOUR}, "service ahead on elsewhere: .* 60 min ahead of this host's", "either clock may be off"),
+        (
+            {"ahead": HOUR},
+            "service ahead on elsewhere: .* 60 min ahead of this host's",
+            "either clock may be off",
+        ),
         ({"ahead": HOUR, "right": 0.0}, "service ahead", "set this one"),
-        ({"first": -HOUR, "second": -HOUR}, "this host's clock is 60 min ahead of 2 others", "run NTP"),
+        (
+            {"first": -HOUR, "second": -HOUR},
+            "this host's clock is 60 min ahead of 2 others",
+            "run NTP",
+        ),
     ],
     ids=["service", "one of two services", "this host"],
 )
@@ -272,7 +325,12 @@ def test_clock_offset_of_publisher_is_reported(zenoh_session: Session, endpoint:
 
     with repeating(publish):
         findings = diagnose_until(endpoint, "publisher of 1/")
-    find(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
+    find(
+        findings,
+        "clock",
+        "wrong",
+        f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's",
+    )
 
 
 def test_service_status_produces_findings(zenoh_session: Session, endpoint: str) -> None:
@@ -288,22 +346,33 @@ def test_service_status_produces_findings(zenoh_session: Session, endpoint: str)
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
     assert "first address" not in find(findings, "source", "warning", "px4-zenoh:: waiting").advice
-    assert "first address" in find(findings, "source", "warning", "mavlink:udpout:10.0.0.1:14580: waiting").advice
+    assert (
+        "first address"
+        in find(findings, "source", "warning", "mavlink:udpout:10.0.0.1:14580: waiting").advice
+    )
     find(findings, "source", "ok", "mavlink:satellite: system 5: a satellite link")
     find(findings, "source", "warning", "no more messages of 9/x")
     find(findings, "source", "warning", r"messages rejected: 7 \(xy_valid\)")
     find(findings, "version", "warning", r"the service runs nedbus 99\.1\.0")
-    waiting = [source(source=f"mavlink:{number}", state="retrying", error=str(number)) for number in range(50)]
+    waiting = [
+        source(source=f"mavlink:{number}", state="retrying", error=str(number))
+        for number in range(50)
+    ]
     with service_status(zenoh_session, sources=[*sources, *waiting]):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "more findings of this check")
     find(findings, "source", "wrong", "retrying: 49")
 
 
-def test_equal_findings_are_one_with_all_subjects(zenoh_session: Session, endpoint: str, bus: nedbus.Bus) -> None:
+def test_equal_findings_are_one_with_all_subjects(
+    zenoh_session: Session, endpoint: str, bus: nedbus.Bus
+) -> None:
     """A fault of all streams of a vehicle is one finding, which lists streams and names service and host."""
     addresses = [f"8/{topic}" for topic in TOPICS][:12]
-    with publishing(bus, "1"), service_status(zenoh_session, vehicle="8", sources=[source(addresses=addresses)]):
+    with (
+        publishing(bus, "1"),
+        service_status(zenoh_session, vehicle="8", sources=[source(addresses=addresses)]),
+    ):
         findings = diagnose_until(endpoint, "reported as published", "messages arrive")
     found = [each for each in findings if "reported as published" in each.seen]
     assert len(found) == 1, found
@@ -316,7 +385,13 @@ def test_equal_findings_are_one_with_all_subjects(zenoh_session: Session, endpoi
 def service_report(session: Session, name: str, **vehicles: Mapping[str, object]) -> Iterator[None]:
     """Reply to event queries with a report of these vehicles."""
     server = QueryServer(session)
-    report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
+    report = {
+        "service": name,
+        "host": "elsewhere",
+        "now": 10_000.0,
+        "events": [],
+        "vehicles": vehicles,
+    }
     for vehicle in vehicles:
         key = status_key(name, vehicle=vehicle)
         server.answer_json(key, lambda get: [json.dumps(report if get("events") else {}).encode()])
@@ -324,7 +399,9 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
         yield
 
 
-def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, endpoint: str) -> None:
+def test_vehicle_states_in_service_reports_are_findings(
+    zenoh_session: Session, endpoint: str
+) -> None:
     """A vehicle in state "bad" is "wrong", and one in state "watch" is a "warning".
 
     Vehicles that are healthy, or have been silent for an hour, are omitted.
@@ -337,7 +414,12 @@ def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, 
             zenoh_session,
             "first",
             sick={"severity": "bad", "text": "failsafe", "since": 9990.0, "kinds": ["failsafe"]},
-            doubtful={"severity": "watch", "text": "dead reckoning", "since": 9880.0, "kinds": ["dead_reckoning"]},
+            doubtful={
+                "severity": "watch",
+                "text": "dead reckoning",
+                "since": 9880.0,
+                "kinds": ["dead_reckoning"],
+            },
             well={"severity": "info", "text": "ok"},
             off={**silent, "since": 1.0},
             gone={**silent, "since": 9999.0},
@@ -367,12 +449,20 @@ def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, 
     ],
     ids=["name", "nan", "inf", "now", "severity", "list"],
 )
-def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, invalid: Mapping[str, object]) -> None:
+def test_invalid_event_report_is_ignored(
+    zenoh_session: Session, endpoint: str, invalid: Mapping[str, object]
+) -> None:
     """An invalid event report from a peer produces no finding and does not break a check."""
     server = QueryServer(zenoh_session)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **invalid}
-    server.answer_json(status_key("x", vehicle="1"), lambda get: [json.dumps(report if get("events") else {}).encode()])
-    with closing(server), service_status(zenoh_session, sources=[source(state="failed", error="the disk is gone")]):
+    server.answer_json(
+        status_key("x", vehicle="1"),
+        lambda get: [json.dumps(report if get("events") else {}).encode()],
+    )
+    with (
+        closing(server),
+        service_status(zenoh_session, sources=[source(state="failed", error="the disk is gone")]),
+    ):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "the disk is gone")
     assert not [each for each in findings if "evil" in each.seen or "check failed" in each.seen]
@@ -381,20 +471,30 @@ def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, 
 def test_doctor_reports_bad_vehicle_from_event_report(run_nedbus: Start, tmp_path: Path) -> None:
     """The doctor reports a bad vehicle from the event report of a service that replays a log in another process."""
     endpoint = free_endpoint()
-    log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
+    log = write_log(
+        tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False}
+    )
     run_nedbus("serve", "--listen", endpoint, "-s", f"ulog:{log}?vehicle=sick")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
         wait_for(lambda: any(report.vehicles for report in bus.accounts()), what="the vehicle")
     find(diagnose(endpoint), "vehicle", "wrong", "sick: xy not valid, since ")
 
 
-@pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
-def test_invalid_service_status_does_not_break_checks(zenoh_session: Session, endpoint: str, now: object) -> None:
+@pytest.mark.parametrize(
+    "now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5]
+)
+def test_invalid_service_status_does_not_break_checks(
+    zenoh_session: Session, endpoint: str, now: object
+) -> None:
     """The valid parts of a peer's invalid status produce findings, and no check fails."""
     states: list[object] = [[], {}, 7, None]
     strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
     with service_status(
-        zenoh_session, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]
+        zenoh_session,
+        now=now,
+        version=[1],
+        host={},
+        sources=[*strange, 5, source(state="failed", error=["why"])],
     ):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: unknown reason")
@@ -425,7 +525,9 @@ def test_doctor_reports_failing_source_of_real_service(run_nedbus: Start) -> Non
     doctor = run_command("doctor", "-c", endpoint)
     assert doctor.exit_code == 1, doctor.err
     words = "".join(doctor.out.split())  # a long path is folded
-    assert re.search(r"wrongsourceulog:nowhere\.ulg:retrying:/\S+/nowhere\.ulg:nosuchfileordirectory->", words)
+    assert re.search(
+        r"wrongsourceulog:nowhere\.ulg:retrying:/\S+/nowhere\.ulg:nosuchfileordirectory->", words
+    )
     assert doctor.out.splitlines()[-1].endswith("1 wrong"), doctor.out
     as_json = run_command("doctor", "-c", endpoint, "--json")
     assert as_json.exit_code == 1
@@ -440,7 +542,10 @@ def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
     """The exit code is 0 if nothing is wrong, even with warnings, and 2 for usage errors."""
     with publishing(bus), service_status(zenoh_session, sources=[source(state="waiting")]):
         doctor = run_command("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)
-    assert (doctor.exit_code, doctor.out.splitlines()[-1].rpartition(", ")[2]) == (0, "1 warning"), doctor.out
+    assert (doctor.exit_code, doctor.out.splitlines()[-1].rpartition(", ")[2]) == (
+        0,
+        "1 warning",
+    ), doctor.out
     assert "set by NEDBUS_CONNECT" in " ".join(doctor.out.split())
     for arguments in (["-v", "a/b"], ["--mavlink", "nonsense"], ["--config", "gone.toml"]):
         refused = run_command("doctor", *arguments)
@@ -452,7 +557,10 @@ def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
 def test_text_from_peers_is_escaped_and_truncated(zenoh_session: Session, endpoint: str) -> None:
     """Text from peers cannot control the terminal, add lines or flood the output."""
     evil = "\x1b[2J\nok all is well " + 1_000 * "x"
-    failed = [source(source=f"{number}{evil}", state="failed", error=f"{number}{evil}") for number in range(50)]
+    failed = [
+        source(source=f"{number}{evil}", state="failed", error=f"{number}{evil}")
+        for number in range(50)
+    ]
     with service_status(zenoh_session, sources=failed, host=evil, version=evil):
         doctor = run_command("doctor", "-c", endpoint)
     assert doctor.exit_code == 1
@@ -493,10 +601,22 @@ def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
 @pytest.mark.parametrize(
     ("case", "expected"),
     [
-        (("router-expired", "reader", "ca.crt"), {"tls": "the router presents router-expired .*has expired"}),
-        (("router-elsewhere", "reader", "ca.crt"), {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"}),
-        (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the CA in .*, but by nedbus CA"}),
-        (("router", None, "ca.crt"), {"tls": "it requires a client certificate, and none is given"}),
+        (
+            ("router-expired", "reader", "ca.crt"),
+            {"tls": "the router presents router-expired .*has expired"},
+        ),
+        (
+            ("router-elsewhere", "reader", "ca.crt"),
+            {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"},
+        ),
+        (
+            ("router", "reader", "foreign/ca.crt"),
+            {"tls": "is not signed by the CA in .*, but by nedbus CA"},
+        ),
+        (
+            ("router", None, "ca.crt"),
+            {"tls": "it requires a client certificate, and none is given"},
+        ),
         (
             ("router", "expired", "ca.crt"),
             {"certificate": "is expired, .*has expired", "tls": "refuses this client: .*expired"},
@@ -508,7 +628,11 @@ def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
     ],
 )
 def test_invalid_certificate_is_reported_with_reason(
-    run_router: Run, pki: Path, timings: Timings, case: tuple[str, str | None, str], expected: dict[str, str]
+    run_router: Run,
+    pki: Path,
+    timings: Timings,
+    case: tuple[str, str | None, str],
+    expected: dict[str, str],
 ) -> None:
     """A finding states the reason, which Zenoh omits, and the router's certificate even if no session opens."""
     router, name, ca = case
@@ -556,13 +680,35 @@ def test_wrong_protocol_and_wrong_tls_files_are_reported(
         ("vehicle-1", "2", "", "write", "warning", "the router silently drops"),
         ("reader", "1", "1", "write", "ok", "fine for a reader"),
         ("older", "1", "", "write", "unknown", "does not let this client read"),
-        ("reader", None, "12", "vehicle", "wrong", f"2/{VLP}: reported as published by service .*, but no message"),
+        (
+            "reader",
+            None,
+            "12",
+            "vehicle",
+            "wrong",
+            f"2/{VLP}: reported as published by service .*, but no message",
+        ),
         ("vehicle-1", None, "12", "read", "wrong", "no message arrives here"),
-        ("vehicle-1", "1", "12", "read", "warning", "no message arrives here.*only permits writing"),
+        (
+            "vehicle-1",
+            "1",
+            "12",
+            "read",
+            "warning",
+            "no message arrives here.*only permits writing",
+        ),
     ],
 )
 def test_read_and_write_permissions_are_reported(
-    run_router: Run, pki: Path, *, client: str, vehicle: str | None, published: str, check: str, state: State, text: str
+    run_router: Run,
+    pki: Path,
+    *,
+    client: str,
+    vehicle: str | None,
+    published: str,
+    check: str,
+    state: State,
+    text: str,
 ) -> None:
     """The findings state what the access rules permit a client to read and write, and whose messages are dropped."""
     older = {"@doctor": "@probe"} if client == "older" else {}  # access rules without the probe key
@@ -573,23 +719,31 @@ def test_read_and_write_permissions_are_reported(
         publishing(bus, *published or "2"),
         service_status(
             session,
-            refused=[each for each in published if each != "1"],  # all that its certificate lets it say of 2
+            # all that its certificate lets it say of 2
+            refused=[each for each in published if each != "1"],
             sources=[source(addresses=[f"{each}/{VLP}" for each in published])],
         ),  # fmt: skip
     ):
         files = tls_settings(pki, "vehicle-1" if older else client)
-        findings = diagnose(endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1)
+        findings = diagnose(
+            endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1
+        )
     assert any(
-        (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen} {each.advice}")
+        (each.check, each.state) == (check, state)
+        and re.search(text, f"{each.subject}: {each.seen} {each.advice}")
         for each in findings
     ), findings
     if published:
         assert has_no_faults(findings) == (state != "wrong"), findings
 
 
-def test_certificates_are_verified_but_not_read_without_cryptography(run_router: Run, pki: Path, start: Start) -> None:
+def test_certificates_are_verified_but_not_read_without_cryptography(
+    run_router: Run, pki: Path, start: Start
+) -> None:
     """Without `cryptography`, names and dates are unknown and the advice names the extra; trust is still verified."""
-    endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
+    endpoints = {
+        run_router(name): name for name in ("router", "router-expired", "router-elsewhere")
+    }
     settings = {name: str(path) for name, path in tls_settings(pki, "reader").items()}
     program = f"""
 import sys
@@ -605,7 +759,11 @@ for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}),
     process = start("-c", program)
     assert process.wait() == 0, process.err
     lines = [line.split("|") for line in process.out.splitlines()]
-    unread = [(endpoints.get(where, ""), check) for where, check, _, _, advice in lines if "[pki]'" in advice]
+    unread = [
+        (endpoints.get(where, ""), check)
+        for where, check, _, _, advice in lines
+        if "[pki]'" in advice
+    ]
     assert unread.count(("", "certificate")) == 2
     assert ("router", "tls") in unread
     wrong = {endpoints[where]: seen for where, _, state, seen, _ in lines if state == "wrong"}
@@ -632,7 +790,9 @@ def check_link(*packets: bytes, senders: int = 1) -> list[Finding]:
     """Run the doctor on a link while each of the senders sends these packets."""
     port = free_port()
     with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(senders)]
+        sockets = [
+            stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(senders)
+        ]
 
         def send() -> None:
             for sender in sockets:
@@ -642,7 +802,9 @@ def check_link(*packets: bytes, senders: int = 1) -> list[Finding]:
         with repeating(send):
             while True:  # a sender on a busy host may send nothing for that long
                 findings = diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{port}", listen=0.5)
-                if not packets or not any("no packet within" in finding.seen for finding in findings):
+                if not packets or not any(
+                    "no packet within" in finding.seen for finding in findings
+                ):
                     return findings
 
 
@@ -654,7 +816,9 @@ def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes
 def check_round_trip(delay: float) -> list[Finding]:
     """Run the doctor on a link with a PX4 that answers TIMESYNC after this delay [s]."""
     port, encoder, parser = free_port(), mavlink.MAVLink(None, 7, 1), mavlink.MAVLink(None)
-    heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    heartbeat = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3
+    )
     with socket.socket(type=socket.SOCK_DGRAM) as vehicle:
         vehicle.setblocking(False)
 
@@ -677,37 +841,69 @@ def check_round_trip(delay: float) -> list[Finding]:
 
 def test_mavlink_traffic_produces_findings() -> None:
     """Packets, messages, positions, ULog stream, ignored senders and a port in use produce findings by system id."""
-    heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    heartbeat = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3
+    )
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
     satellite = mavlink.MAVLink_high_latency2_message(5000, 2, 12, *[0] * 24)
-    assert "sends nothing" in find(check_link(*packets_of(7, satellite)), "mavlink", "ok", "a satellite link").advice
+    assert (
+        "sends nothing"
+        in find(check_link(*packets_of(7, satellite)), "mavlink", "ok", "a satellite link").advice
+    )
     assert "first address" not in find(check_link(), "mavlink", "wrong", "no packet within").advice
     findings = diagnose(free_endpoint(), mavlink=f"udpout:127.0.0.1:{free_port()}", listen=0.1)
     silent = find(findings, "mavlink", "wrong", "no packet within")
-    assert "PX4 sends only to the first address that sent to its port since its boot" in silent.advice
+    assert (
+        "PX4 sends only to the first address that sent to its port since its boot" in silent.advice
+    )
     junk = check_link(b"GET / HTTP/1.1")
     find(junk, "mavlink", "wrong", r"no MAVLink among the packets from 127\.0\.0\.1:\d+ ")
     findings = check_link(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position))
     assert "requests it" in find(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
     find(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
-    assert "?log=1" in find(findings, "mavlink", "ok", "system 7.*: PX4 found; the link carries").advice
-    finding = find(check_round_trip(0.04), "mavlink", "ok", r"round trip \d+ ms: the header of the ULog stream blocks")
+    assert (
+        "?log=1"
+        in find(findings, "mavlink", "ok", "system 7.*: PX4 found; the link carries").advice
+    )
+    finding = find(
+        check_round_trip(0.04),
+        "mavlink",
+        "ok",
+        r"round trip \d+ ms: the header of the ULog stream blocks",
+    )
     assert "?log=1&header=" in finding.advice
     (backend,) = struct.unpack("<f", struct.pack("<i", 1))
-    parameter = mavlink.MAVLink_param_value_message(b"SDLOG_BACKEND", backend, mavlink.MAV_PARAM_TYPE_INT32, 1, 0)
+    parameter = mavlink.MAVLink_param_value_message(
+        b"SDLOG_BACKEND", backend, mavlink.MAV_PARAM_TYPE_INT32, 1, 0
+    )
     data = mavlink.MAVLink_logging_data_message(255, 190, 7, 1, 0, [0] * 249)
     findings = check_link(*packets_of(7, heartbeat, parameter), *packets_of(8, heartbeat, data))
     find(findings, "mavlink", "warning", "system 7: SDLOG_BACKEND is 1")
-    find(findings, "mavlink", "warning", "system 8: sends its ULog stream to system 255 component 190")
-    findings = check_link(*packets_of(7, position, component=0), *packets_of(8, heartbeat, component=100))
+    find(
+        findings,
+        "mavlink",
+        "warning",
+        "system 8: sends its ULog stream to system 255 component 190",
+    )
+    findings = check_link(
+        *packets_of(7, position, component=0), *packets_of(8, heartbeat, component=100)
+    )
     find(findings, "mavlink", "wrong", "system 7 component 0: ignored: id 0 is for broadcast only")
     find(findings, "mavlink", "wrong", "system 8 component 100: ignored: not an autopilot")
     assert not any(each.state == "ok" for each in findings if each.check == "mavlink")
-    findings = check_link(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)
-    find(findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7")
+    findings = check_link(
+        *packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2
+    )
+    find(
+        findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7"
+    )
     assert not any("component 100" in each.subject for each in findings)
-    findings = check_link(*packets_of(7, heartbeat, position), *packets_of(255, heartbeat, component=190))
-    assert not [each for each in findings if each.check == "mavlink" and each.state != "ok"], "a ground station"
+    findings = check_link(
+        *packets_of(7, heartbeat, position), *packets_of(255, heartbeat, component=190)
+    )
+    assert not [each for each in findings if each.check == "mavlink" and each.state != "ok"], (
+        "a ground station"
+    )
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
         findings = diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")
@@ -716,11 +912,16 @@ def test_mavlink_traffic_produces_findings() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "text"),
-    [(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, "the type MAV_TYPE_ONBOARD_CONTROLLER"), (250, "the unknown type 250")],
+    [
+        (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, "the type MAV_TYPE_ONBOARD_CONTROLLER"),
+        (250, "the unknown type 250"),
+    ],
 )
 def test_heartbeats_of_others_with_component_1_are_named(kind: int, text: str) -> None:
     """A router or an unknown component with component id 1 is no vehicle, and is named, alone or beside a vehicle."""
-    vehicle = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    vehicle = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3
+    )
     other = mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
     reason = f"not an autopilot: its HEARTBEAT has {text}"
     findings = check_link(*packets_of(42, other))
@@ -730,18 +931,27 @@ def test_heartbeats_of_others_with_component_1_are_named(kind: int, text: str) -
     find(findings, "mavlink", "ok", f"system 42 component 1: ignored: {reason}")
     assert not any("system 42: " in f"{each.subject}: " for each in findings), "it is no vehicle"
     findings = check_link(*packets_of(7, vehicle), *packets_of(7, other))
-    shared = find(findings, "mavlink", "warning", f"system 7 component 1: some HEARTBEATs are ignored: {reason}")
+    shared = find(
+        findings,
+        "mavlink",
+        "warning",
+        f"system 7 component 1: some HEARTBEATs are ignored: {reason}",
+    )
     assert "give it a component id of its own" in shared.advice
     find(findings, "mavlink", "ok", "system 7: PX4 found")
     pressure = mavlink.MAVLink_scaled_pressure_message(1, 1.0, 1.0, 1)
     findings = check_link(*packets_of(7, pressure, vehicle), *packets_of(8, pressure))
-    assert not any("system 7 component 1" in each.subject for each in findings), "its heartbeat came second"
+    assert not any("system 7 component 1" in each.subject for each in findings), (
+        "its heartbeat came second"
+    )
     find(findings, "mavlink", "ok", "system 8 component 1: ignored: not known to be an autopilot")
 
 
 def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch) -> None:
     """Findings name the origin of each setting and the mistakes in the sources."""
-    Path("nedbus.toml").write_text('prefix = "fleet"\nsource = ["ulog:gone.ulg", "sim:?nonsense=1"]\n')
+    Path("nedbus.toml").write_text(
+        'prefix = "fleet"\nsource = ["ulog:gone.ulg", "sim:?nonsense=1"]\n'
+    )
     monkeypatch.setenv("NEDBUS_VEHICLE", "7")
     findings = examine(load_settings(), version="0")
     find(findings, "settings", "ok", "connect: tcp/127.0.0.1:7447, the default")

@@ -66,7 +66,12 @@ def _write_log(path: Path, vehicle: int, times: Sequence[int], start: int) -> Pa
 def _write_recording(path: Path, vehicles: Sequence[int], times: Sequence[int], start: int) -> Path:
     with RecordingWriter(path, chunk_size=2**16, boot_utc=start) as writer:
         writer.write_messages(
-            (_position(each, index, time), Address(str(each), VLP), Provenance("sim"), 1000 * (start + time))
+            (
+                _position(each, index, time),
+                Address(str(each), VLP),
+                Provenance("sim"),
+                1000 * (start + time),
+            )
             for index, time in enumerate(times)
             for each in vehicles
         )

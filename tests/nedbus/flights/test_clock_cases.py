@@ -32,7 +32,9 @@ EXPECTED: Final = [
 
 
 @pytest.mark.parametrize(("name", "count", "duration", "steps"), EXPECTED)
-def test_order_and_duration_are_the_vehicles(name: str, count: int, duration: float, steps: int) -> None:
+def test_order_and_duration_are_the_vehicles(
+    name: str, count: int, duration: float, steps: int
+) -> None:
     """`open` and `read` give the same order and duration, whatever happened to the clock of the recorder."""
     with nedbus.open(CASES / name) as flight:
         times = [each.message.timestamp for each in flight()]
@@ -51,7 +53,10 @@ def test_no_event_is_invented(name: str) -> None:
 def test_start_in_a_header_on_another_clock_hides_no_fault() -> None:
     """Messages that advance together decide where the flight begins: xy is invalid from 30 to 35 s since boot."""
     events = read_file_events(CASES / "17_header_start_unix.ulg").event_log.events
-    assert [(each.kind, each.time) for each in events] == [("xy_invalid", 10.0), ("xy_invalid", 15.0)]
+    assert [(each.kind, each.time) for each in events] == [
+        ("xy_invalid", 10.0),
+        ("xy_invalid", 15.0),
+    ]
 
 
 def test_clock_that_was_never_set_is_no_utc() -> None:

@@ -23,7 +23,9 @@ from tests.peers.command_line import run_command
 from .formats import VLP
 
 
-def copy_without_metadata(source: Path, target: Path, *, rename: dict[str, str] | None = None) -> None:
+def copy_without_metadata(
+    source: Path, target: Path, *, rename: dict[str, str] | None = None
+) -> None:
     """Copy a recording as rosbags and mcap-ros2-support do: topics, schemas and messages, without channel metadata."""
     with target.open("wb") as file:
         writer, schemas, channels = Writer(file), dict[int, int](), dict[int, int]()
@@ -31,7 +33,9 @@ def copy_without_metadata(source: Path, target: Path, *, rename: dict[str, str] 
         for schema, channel, each in NonSeekingReader(BytesIO(source.read_bytes())).iter_messages():
             assert schema is not None
             if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                schemas[schema.id] = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
             if channel.id not in channels:
                 topic = (rename or {}).get(channel.topic, channel.topic)
                 channels[channel.id] = writer.register_channel(topic, "cdr", schemas[schema.id], {})
@@ -82,7 +86,8 @@ def test_newer_version_of_a_topic_is_read(tmp_path: Path, caplog: pytest.LogCapt
         rows = [(message(1_000_000 + index, x=float(index)), index) for index in range(100)]
         for name in "12":
             writer.write_messages(
-                (each, Address(name, VLP), Provenance(), 1000 * index + int(name)) for each, index in rows
+                (each, Address(name, VLP), Provenance(), 1000 * index + int(name))
+                for each, index in rows
             )
     topics = {f"/1/{VLP}": f"/fmu/out/{VLP}", f"/2/{VLP}": f"/fmu/out/{VLP}_v1"}
     copy_without_metadata(original, bag, rename=topics)
@@ -98,7 +103,9 @@ def test_messages_behind_the_indexed_chunks_are_read(tmp_path: Path) -> None:
     out = BytesIO()
     writer, channel = start_recording(tmp_path, out)
     for index in range(13):
-        payload = encode_with(DEFAULT, message(1 + index, x=float(index)).model_dump(), DEFAULT.current)
+        payload = encode_with(
+            DEFAULT, message(1 + index, x=float(index)).model_dump(), DEFAULT.current
+        )
         if index == 10:
             getattr(writer, "_Writer__finalize_chunk")()  # noqa: B009 - a private name of the class
             setattr(writer, "_Writer__chunk_builder", None)  # noqa: B010 - further messages are not in chunks
@@ -113,10 +120,14 @@ def test_messages_behind_the_indexed_chunks_are_read(tmp_path: Path) -> None:
 
 def test_malformed_payload_is_skipped_alone(tmp_path: Path) -> None:
     """A bool other than 0 or 1, a wrong length or another encapsulation makes only that message invalid."""
-    payload = encode_with(DEFAULT, message(1, x=1.0, y=2.0, xy_valid=True).model_dump(), DEFAULT.current)
+    payload = encode_with(
+        DEFAULT, message(1, x=1.0, y=2.0, xy_valid=True).model_dump(), DEFAULT.current
+    )
     first_bool = 4 + 16
     assert payload[first_bool] == 1
-    others = [payload[:first_bool] + bytes([byte]) + payload[first_bool + 1 :] for byte in (2, 3, 255)]
+    others = [
+        payload[:first_bool] + bytes([byte]) + payload[first_bool + 1 :] for byte in (2, 3, 255)
+    ]
     others += [payload[:-1], payload + bytes(4), b"\x00\x00" + payload[2:]]
     out = BytesIO()
     writer, channel = start_recording(tmp_path, out)
@@ -132,7 +143,9 @@ def test_malformed_payload_is_skipped_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("new_id", [0, 1])
 @pytest.mark.parametrize("unsubscribed", [True, False])
-def test_repeated_subscription_is_one_stream(tmp_path: Path, new_id: int, *, unsubscribed: bool) -> None:
+def test_repeated_subscription_is_one_stream(
+    tmp_path: Path, new_id: int, *, unsubscribed: bool
+) -> None:
     """A topic that is subscribed to again, with the same or another id, is one stream without losses."""
     writer = UlogWriter()
     writer.define([VLP])

@@ -42,7 +42,9 @@ def test_start_and_end_count_pauses(tmp_path: Path) -> None:
     """Seconds and UTC mean the same place behind a pause of minutes."""
     begin = datetime.fromtimestamp(BOOT / 1e6 + 605, UTC)
     with nedbus.open(paused(tmp_path / "a.ulg")) as flight:
-        by_utc = [each.message.timestamp for each in flight(start=begin, end=begin + timedelta(seconds=3))]
+        by_utc = [
+            each.message.timestamp for each in flight(start=begin, end=begin + timedelta(seconds=3))
+        ]
         by_seconds = [each.message.timestamp for each in flight(start=605.0, end=608.0)]
         assert by_utc == by_seconds == steps(BOOT + PAUSE + 5_000_000, 31)
         assert flight.duration == pytest.approx(609.9)
@@ -79,14 +81,20 @@ def test_start_and_end_mean_the_same_for_every_topic(tmp_path: Path, *, several:
 def test_datetime_without_a_time_zone_is_an_error(tmp_path: Path, option: str) -> None:
     """A naive datetime would mean another period in Tokyo than in London; the error shows the remedy."""
     naive = datetime.fromtimestamp(BOOT / 1e6 + 5, UTC).replace(tzinfo=None)
-    with nedbus.open(paused(tmp_path / "a.ulg")) as flight, pytest.raises(ArgumentError, match="tzinfo=UTC"):
+    with (
+        nedbus.open(paused(tmp_path / "a.ulg")) as flight,
+        pytest.raises(ArgumentError, match="tzinfo=UTC"),
+    ):
         flight(**{option: naive})  # type: ignore[call-overload] # mypy does not know which of the options it is
 
 
 def test_utc_in_a_flight_without_utc_is_an_error(tmp_path: Path) -> None:
     """The error names the remedy: seconds."""
     path = write_log(tmp_path / "a.ulg", steps(1_000_000, 20))
-    with nedbus.open(path) as flight, pytest.raises(ArgumentError, match="seconds since the first message"):
+    with (
+        nedbus.open(path) as flight,
+        pytest.raises(ArgumentError, match="seconds since the first message"),
+    ):
         flight(start=datetime.fromtimestamp(BOOT / 1e6, UTC))
 
 
@@ -161,7 +169,10 @@ def test_last_message_after_a_pause_is_in_order(tmp_path: Path) -> None:
 
 def test_several_files_are_chronological_whatever_pauses_they_have(tmp_path: Path) -> None:
     """`open` and `read` merge a file with a pause of minutes and one without by UTC."""
-    first = write_log(tmp_path / "a.ulg", [*steps(BOOT, 10, step=10**6), *steps(BOOT + 300_000_000, 10, step=10**6)])
+    first = write_log(
+        tmp_path / "a.ulg",
+        [*steps(BOOT, 10, step=10**6), *steps(BOOT + 300_000_000, 10, step=10**6)],
+    )
     second = write_log(tmp_path / "b.ulg", steps(BOOT, 310, step=10**6))
     with nedbus.open([first, second]) as flight:
         times = [each.message.timestamp for each in flight()]
@@ -191,7 +202,10 @@ def test_why_at_a_time_before_a_pause(tmp_path: Path) -> None:
 
 _STEP: Final = 100_000  # us between two messages
 _PARTS = st.lists(
-    st.tuples(st.sampled_from(["pause", "reboot", "host"]), st.integers(20, 60), st.integers(5, 900)), max_size=5
+    st.tuples(
+        st.sampled_from(["pause", "reboot", "host"]), st.integers(20, 60), st.integers(5, 900)
+    ),
+    max_size=5,
 )
 
 
@@ -202,7 +216,8 @@ _SOUND: Final = {
 
 
 @given(_PARTS)
-@example([("reboot", 20, 199), ("reboot", 20, 558)])  # the third boot reaches the time of the second
+# the third boot reaches the time of the second
+@example([("reboot", 20, 199), ("reboot", 20, 558)])
 def test_no_event_is_invented_by_any_sequence_of_clocks(parts: list[tuple[str, int, int]]) -> None:
     """Pauses are silences, reboots are reboots, and steps of the recorder's clock are nothing; times are the axis."""
     address = nedbus.Address("1", "vehicle_local_position")
@@ -223,7 +238,9 @@ def test_no_event_is_invented_by_any_sequence_of_clocks(parts: list[tuple[str, i
             expected.append(("silent", place + gap))
             place += gap
         for _ in range(count):
-            messages.append(SourceMessage(0.0, address, {"timestamp": stamp, **_SOUND}, time=stamp + host))
+            messages.append(
+                SourceMessage(0.0, address, {"timestamp": stamp, **_SOUND}, time=stamp + host)
+            )
             stamp, place = stamp + _STEP, place + _STEP
     event_log = EventLog()
     for _ in follow(Order[SourceMessage]().arrange(messages), event_log):
@@ -231,7 +248,9 @@ def test_no_event_is_invented_by_any_sequence_of_clocks(parts: list[tuple[str, i
     found = [(each.kind, each.time) for each in event_log.events if each.change != "begin"]
     texts = [each.text for each in event_log.events]
     assert sorted(kind for kind, _ in found) == sorted(kind for kind, _ in expected), texts
-    assert sorted(time for _, time in found) == pytest.approx(sorted(time / 1e6 for _, time in expected), abs=0.5)
+    assert sorted(time for _, time in found) == pytest.approx(
+        sorted(time / 1e6 for _, time in expected), abs=0.5
+    )
 
 
 def test_warning_names_the_first_reason_of_invalid_messages(tmp_path: Path) -> None:

@@ -12,7 +12,17 @@ import pytest
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, McapRecord, Message, Metadata, Schema
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    Message,
+    Metadata,
+    Schema,
+)
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 import nedbus
@@ -119,8 +129,13 @@ def test_file_at_a_limit_is_read_in_bounded_memory(start: Start, tmp_path: Path,
 def test_index_with_many_schemas_is_read_in_linear_time(tmp_path: Path) -> None:
     """An index with 40,000 schemas and channels is read in seconds of CPU time, on any machine."""
     path = tmp_path / "a.mcap"
-    schemas = [Schema(id=number, data=b"", encoding="", name="other") for number in range(1, 40_001)]
-    path.write_bytes(MCAP0_MAGIC + index(*schemas, *(Channel(each.id, "/a", "", {}, each.id) for each in schemas)))
+    schemas = [
+        Schema(id=number, data=b"", encoding="", name="other") for number in range(1, 40_001)
+    ]
+    path.write_bytes(
+        MCAP0_MAGIC
+        + index(*schemas, *(Channel(each.id, "/a", "", {}, each.id) for each in schemas))
+    )
     with path.open("ab") as file:
         file.write(MCAP0_MAGIC)
     begin = time.process_time()
@@ -129,7 +144,9 @@ def test_index_with_many_schemas_is_read_in_linear_time(tmp_path: Path) -> None:
     assert time.process_time() - begin < _SECONDS
 
 
-def test_chunks_that_together_unpack_too_far_are_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_that_together_unpack_too_far_are_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The limit of the compression ratio counts all chunks of a file; chunks beyond it are reported as damage."""
     path = tmp_path / "repeated.mcap"
     with path.open("wb") as stream:

@@ -49,7 +49,9 @@ def write_bag(
         schema = writer.register_schema(ROS2_TYPE, encoding, definition.encode())
         channel = writer.register_channel(TOPIC, "cdr", schema, {"offered_qos_profiles": ""})
         for number in numbers:
-            payload = encode_cdr(downgrade(message(number + 1, x=float(number)), "1.16"), layout="1.16")
+            payload = encode_cdr(
+                downgrade(message(number + 1, x=float(number)), "1.16"), layout="1.16"
+            )
             writer.add_message(channel, number * 10**9, change(payload), number)
         writer.finish()
     return path
@@ -75,20 +77,28 @@ def test_fields_unknown_to_px4_are_skipped_and_listed(tmp_path: Path, where: str
     text, own = message_definition("1.16"), "float32 wind_north\nfloat32 wind_east\n"
     if where == "end":
         path = write_bag(
-            tmp_path / "a.mcap", definition=text + own, change=lambda each: each + -len(each) % 4 * b"\0" + 2 * WIND
+            tmp_path / "a.mcap",
+            definition=text + own,
+            change=lambda each: each + -len(each) % 4 * b"\0" + 2 * WIND,
         )
     else:
         first, second = text.split("uint64 timestamp_sample", 1)
         rest, text = second.split("\n", 1)
         text = f"{first}uint64 timestamp_sample{rest}\n{own}{text}"
         path = write_bag(tmp_path / "a.mcap", definition=text, change=add_in_middle)
-    left_out = f"left out wind_east, wind_north of {TOPIC}, unknown to nedbus in VehicleLocalPosition"
+    left_out = (
+        f"left out wind_east, wind_north of {TOPIC}, unknown to nedbus in VehicleLocalPosition"
+    )
     assert_complete(path, warnings=(left_out,))
 
 
 def test_definition_that_matches_no_release_raises(tmp_path: Path) -> None:
     """A definition that lacks required fields, or has them with other types, raises; the error names the fields."""
-    text = message_definition("1.16").replace("float32 x ", "float64 x ").replace("float32 y ", "float32 y2 ")
+    text = (
+        message_definition("1.16")
+        .replace("float32 x ", "float64 x ")
+        .replace("float32 y ", "float32 y2 ")
+    )
     with pytest.raises(SourceError, match=r"its definition of x, y matches no PX4 release"):
         nedbus.read(write_bag(tmp_path / "a.mcap", definition=text))
 
@@ -99,9 +109,13 @@ def test_message_whose_timestamp_is_not_first_is_read(tmp_path: Path) -> None:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("px4_msgs/msg/Wind", "ros2msg", b"float32 north\nuint64 timestamp\n")
+        schema = writer.register_schema(
+            "px4_msgs/msg/Wind", "ros2msg", b"float32 north\nuint64 timestamp\n"
+        )
         channel = writer.register_channel("/fmu/out/wind", "cdr", schema)
-        writer.add_message(channel, 1, b"\x00\x01\x00\x00" + WIND + bytes(4) + (7).to_bytes(8, "little"), 1)
+        writer.add_message(
+            channel, 1, b"\x00\x01\x00\x00" + WIND + bytes(4) + (7).to_bytes(8, "little"), 1
+        )
         writer.finish()
     assert nedbus.read(path, "wind").tolist() == [(7, 3.5)]
 
@@ -116,9 +130,13 @@ def test_reason_of_skipped_messages_is_that_of_the_first(
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("px4_msgs/msg/Wind", "ros2msg", b"uint64 timestamp\nfloat32 north\n")
+        schema = writer.register_schema(
+            "px4_msgs/msg/Wind", "ros2msg", b"uint64 timestamp\nfloat32 north\n"
+        )
         channel = writer.register_channel("/fmu/out/wind", "cdr", schema)
-        for time, payload in enumerate([valid, b"\x00\x09\x00\x00" + valid[4:], *([valid] * size), valid[:9]]):
+        for time, payload in enumerate(
+            [valid, b"\x00\x09\x00\x00" + valid[4:], *([valid] * size), valid[:9]]
+        ):
             writer.add_message(channel, time, payload, time)
         writer.finish()
     assert len(nedbus.read(path, "wind")) == size + 1
@@ -141,7 +159,9 @@ def test_definition_with_invalid_range_is_read_without_it(tmp_path: Path, annota
         writer.finish()
     run = open_replay(f"mcap:{path}?topics=*")
     assert [each.fields["north"] for each in run.messages] == [3.5]
-    assert "ignored the ranges in the definition of /fmu/out/wind (line 2, column 1" in run.warnings[0]
+    assert (
+        "ignored the ranges in the definition of /fmu/out/wind (line 2, column 1" in run.warnings[0]
+    )
 
 
 FLAGS = {
@@ -177,7 +197,10 @@ def write_variant(*, has_extras: bool, **options: object) -> bytes:
     return file.getvalue()
 
 
-SLOW_FORMS = [pytest.param(form, marks=pytest.mark.slow) for form in (CompressionType.NONE, CompressionType.LZ4)]
+SLOW_FORMS = [
+    pytest.param(form, marks=pytest.mark.slow)
+    for form in (CompressionType.NONE, CompressionType.LZ4)
+]
 
 
 @pytest.mark.parametrize("form", [None, CompressionType.ZSTD, *SLOW_FORMS])
@@ -208,11 +231,17 @@ def test_all_variants_of_mcap_are_read_completely(
             use_chunking=form is not None, compression=form or CompressionType.NONE, **options  # type: ignore[arg-type]
         )  # fmt: skip
         path.write_bytes(data)
-        expected = [each.log_time for schema, _, each in NonSeekingReader(BytesIO(data)).iter_messages() if schema]
+        expected = [
+            each.log_time
+            for schema, _, each in NonSeekingReader(BytesIO(data)).iter_messages()
+            if schema
+        ]
         assert len(expected) == 7, options
         with open_recording(path) as reader:
             assert sum(reader.counts.values()) == len(expected), options
-            assert [each.time for each in reader.records()] == [each // 1000 for each in expected], options
+            assert [each.time for each in reader.records()] == [
+                each // 1000 for each in expected
+            ], options
         with McapReader(path, ReadOptions(topics={"second_topic"})) as reader:
             assert len(list(reader.records())) == 3, options
             assert not reader.warnings, options
@@ -225,8 +254,13 @@ def test_bit_flip_outside_chunks_does_not_create_messages(tmp_path: Path, every:
     with RecordingWriter(path) as writer:
         for number in range(2):
             positions = [message(2 * number + 1), message(2 * number + 2)]
-            streams = [(Address(vehicle, VLP), Provenance("sim", frozenset({"dist_bottom"}))) for vehicle in "12"]
-            writer.write(to_array(positions), DEFAULT, streams, logged=[number] * 2, published=[number] * 2)
+            streams = [
+                (Address(vehicle, VLP), Provenance("sim", frozenset({"dist_bottom"})))
+                for vehicle in "12"
+            ]
+            writer.write(
+                to_array(positions), DEFAULT, streams, logged=[number] * 2, published=[number] * 2
+            )
             writer.flush()
         data = path.read_bytes()
     path.write_bytes(data)
@@ -254,7 +288,9 @@ def test_damaged_summary_is_not_used(tmp_path: Path) -> None:
     """The summary has a CRC: after a bit flip in a vehicle's name there, the name comes from the chunks."""
     path, address = tmp_path / "a.mcap", Address("alpha", VLP)
     with RecordingWriter(path) as writer:
-        writer.write(to_array([message(1)]), DEFAULT, [(address, Provenance())], logged=[1], published=[1])
+        writer.write(
+            to_array([message(1)]), DEFAULT, [(address, Provenance())], logged=[1], published=[1]
+        )
     data = bytearray(path.read_bytes())
     data[data.rindex(b"alpha")] ^= 1
     path.write_bytes(data)
@@ -277,7 +313,10 @@ def bag_in_sqlite(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (lambda path: path.write_bytes(b"ULogKey\x01" + bytes(100)), "an encrypted log; decrypt it"),
+        (
+            lambda path: path.write_bytes(b"ULogKey\x01" + bytes(100)),
+            "an encrypted log; decrypt it",
+        ),
         (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "a zip archive; unpack it"),
         (lambda path: path.write_bytes(b"\x1f\x8b" + bytes(100)), "a gzip file; unpack it"),
         (lambda path: path.write_bytes(b""), "an empty file"),
@@ -305,7 +344,11 @@ def test_unsupported_file_format_raises_with_remedy(
 @pytest.mark.parametrize(
     ("encoding", "definition", "reason"),
     [
-        ("ros2idl", "module px4_msgs {};", "its encoding is cdr with ros2idl, not cdr with ros2msg"),
+        (
+            "ros2idl",
+            "module px4_msgs {};",
+            "its encoding is cdr with ros2idl, not cdr with ros2msg",
+        ),
         ("", "", "the file has no definition of px4_msgs/msg/VehicleLocalPosition"),
         ("ros2msg", "uint64 timestamp\nstring name\n", "line 2, column 1"),
     ],
@@ -345,7 +388,9 @@ def test_split_bag_is_one_recording(tmp_path: Path, suffix: str) -> None:
     (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}")
     assert_complete(folder)
     assert run_command("events", str(folder)).exit_code == 0
-    (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}    - bag_11.mcap\n")
+    (folder / "metadata.yaml").write_text(
+        f"bag:\n  relative_file_paths:\n{listed}    - bag_11.mcap\n"
+    )
     assert open_replay(f"mcap:{folder}").damage == (
         f"{folder}: some messages are lost to damage; bag_11.mcap of this bag is missing"
     )
@@ -371,7 +416,9 @@ def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
         nedbus.read(path)
     monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_BLOCK", 2**20)
     path.write_bytes(zstandard.compress(bytes(2**21)))
-    with pytest.raises(SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"):
+    with pytest.raises(
+        SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"
+    ):
         nedbus.read(path)
 
 

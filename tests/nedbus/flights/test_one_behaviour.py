@@ -33,7 +33,10 @@ def test_unknown_vehicle_raises(tmp_path: Path, suffix: str, *, is_list: bool) -
     path = write_flight(tmp_path / f"a{suffix}")
     with pytest.raises(AddressError, match=r"vehicle 'typo' is not .*1"):
         nedbus.read([path] if is_list else path, [VLP], vehicle="typo")
-    with nedbus.open([path] if is_list else path, vehicle="typo") as flight, pytest.raises(AddressError, match="typo"):
+    with (
+        nedbus.open([path] if is_list else path, vehicle="typo") as flight,
+        pytest.raises(AddressError, match="typo"),
+    ):
         list(flight())
 
 
@@ -43,9 +46,14 @@ def test_unknown_topic_raises(tmp_path: Path, suffix: str, *, is_list: bool) -> 
     """A topic that the file lacks raises, and the error of `read` lists the streams of the file."""
     path = write_flight(tmp_path / f"a{suffix}")
     files = [path] if is_list else path
-    with pytest.raises(AddressError, match=r"topic 'home_position' is not in .*1/vehicle_local_position"):
+    with pytest.raises(
+        AddressError, match=r"topic 'home_position' is not in .*1/vehicle_local_position"
+    ):
         nedbus.read(files, ["home_position"])
-    with pytest.raises(NedbusError, match=r"has no|has none of|no message of"), nedbus.open(files) as flight:
+    with (
+        pytest.raises(NedbusError, match=r"has no|has none of|no message of"),
+        nedbus.open(files) as flight,
+    ):
         list(flight("home_position"))
 
 
@@ -78,7 +86,10 @@ def test_file_is_parsed_once(tmp_path: Path, suffix: str, monkeypatch: pytest.Mo
 def test_runs_contain_the_records_of_each_address_in_order(tmp_path: Path, suffix: str) -> None:
     """Records and runs are two views of one file: both have the same messages and times per address."""
     path = write_flight(tmp_path / f"a{suffix}", vehicles=(1,) if suffix == ".ulg" else (1, 2))
-    single, together = defaultdict[Address, list[object]](list), defaultdict[Address, list[object]](list)
+    single, together = (
+        defaultdict[Address, list[object]](list),
+        defaultdict[Address, list[object]](list),
+    )
     with open_reader(path) as reader:
         for record in reader.records():
             single[record.stream.address].append((record.payload, record.time))
@@ -98,7 +109,9 @@ def test_one_name_for_several_vehicles_raises(tmp_path: Path, suffix: str) -> No
 
 @each_format
 @each_several
-def test_read_and_open_yield_the_same_messages(tmp_path: Path, suffix: str, *, is_list: bool) -> None:
+def test_read_and_open_yield_the_same_messages(
+    tmp_path: Path, suffix: str, *, is_list: bool
+) -> None:
     """`open` yields each message of `read`, in order, as models, rows and batches."""
     path = write_flight(tmp_path / f"a{suffix}")
     array = nedbus.read(path)
@@ -110,7 +123,11 @@ def test_read_and_open_yield_the_same_messages(tmp_path: Path, suffix: str, *, i
         assert flight.utc is not None
         assert abs(flight.utc.at(BOOT).timestamp() - (EPOCH + BOOT) / 1e6) < 0.001
         assert not flight.damaged, flight.warnings
-    assert [each.message.x for each in models] == [each.message.x for each in rows] == array["x"].tolist()
+    assert (
+        [each.message.x for each in models]
+        == [each.message.x for each in rows]
+        == array["x"].tolist()
+    )
     (batch,) = batches
     assert batch.messages.tobytes() == array.tobytes()
     assert {each.source for each in models} == {batch.provenances[0].source} == {SOURCES[suffix]}
@@ -142,11 +159,17 @@ def test_files_of_all_formats_are_merged_by_utc(tmp_path: Path) -> None:
     arrays = nedbus.read(paths, [VLP])
     assert arrays.keys() == {f"{name}/{VLP}" for name in "abc"}
     assert len(nedbus.align(paths, topics=[VLP])) == 50
-    for command in (["events", *paths], ["why", *paths], ["plot", *paths, "-o", tmp_path / "all.png"]):
+    for command in (
+        ["events", *paths],
+        ["why", *paths],
+        ["plot", *paths, "-o", tmp_path / "all.png"],
+    ):
         result = run_command(*map(str, command))
         assert result.exit_code == 0, result.err
     assert run_command("convert", *map(str, paths), str(tmp_path / "all.mcap")).exit_code == 0
-    assert {str(each) for each in nedbus.addresses_of(tmp_path / "all.mcap")} == {f"{name}/{VLP}" for name in "abc"}
+    assert {str(each) for each in nedbus.addresses_of(tmp_path / "all.mcap")} == {
+        f"{name}/{VLP}" for name in "abc"
+    }
 
 
 @each_format
@@ -174,7 +197,9 @@ def test_folder_that_is_no_bag_raises(tmp_path: Path) -> None:
     """A folder without recordings, whatever its name, raises."""
     for name in ("a.ulg", "a.tlog", "bag"):
         (tmp_path / name).mkdir()
-        with pytest.raises(SourceError, match=r"no \.mcap file in this folder|only a bag of MCAP files"):
+        with pytest.raises(
+            SourceError, match=r"no \.mcap file in this folder|only a bag of MCAP files"
+        ):
             nedbus.read(tmp_path / name)
 
 
@@ -225,7 +250,11 @@ def test_layout_of_another_release_is_read_on_request(caplog: pytest.LogCaptureF
     """A recording made with the px4_msgs of another release names the cause, and is read with `layout=`."""
     cases = Path(__file__).parents[4] / "shared" / "cases" / "turn5"
     for name, layout, remedy in (
-        ("53_wrong_px4_msgs_115_as_116.mcap", "1.15", "204 bytes, expected 220.*rebuild px4_msgs at release/1.15"),
+        (
+            "53_wrong_px4_msgs_115_as_116.mcap",
+            "1.15",
+            "204 bytes, expected 220.*rebuild px4_msgs at release/1.15",
+        ),
         ("53c_wrong_V0_as_116.mcap", "V0", "216 bytes, expected 220.*a development version"),
     ):
         if not (cases / name).exists():
@@ -246,7 +275,9 @@ def test_unknown_layout_raises(tmp_path: Path) -> None:
     """A layout that no release has raises, instead of being ignored."""
     path = write_flight(tmp_path / "a.mcap")
     for use in (nedbus.read, nedbus.align, nedbus.open):
-        with pytest.raises(ArgumentError, match=r"layout '9\.9' is not valid: expected one of 1\.13, .*V0"):
+        with pytest.raises(
+            ArgumentError, match=r"layout '9\.9' is not valid: expected one of 1\.13, .*V0"
+        ):
             use(path, layout="9.9")
 
 

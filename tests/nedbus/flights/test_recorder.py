@@ -31,7 +31,15 @@ from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import arrays_of, to_array
 from nedbus_msgs.messages import LogMessage
-from tests.flights.local_position import LAYOUTS, ROS2_TYPE, downgrade, encode, encode_cdr, message_definition, upgrade
+from tests.flights.local_position import (
+    LAYOUTS,
+    ROS2_TYPE,
+    downgrade,
+    encode,
+    encode_cdr,
+    message_definition,
+    upgrade,
+)
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_recording, open_replay
 from tests.flights.ulogs import UlogWriter, write_log
@@ -59,7 +67,9 @@ def read_independently(path: Path) -> list[tuple[str, int, int, Any]]:
 
 def write(writer: RecordingWriter, *messages: VehicleLocalPosition) -> None:
     times = [each.timestamp * 1000 for each in messages]
-    writer.write(to_array(messages), DEFAULT, repeat((ADDRESS, Provenance())), logged=times, published=times)
+    writer.write(
+        to_array(messages), DEFAULT, repeat((ADDRESS, Provenance())), logged=times, published=times
+    )
 
 
 def test_independent_reader_decodes_every_field(tmp_path: Path) -> None:
@@ -81,9 +91,21 @@ def test_sequence_numbers_of_publishers_are_recorded(tmp_path: Path) -> None:
     path, numbers = tmp_path / "a.mcap", [-1, 0, 7, 2**32 - 1]
     with RecordingWriter(path) as writer:
         rows, times = to_array([message(1)] * len(numbers)), range(len(numbers))
-        writer.write(rows, DEFAULT, repeat((ADDRESS, Provenance())), logged=times, published=times, sequence=numbers)
+        writer.write(
+            rows,
+            DEFAULT,
+            repeat((ADDRESS, Provenance())),
+            logged=times,
+            published=times,
+            sequence=numbers,
+        )
     with path.open("rb") as file:
-        assert [each.sequence for _, _, each in make_reader(file).iter_messages()] == [0, 0, 7, 2**32 - 1]
+        assert [each.sequence for _, _, each in make_reader(file).iter_messages()] == [
+            0,
+            0,
+            7,
+            2**32 - 1,
+        ]
 
 
 def test_channels_of_a_vehicle_are_limited(
@@ -97,11 +119,21 @@ def test_channels_of_a_vehicle_are_limited(
     monkeypatch.setattr("nedbus.flights.writer._MAX_ALL_CHANNELS", 3)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
-        for vehicle, source in (("7", "a"), ("7", "b"), ("7", "c"), ("7", "d"), ("8", "a"), ("9", "a"), ("7", "a")):
+        for vehicle, source in (
+            ("7", "a"),
+            ("7", "b"),
+            ("7", "c"),
+            ("7", "d"),
+            ("8", "a"),
+            ("9", "a"),
+            ("7", "a"),
+        ):
             streams = [(Address(vehicle, VLP), Provenance(source))]
             writer.write(to_array([message(1)]), DEFAULT, streams, logged=[1], published=[1])
     assert (writer.messages, writer.omitted) == (4, 3)
-    assert [topic for topic, *_ in read_independently(path)] == [f"/{each}/{VLP}" for each in "7787"]
+    assert [topic for topic, *_ in read_independently(path)] == [
+        f"/{each}/{VLP}" for each in "7787"
+    ]
     assert caplog.text.count("not recording some messages of vehicle 7, which has more than 2") == 1
 
 
@@ -123,7 +155,9 @@ def test_replay_of_a_recording_is_bit_exact(
         wait_for_matching(zenoh_session, publisher.key)
     sent: dict[str, list[bytes]] = {}
     for each in messages:
-        published = upgrade({name: value for name, value in each.fields.items() if name != "tilt_var"})
+        published = upgrade(
+            {name: value for name, value in each.fields.items() if name != "tilt_var"}
+        )
         publishers[each.address].publish(published)
         sent.setdefault(str(publishers[each.address].address), []).append(encode(published))
     wait_for(lambda: recorder.status.startswith(f"{len(messages)} "), what="all messages")
@@ -179,13 +213,17 @@ def test_kill_loses_about_the_last_second(run_nedbus: Start, endpoint: str, tmp_
                 pass
             recorder.kill()
             last = subscription.receive(DEADLINE).message.timestamp
-        times = [each.timestamp for topic, _, _, each in read_independently(path) if topic == f"/1/{VLP}"]
+        times = [
+            each.timestamp for topic, _, _, each in read_independently(path) if topic == f"/1/{VLP}"
+        ]
         assert times == sorted(times)
         costs.append(last - times[-1] if times else last)
     assert costs[-1] < 1_500_000
 
 
-def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_valid_and_synced_after_every_flush(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After each flush, any reader finds a valid file with all messages, and fsync was called.
 
     The file is also valid before the first message.
@@ -198,7 +236,9 @@ def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch:
             write(writer, message(count))
             assert len(read_independently(path)) == count - 1
             writer.flush()
-            assert [each.timestamp for *_, each in read_independently(path)] == list(range(1, count + 1))
+            assert [each.timestamp for *_, each in read_independently(path)] == list(
+                range(1, count + 1)
+            )
             assert synced[-1] == path.stat().st_size
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -209,7 +249,10 @@ def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch:
 
 def test_messages_between_flushes_do_not_fill_the_memory(tmp_path: Path) -> None:
     """A recording that is not flushed buffers at most 16 MiB of data in memory; the rest is on the disk."""
-    path, blob = tmp_path / "a.mcap", nedbus.define_msg("Blob", "uint64 timestamp\nfloat64[440] data\n")
+    path, blob = (
+        tmp_path / "a.mcap",
+        nedbus.define_msg("Blob", "uint64 timestamp\nfloat64[440] data\n"),
+    )
     rows, noise = np.zeros(550, arrays_of(blob).dtype), np.random.default_rng(1)
     streams, times = repeat((Address("1", "blob"), Provenance())), repeat(1)
     with RecordingWriter(path) as writer:
@@ -273,29 +316,49 @@ def test_ros2_bag_is_replayed(tmp_path: Path, layout: str) -> None:
     A channel with an unsupported encoding is skipped with a warning.
     """
     path = tmp_path / "bag.mcap"
-    definition = "uint8 CONSTANT=1\n" + message_definition(layout) + "\n" + "=" * 80 + "\nMSG: other/Type\nuint8 z\n"
+    definition = (
+        "uint8 CONSTANT=1\n"
+        + message_definition(layout)
+        + "\n"
+        + "=" * 80
+        + "\nMSG: other/Type\nuint8 z\n"
+    )
     sent = message(9, x=1.0, hagl_max_z=2.0)
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
         schema = writer.register_schema(ROS2_TYPE, "ros2msg", definition.encode())
         other = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
-        topics = ("/fmu/out/vehicle_local_position", "/px4_1/fmu/out/estimator_local_position_1", "/other")
+        topics = (
+            "/fmu/out/vehicle_local_position",
+            "/px4_1/fmu/out/estimator_local_position_1",
+            "/other",
+        )
         for topic in topics:
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, 1, encode_cdr(downgrade(sent, layout), layout=layout), 1)
-        writer.add_message(writer.register_channel("/empty", "cdr", other), 1, b"\x00\x01\x00\x00", 1)
+        writer.add_message(
+            writer.register_channel("/empty", "cdr", other), 1, b"\x00\x01\x00\x00", 1
+        )
         idl = writer.register_schema(ROS2_TYPE, "ros2idl", b"")
         writer.add_message(writer.register_channel(f"/{ADDRESS}", "cdr", idl), 1, b"", 1)
         writer.finish()
     run = open_replay(f"mcap:{path}")
-    assert list(map(str, run.addresses)) == ["1/vehicle_local_position", "px4_1/estimator_local_position/1"]
-    assert f"skipped /{ADDRESS} (its encoding is cdr with ros2idl, not cdr with ros2msg" in run.warnings[0]
+    assert list(map(str, run.addresses)) == [
+        "1/vehicle_local_position",
+        "px4_1/estimator_local_position/1",
+    ]
+    assert (
+        f"skipped /{ADDRESS} (its encoding is cdr with ros2idl, not cdr with ros2msg"
+        in run.warnings[0]
+    )
     for each in run.messages:
         assert upgrade(each.fields) == upgrade(downgrade(sent, layout))
 
 
-@pytest.mark.parametrize("arguments", [["record", "-o", "there/a.mcap"], ["convert", "flight.mcap", "there/a.mcap"]])
+@pytest.mark.parametrize(
+    "arguments", [["record", "-o", "there/a.mcap"], ["convert", "flight.mcap", "there/a.mcap"]]
+)
 def test_existing_file_is_not_replaced(endpoint: str, arguments: list[str]) -> None:
     """An existing file stays unchanged, and no other file is left behind."""
     convert_replay("sim:?duration=1", Path("flight.mcap"))
@@ -338,7 +401,9 @@ with RecordingWriter(Path(sys.argv[1])) as writer:
 """
 
 
-def run_limited(fork_server: ForkServer, script: str, size: int, *arguments: str) -> tuple[int, str]:
+def run_limited(
+    fork_server: ForkServer, script: str, size: int, *arguments: str
+) -> tuple[int, str]:
     """Run a script in a process with a limit of the size of all files, as on a full disk.
 
     Return its exit code and output, which is a pipe and therefore not limited.
@@ -347,7 +412,9 @@ def run_limited(fork_server: ForkServer, script: str, size: int, *arguments: str
     with open(os.devnull, "rb") as null, open(write_end, "wb") as out:  # noqa: PTH123 - a file descriptor
         streams = null.fileno(), out.fileno(), out.fileno()
         command = "-c", LIMITED + script, str(size), *arguments
-        process = fork_server.start(command, cwd=Path.cwd(), environment=without_coverage(), streams=streams)
+        process = fork_server.start(
+            command, cwd=Path.cwd(), environment=without_coverage(), streams=streams
+        )
     try:
         exit_code = process.wait(DEADLINE)
     finally:
@@ -357,12 +424,16 @@ def run_limited(fork_server: ForkServer, script: str, size: int, *arguments: str
 
 
 @pytest.mark.process
-def test_full_disk_raises_and_keeps_flushed_messages(fork_server: ForkServer, tmp_path: Path) -> None:
+def test_full_disk_raises_and_keeps_flushed_messages(
+    fork_server: ForkServer, tmp_path: Path
+) -> None:
     """A full disk raises OutputError; all flushed messages can be read."""
     path = tmp_path / "full.mcap"
     exit_code, output = run_limited(fork_server, FILL, 50_000, str(path))
     assert exit_code == 1
-    assert output.splitlines()[-1].startswith(f"nedbus.errors.OutputError: {path} cannot be written (file too large)")
+    assert output.splitlines()[-1].startswith(
+        f"nedbus.errors.OutputError: {path} cannot be written (file too large)"
+    )
     flushed = int(re.findall(r"flushed (\d+)", output)[-1])
     assert len(read_independently(path)) == flushed
 
@@ -371,8 +442,16 @@ def test_full_disk_raises_and_keeps_flushed_messages(fork_server: ForkServer, tm
 @pytest.mark.parametrize(
     ("size", "arguments", "reason"),
     [
-        (20_000, ["convert", "flight.mcap", "full/new.mcap"], "new.mcap cannot be written (file too large)"),
-        (5_000, ["plot", "flight.mcap", "-o", "full/new.png"], "new.png cannot be written (file too large)"),
+        (
+            20_000,
+            ["convert", "flight.mcap", "full/new.mcap"],
+            "new.mcap cannot be written (file too large)",
+        ),
+        (
+            5_000,
+            ["plot", "flight.mcap", "-o", "full/new.png"],
+            "new.png cannot be written (file too large)",
+        ),
         (200, ["pki", "ca", "full/new"], "new/ca cannot be written: file too large"),
         (300, ["pki", "ca", "full/new"], "new/ca cannot be written: file too large"),
     ],
@@ -389,7 +468,9 @@ def test_full_disk_leaves_no_partial_file(
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
 
 
-def test_ctrl_c_finishes_the_recording(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+def test_ctrl_c_finishes_the_recording(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
+) -> None:
     """Ctrl-C finishes the file, prints the counts, and exits with 0."""
     path = tmp_path / "a.mcap"
     recorder = run_nedbus("record", VLP, "-c", endpoint, "-o", str(path), coverage=False)
@@ -409,7 +490,9 @@ def test_ctrl_c_finishes_the_recording(run_nedbus: Start, endpoint: str, bus: ne
     assert f"{len(found)} messages" in recorder.err
 
 
-def test_deleting_the_recording_exits_with_an_error(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+def test_deleting_the_recording_exits_with_an_error(
+    run_nedbus: Start, endpoint: str, tmp_path: Path
+) -> None:
     """If the file is deleted, recording stops at the next flush with exit code 1."""
     path = tmp_path / "a.mcap"
     recorder = run_nedbus("record", "-c", endpoint, "-o", str(path))
@@ -490,7 +573,9 @@ WRONG_SUFFIX = "its name must end with .mcap; for CSV, see nedbus.read in docs/r
         ("convert flight.ulg a.mcap", 1, "/flight.ulg: no such file or directory\n"),
     ],
 )
-def test_invalid_argument_is_a_one_line_error(endpoint: str, arguments: str, exit_code: int, reason: str) -> None:
+def test_invalid_argument_is_a_one_line_error(
+    endpoint: str, arguments: str, exit_code: int, reason: str
+) -> None:
     """An invalid argument exits with 2, an unreadable file with 1; one line is printed, and no file is written.
 
     Names of recordings must end with .mcap.
@@ -510,7 +595,9 @@ def test_converted_log_is_complete(tmp_path: Path, layout: str) -> None:
     writer.define([VLP, "estimator_local_position"], without=["tilt_var", "eph"])
     for number in range(10):
         for instance in (0, 1):
-            writer.add("estimator_local_position", message(number, x=float(instance)), instance=instance)
+            writer.add(
+                "estimator_local_position", message(number, x=float(instance)), instance=instance
+            )
         writer.add(VLP, message(number, x=float(number)))
     writer.write(log)
     converter = run_command("convert", str(log), str(path))
@@ -535,7 +622,10 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
     strange = [{"timestamp": 2**64 - 1}, {"timestamp": 2, "xy_valid": True}]
     messages = [SourceMessage(0.0, ADDRESS, each) for each in [{"timestamp": 1}] * 2998 + strange]
     run = ReplayRun(iter(messages), {}, None, "")
-    assert convert(run.messages, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
+    assert (
+        convert(run.messages, path, source="ulog", on_progress=done.append)
+        == "2999 messages, 1 rejected"
+    )
     assert [each.timestamp for *_, each in read_independently(path)] == [1] * 2998 + [2**64 - 1]
     assert done == [1024, 2048]
 
@@ -548,7 +638,9 @@ def test_conversion_without_a_valid_message_fails(tmp_path: Path) -> None:
         writer.add(VLP, message(timestamp), xy_valid=True)
     ended = run_command("convert", str(writer.write(tmp_path / "a.ulg")), str(path))
     assert ended.exit_code == 1
-    assert "a.mcap: not written, because all 20 messages are rejected: x: must be finite" in ended.err
+    assert (
+        "a.mcap: not written, because all 20 messages are rejected: x: must be finite" in ended.err
+    )
     assert [each.name for each in tmp_path.iterdir()] == ["a.ulg"]
 
 
@@ -562,7 +654,9 @@ def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
     assert "not a regular file" in plot.err
     folder = tmp_path / f"folder{suffix}"
     folder.mkdir()
-    with pytest.raises(SourceError, match="not a regular file" if suffix == ".ulg" else "no .mcap file"):
+    with pytest.raises(
+        SourceError, match="not a regular file" if suffix == ".ulg" else "no .mcap file"
+    ):
         nedbus.read(folder)
 
 
@@ -587,7 +681,10 @@ def test_private_and_unknown_records_are_skipped(tmp_path: Path) -> None:
 def test_px4_texts_are_also_recorded_as_ros2_log(tmp_path: Path) -> None:
     """`log_message` is recorded a second time as ROS 2's Log, which nedbus ignores when it reads the file."""
     path, texts = tmp_path / "a.mcap", ["Takeoff detected", "12 \u00b5s", ""]
-    written = [LogMessage(timestamp=number, severity=2 * number, text=text) for number, text in enumerate(texts)]
+    written = [
+        LogMessage(timestamp=number, severity=2 * number, text=text)
+        for number, text in enumerate(texts)
+    ]
     with RecordingWriter(path) as writer:
         writer.write_messages(
             (each, Address("7", "log_message"), Provenance("mavlink", frozenset()), 10**18 + number)
@@ -605,4 +702,8 @@ def test_px4_texts_are_also_recorded_as_ros2_log(tmp_path: Path) -> None:
             log: Any = store.deserialize_cdr(each.data, schema.name)
             assert bytes(store.serialize_cdr(log, schema.name)) == each.data
             found.append((log.stamp.sec, log.stamp.nanosec, log.level, log.name, log.msg))
-    assert found == [(10**9, 0, 50, "7", texts[0]), (10**9, 1, 50, "7", texts[1]), (10**9, 2, 30, "7", "")]
+    assert found == [
+        (10**9, 0, 50, "7", texts[0]),
+        (10**9, 1, 50, "7", texts[1]),
+        (10**9, 2, 30, "7", ""),
+    ]

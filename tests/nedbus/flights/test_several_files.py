@@ -37,7 +37,11 @@ def write_flight(
         writer.put("I", bytes([len(key)]) + key + struct.pack("<Q", EPOCH + round(boot * 1e6)))
     writer.define([VLP, OTHER])
     for tenth in range(round(seconds * 10)):
-        fields = VALID | {"x": float(tenth), "xy_valid": tenth < bad * 10, "v_xy_valid": tenth < bad * 10}
+        fields = VALID | {
+            "x": float(tenth),
+            "xy_valid": tenth < bad * 10,
+            "v_xy_valid": tenth < bad * 10,
+        }
         for topic in (VLP, OTHER):
             writer.add(topic, message(round((start - boot) * 1e6) + tenth * 100_000, **fields))
     return writer.write(path)
@@ -59,16 +63,21 @@ def test_events_of_several_files_share_utc(swarm: list[str]) -> None:
     assert shown.exit_code == 0, shown.err
     for path, name in zip(swarm, ("a_1", "b", "c"), strict=True):
         assert (
-            f"{path}: vehicle 1 is named {name} here, because several files have a vehicle 1" in shown.err.splitlines()
+            f"{path}: vehicle 1 is named {name} here, because several files have a vehicle 1"
+            in shown.err.splitlines()
         )
     found = [json.loads(line) for line in shown.out.splitlines()]
-    assert {(each["vehicle"], each["time"]) for each in found} == {("b", "2025-10-09T08:54:25.000+00:00")}
+    assert {(each["vehicle"], each["time"]) for each in found} == {
+        ("b", "2025-10-09T08:54:25.000+00:00")
+    }
     assert run_command("events", "-v", "a_1", *swarm).out == ""
     why = run_command("why", "-v", "b", "--at", "08:54:26", *swarm)
     assert "b: not usable: xy and vxy not valid from 08:54:25.0" in why.out, why.err
 
 
-def test_commands_in_the_docs_run(swarm: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_commands_in_the_docs_run(
+    swarm: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """The swarm commands in docs/recordings.md exit with 0."""
     monkeypatch.chdir(tmp_path)
     for path, name in zip(swarm, "ab", strict=False):
@@ -86,13 +95,17 @@ def test_files_of_one_name_have_distinct_vehicles(tmp_path: Path) -> None:
         path.parent.mkdir()
         write_flight(path, boot=0, start=60 + number, seconds=1)
     streams = nedbus.read(paths, [VLP])
-    seconds = {name: round(1e-6 * int(own["timestamp"][0] - EPOCH)) for name, own in streams.items()}
+    seconds = {
+        name: round(1e-6 * int(own["timestamp"][0] - EPOCH)) for name, own in streams.items()
+    }
     assert seconds == {f"a/{VLP}": 60, f"a_2/{VLP}": 61, f"a_3/{VLP}": 62}
 
 
 def test_plot_of_one_vehicle_among_several_files(swarm: list[str], tmp_path: Path) -> None:
     """A vehicle that several files have is plotted by the name that the warnings and `read` give it."""
-    flight, addresses = read_plotted([Path(path) for path in swarm], Selection(VLP, vehicle="b"), [VLP])
+    flight, addresses = read_plotted(
+        [Path(path) for path in swarm], Selection(VLP, vehicle="b"), [VLP]
+    )
     assert [str(address) for address in addresses] == [f"b/{VLP}"]
     (messages, _) = array_of(flight, addresses[0], unix_times=True)
     assert messages["timestamp"][0] == EPOCH + 60_000_000
@@ -105,7 +118,12 @@ def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
     second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
     event_log = read_file_events(first, second)
-    assert [event.vehicle for event in event_log.event_log.events_since(0)[0]] == ["a", "a", "b", "b"]
+    assert [event.vehicle for event in event_log.event_log.events_since(0)[0]] == [
+        "a",
+        "a",
+        "b",
+        "b",
+    ]
     assert math.isclose(event_log.end, 3e8 - 60 + 9.9, abs_tol=0.01)
 
 
@@ -124,7 +142,11 @@ def test_several_files_are_read_and_aligned_in_utc(swarm: list[str]) -> None:
     """Streams have the vehicle in their name and Unix timestamps; rows are aligned across vehicles."""
     streams = nedbus.read(swarm, [VLP])
     assert [*streams] == [f"{name}/{VLP}" for name in ("a_1", "b", "c")]
-    assert [each["timestamp"][0] - EPOCH for each in streams.values()] == [60_000_000, 60_000_000, 58_000_000]
+    assert [each["timestamp"][0] - EPOCH for each in streams.values()] == [
+        60_000_000,
+        60_000_000,
+        58_000_000,
+    ]
     table = nedbus.align(swarm, topics=[VLP], utc=True, method="nearest")
     assert str(table["utc"][0]) == "2025-10-09T08:54:20.000000"
     assert table[f"a_1/{VLP}.x"].tolist() == table[f"b/{VLP}.x"].tolist() == list(range(100))

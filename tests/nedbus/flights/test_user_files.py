@@ -35,7 +35,11 @@ def count(name: str) -> dict[str, int]:
 
 def due_times(name: str) -> tuple[float, float]:
     """Return the replay times of the first and the last position [s]."""
-    found = [each.at for each in open_replay(f"ulog:{CASES / name}").messages if each.address.topic == VLP]
+    found = [
+        each.at
+        for each in open_replay(f"ulog:{CASES / name}").messages
+        if each.address.topic == VLP
+    ]
     return round(found[0], 2), round(found[-1], 2)
 
 
@@ -68,7 +72,9 @@ EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
 
 
 @pytest.mark.parametrize(("value", "name", "expected"), EXPECTED)
-def test_value_matches_independent_tools(value: Callable[[str], object], name: str, expected: object) -> None:
+def test_value_matches_independent_tools(
+    value: Callable[[str], object], name: str, expected: object
+) -> None:
     """The expected values come from pyulog, from rosbags, and from the raw records of the files."""
     assert value(name) == expected
 
@@ -127,10 +133,13 @@ def test_unreadable_file_raises_with_the_reason(name: str, reason: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["Bom", "BomCrlf", "DefaultValue", "FormFeed", "Latin1", "LineSep", "Nel", "StringConst"]
+    "name",
+    ["Bom", "BomCrlf", "DefaultValue", "FormFeed", "Latin1", "LineSep", "Nel", "StringConst"],
 )
 def test_msg_file_variants_are_read(name: str) -> None:
     """All .msg files that the library rosbags reads are accepted, as are files with a BOM, which it rejects."""
-    source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(vehicle="1")
+    source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(
+        vehicle="1"
+    )
     ((definition,),) = (each.values() for each in source._supplied.values())
     assert [*definition.types][:3] == ["timestamp", "angle", "mode"]

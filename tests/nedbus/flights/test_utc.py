@@ -25,7 +25,10 @@ INPUTS: Final = DATA / "fmu_in_topics.mcap"
 
 @pytest.mark.parametrize(
     ("path", "utc", "source"),
-    [(UNIX, "2025-10-09 08:53:19.997000", "timestamp"), (BOOT, "2025-09-08 13:31:04", "boot_time_utc_us")],
+    [
+        (UNIX, "2025-10-09 08:53:19.997000", "timestamp"),
+        (BOOT, "2025-09-08 13:31:04", "boot_time_utc_us"),
+    ],
 )
 def test_utc_of_a_recording_is_the_same_everywhere(path: Path, utc: str, source: str) -> None:
     """`utc_of`, `align` and events give the same UTC, from Unix timestamps or from the boot time in a log."""
@@ -58,7 +61,8 @@ def test_files_of_a_bag_share_one_boot(tmp_path: Path, boots: tuple[int, int]) -
 def test_mixed_clocks_are_distinguished_per_timestamp() -> None:
     """In a stream with both clocks, Unix timestamps are converted to UTC, and times since boot to NaT."""
     messages = nedbus.read(UNIX)
-    messages["timestamp"][:100] = np.arange(100) * 20_000 + 1_000_000  # before the time is synchronized
+    # before the time is synchronized
+    messages["timestamp"][:100] = np.arange(100) * 20_000 + 1_000_000
     table = nedbus.align({DEFAULT_TOPIC: messages}, utc=True)
     assert np.isnat(table["utc"][:100]).all()
     assert is_unix_time(table["utc"][100:].astype(np.int64)).all()

@@ -27,7 +27,12 @@ class Vehicle:
         self.tracker, self.time, self._random = FusionTracker(), 100_000_000, random.Random(1)
 
     def fly(
-        self, seconds: float, rejected: dict[str, float] = RIGHT, *, ratio: float = 0.01, **echo: Any
+        self,
+        seconds: float,
+        rejected: dict[str, float] = RIGHT,
+        *,
+        ratio: float = 0.01,
+        **echo: Any,
     ) -> list[Fusion]:
         """Return the report after each step."""
         reports = []
@@ -71,13 +76,18 @@ def test_mistake_in_flight_is_named_within_2_s(mistake: str) -> None:
     vehicle = Vehicle()
     vehicle.fly(2.0)
     reports = vehicle.fly(2.0, rejected, ratio=140.0 if "order" in mistake else 3.0)
-    seen = [{each.name: each.cause for each in report.quantities if each.state == "rejected"} for report in reports]
+    seen = [
+        {each.name: each.cause for each in report.quantities if each.state == "rejected"}
+        for report in reports
+    ]
     assert causes in seen
 
 
 def test_body_flu_is_named() -> None:
     """An unknown child_frame_id costs the velocity alone."""
-    [*_, report] = Vehicle().fly(2.0, {"position": 0.0, "height": 0.0, "yaw": 0.0}, velocity_frame=0)
+    [*_, report] = Vehicle().fly(
+        2.0, {"position": 0.0, "height": 0.0, "yaw": 0.0}, velocity_frame=0
+    )
     assert report.causes == (Cause.VELOCITY_FRAME,)
     assert [each.state for each in report.quantities] == ["fused", "fused", "not received", "fused"]
 
@@ -85,7 +95,9 @@ def test_body_flu_is_named() -> None:
 def test_velocity_alone_is_not_fused_without_its_bit() -> None:
     """A velocity that EKF2 does not report while it fuses the position has no bit in EKF2_EV_CTRL."""
     [*_, report] = Vehicle().fly(2.0, {"position": 0.0, "height": 0.0, "yaw": 0.0})
-    assert report.causes == ("bit 4 of EKF2_EV_CTRL is not set, or quality 100 is below EKF2_EV_QMIN",)
+    assert report.causes == (
+        "bit 4 of EKF2_EV_CTRL is not set, or quality 100 is below EKF2_EV_QMIN",
+    )
 
 
 def test_bias_against_gnss_is_named() -> None:
@@ -93,14 +105,20 @@ def test_bias_against_gnss_is_named() -> None:
     vehicle = Vehicle()
     vehicle.fly(2.0, ratio=1e-7)
     assert vehicle.tracker.fusion("1").remarks == ()
-    vehicle.tracker.add("estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (7.0, -5.0, 0.0)})
+    vehicle.tracker.add(
+        "estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (7.0, -5.0, 0.0)}
+    )
     report = vehicle.fly(1.0, ratio=1e-7)[-1]
     assert report.used
     assert report.bias == (7.0, -5.0)
     [remark] = report.remarks
-    assert remark.startswith("with GNSS, EKF2 gives vision a bias of 8.6 m: the estimate follows GNSS")
+    assert remark.startswith(
+        "with GNSS, EKF2 gives vision a bias of 8.6 m: the estimate follows GNSS"
+    )
     assert "bias against GNSS 7.0 m north, -5.0 m east" in "\n".join(report.lines)
-    vehicle.tracker.add("estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (0.3, -0.2, 0.0)})
+    vehicle.tracker.add(
+        "estimator_ev_pos_bias", {"timestamp": vehicle.time, "bias": (0.3, -0.2, 0.0)}
+    )
     assert vehicle.fly(1.0)[-1].remarks == ()
 
 
@@ -129,7 +147,9 @@ def test_sent_without_an_echo_is_named() -> None:
     """A service sends positions, and PX4 publishes none of them."""
     vehicle = Vehicle()
     vehicle.fly(2.0)
-    vehicle.tracker.add("vehicle_local_position", {"timestamp": vehicle.time + 1_000_000, "eph": 0.1})
+    vehicle.tracker.add(
+        "vehicle_local_position", {"timestamp": vehicle.time + 1_000_000, "eph": 0.1}
+    )
     report = vehicle.tracker.fusion("1", PositionStatus(vehicle="1", sent=100, rate=50.0))
     assert report.causes == (Cause.NO_ECHO,)
 
@@ -149,10 +169,14 @@ def test_missing_evidence_is_named_and_flags_are_used() -> None:
 
 
 @pytest.mark.parametrize(("is_valid", "remarks"), [(True, ()), (False, (Cause.NOT_VALID,))])
-def test_validity_is_the_evidence_without_a_log_stream(is_valid: bool, remarks: tuple[str, ...]) -> None:
+def test_validity_is_the_evidence_without_a_log_stream(
+    is_valid: bool, remarks: tuple[str, ...]
+) -> None:
     """MAVLink has neither echo nor aid messages: xy_valid, from ESTIMATOR_STATUS, shows that nothing is used."""
     tracker = FusionTracker()
-    tracker.add("vehicle_local_position", {"timestamp": 5_000_000, "eph": 0.1, "xy_valid": is_valid})
+    tracker.add(
+        "vehicle_local_position", {"timestamp": 5_000_000, "eph": 0.1, "xy_valid": is_valid}
+    )
     assert tracker.fusion("1").remarks == ()
     report = tracker.fusion("1", PositionStatus(vehicle="1", sent=90, rate=30.0))
     assert report.remarks == remarks
@@ -163,7 +187,9 @@ def test_validity_is_the_evidence_without_a_log_stream(is_valid: bool, remarks: 
 @pytest.mark.parametrize(("clock", "is_named"), [("arrival", True), ("timesync", False)])
 def test_measured_age_is_the_delay_to_set(clock: str, is_named: bool) -> None:
     """While PX4 stamps positions on arrival, the report names their age as the value of EKF2_EV_DELAY."""
-    sent = PositionStatus(vehicle="1", address="mocap/vehicle_odometry", sent=90, rate=30.0, age=0.0124, clock=clock)
+    sent = PositionStatus(
+        vehicle="1", address="mocap/vehicle_odometry", sent=90, rate=30.0, age=0.0124, clock=clock
+    )
     [line] = [line for line in FusionTracker().fusion("1", sent).lines if line.startswith("sent: ")]
     assert ("; set EKF2_EV_DELAY to 12 ms, plus the delay of the link" in line) == is_named
 
@@ -201,7 +227,9 @@ def test_right_input_raises_no_alarm(seconds: int) -> None:
     vehicle = Vehicle()
     vehicle.fly(1.0)
     for _ in range(seconds):
-        assert not any(report.causes for report in vehicle.fly(1.0, dict.fromkeys(QUANTITIES, 0.01)))
+        assert not any(
+            report.causes for report in vehicle.fly(1.0, dict.fromkeys(QUANTITIES, 0.01))
+        )
 
 
 def test_reboot_begins_anew() -> None:

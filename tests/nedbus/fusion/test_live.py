@@ -16,14 +16,19 @@ from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 
 RIGHT: Final = LOGS.parent / "px4" / "ev_right.ulg"
-pytestmark = [pytest.mark.logs, pytest.mark.skipif(not RIGHT.exists(), reason=f"no recording: {RIGHT}")]
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.skipif(not RIGHT.exists(), reason=f"no recording: {RIGHT}"),
+]
 
 
 @pytest.fixture
 def endpoint(start: Start) -> str:
     """Replay the flight, which has vision from 3.3 s on, twice as fast."""
     endpoint = free_endpoint()
-    start("-m", "nedbus", "serve", "--source", f"ulog:{RIGHT}?topics=*&speed=2", "--listen", endpoint)
+    start(
+        "-m", "nedbus", "serve", "--source", f"ulog:{RIGHT}?topics=*&speed=2", "--listen", endpoint
+    )
     return endpoint
 
 

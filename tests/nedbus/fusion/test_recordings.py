@@ -29,7 +29,10 @@ MISTAKES: Final = {
     "old": (57.84, "time_usec is 0.3 s old", ALL),
     "ahead": (65.96, "a message was stamped 3600 s ahead", ALL),
 }
-pytestmark = [pytest.mark.logs, pytest.mark.skipif(not RIGHT.exists(), reason=f"no recording: {RIGHT}")]
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.skipif(not RIGHT.exists(), reason=f"no recording: {RIGHT}"),
+]
 
 
 @cache
@@ -52,7 +55,9 @@ def causes_at(report: Fusion) -> dict[str, str]:
 def test_mistake_is_named_within_1_s(mistake: str) -> None:
     """1 s after the first wrong message, each quantity that EKF2 does not fuse has the cause of the mistake."""
     begin, cause, names = MISTAKES[mistake]
-    after = [report for time, report in reports("ev_refused.ulg") if begin + 1.0 <= time <= begin + 1.2]
+    after = [
+        report for time, report in reports("ev_refused.ulg") if begin + 1.0 <= time <= begin + 1.2
+    ]
     assert after
     for report in after:
         found = causes_at(report)
@@ -88,7 +93,9 @@ def test_jump_with_reset_counter_is_no_rejection() -> None:
 
 def test_right_input_has_no_cause() -> None:
     """While vision arrives as it should, no quantity has a cause, and there is no remark."""
-    calm = [report for time, report in reports("ev_right.ulg") if 4.5 < time < 26.9 or 36.5 < time < 52]
+    calm = [
+        report for time, report in reports("ev_right.ulg") if 4.5 < time < 26.9 or 36.5 < time < 52
+    ]
     assert len(calm) > 1000
     assert not any(report.causes or report.remarks or report.missing for report in calm)
 
@@ -104,4 +111,6 @@ def test_command_reports_a_log() -> None:
     """`nedbus fusion FILE` prints one report per change, with times since boot."""
     out = run_command("fusion", str(RIGHT)).out
     assert "2: 3.9 s: position, height, velocity, yaw fused since 3.5 s" in out
-    assert "position rejected (test ratio 14) since 27.1 s: the position jumped" in " ".join(out.split())
+    assert "position rejected (test ratio 14) since 27.1 s: the position jumped" in " ".join(
+        out.split()
+    )

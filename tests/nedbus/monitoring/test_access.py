@@ -33,7 +33,12 @@ PAGE_PATHS = (
     "/nothing",
 )
 TEXTS = {path: lambda: Page.text("content") for path in TEXT_PATHS}
-WEBSOCKET = ("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAA")
+WEBSOCKET = (
+    "Connection: Upgrade",
+    "Upgrade: websocket",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: AAAA",
+)
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,9 @@ def servers() -> Iterator[list[Server]]:
     def serve(host: str) -> Callable[[threading.Event, Callable[[str], object]], None]:
         def run(stop: threading.Event, on_listening: Callable[[str], object]) -> None:
             options = PageOptions(host, 0, ("ground.example:8420",))
-            server = WebServer(options, lambda document: document.add_root(Div(text="a word")), TEXTS)
+            server = WebServer(
+                options, lambda document: document.add_root(Div(text="a word")), TEXTS
+            )
             on_listening(server.url)
             server.run(stop)
 
@@ -157,17 +164,23 @@ def test_allowed_name_opens_every_path_of_the_page(servers: list[Server]) -> Non
             assert is_accepted(server, path, "Host: 127.0.0.1:8420", f"Origin: https://{name}")
             if server.is_local or path not in ANY_NAME:
                 assert not is_accepted(server, path, "Host: ground.example:8421")
-            assert not is_accepted(server, path, "Host: 127.0.0.1:8420", "Origin: http://ground.example:8421")
+            assert not is_accepted(
+                server, path, "Host: 127.0.0.1:8420", "Origin: http://ground.example:8421"
+            )
 
 
 @pytest.mark.parametrize(
-    "hosts", [("127.0.0.1", "evil.example"), ("evil.example", "127.0.0.1"), ("127.0.0.1", "127.0.0.1")]
+    "hosts",
+    [("127.0.0.1", "evil.example"), ("evil.example", "127.0.0.1"), ("127.0.0.1", "127.0.0.1")],
 )
 def test_duplicated_host_header_is_refused(servers: list[Server], hosts: tuple[str, ...]) -> None:
     """A request with two Host headers is refused on every path, because a proxy may have checked the other one."""
     for server in servers:
         for path in server.paths:
-            assert not is_accepted(server, path, *(f"Host: {host}" for host in hosts)), (server, path)
+            assert not is_accepted(server, path, *(f"Host: {host}" for host in hosts)), (
+                server,
+                path,
+            )
 
 
 def test_missing_host_header_is_accepted_without_origin(servers: list[Server]) -> None:
@@ -177,7 +190,10 @@ def test_missing_host_header_is_accepted_without_origin(servers: list[Server]) -
             if path != "/ws":  # needs HTTP/1.1
                 assert is_accepted(server, path, version="HTTP/1.0"), (server, path)
                 for origin in ("null", "http://127.0.0.1", "http://evil.example"):
-                    assert not is_accepted(server, path, f"Origin: {origin}", version="HTTP/1.0"), (server, path)
+                    assert not is_accepted(server, path, f"Origin: {origin}", version="HTTP/1.0"), (
+                        server,
+                        path,
+                    )
 
 
 @pytest.mark.parametrize(
@@ -212,7 +228,9 @@ def test_request_from_page_of_other_origin_is_refused(
         ("cross-site", "document", True), ("same-origin", "script", True), ("none", "document", True),
     ],
 )  # fmt: skip
-def test_cross_site_subresources_are_refused(servers: list[Server], site: str, kind: str, accepted: bool) -> None:
+def test_cross_site_subresources_are_refused(
+    servers: list[Server], site: str, kind: str, accepted: bool
+) -> None:
     """Cross-site images, scripts and frames are refused, based on Sec-Fetch-Site; links from other sites work."""
     for server in servers:
         for path in server.paths:

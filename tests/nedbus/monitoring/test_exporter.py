@@ -15,7 +15,9 @@ from tests.flights.messages import VALID, VLP, message
 WING = Address("wing", VLP)
 
 
-def test_stream_that_begins_during_a_poll_keeps_its_source(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stream_that_begins_during_a_poll_keeps_its_source(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A stream whose first message arrives while vehicles are polled has the label of its source.
 
     A topic that is sent on change may not have another message for the rest of the flight.
@@ -40,13 +42,17 @@ def test_retained_and_forgotten_streams_have_no_metrics(bus: nedbus.Bus) -> None
 
     def labels() -> list[str]:
         page = exporter.pages["/metrics"]().content.decode()
-        return [line for line in page.splitlines() if line.startswith("nedbus_messages_received_total{")]
+        return [
+            line for line in page.splitlines() if line.startswith("nedbus_messages_received_total{")
+        ]
 
     for source in ("ulog", "sim"):
         exporter.add(replace(sample, provenance=Provenance(source)))
     exporter.add(replace(sample, address=Address("quad", VLP), retained=True))
     assert len(exporter.monitor) == 2
-    assert labels() == [f'nedbus_messages_received_total{{source="sim",topic="{VLP}",vehicle="wing"}} 2.0']
+    assert labels() == [
+        f'nedbus_messages_received_total{{source="sim",topic="{VLP}",vehicle="wing"}} 2.0'
+    ]
     exporter.monitor.forget(WING)
     assert labels() == []
 

@@ -41,7 +41,9 @@ def server() -> Iterator[HttpClient]:
         yield HttpClient(server.port)
 
 
-def test_unknown_path_returns_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
+def test_unknown_path_returns_404_and_failing_page_500(
+    server: HttpClient, caplog: pytest.LogCaptureFixture
+) -> None:
     """404 and / list the available pages; a page that raises, even a panic, returns 500 and is logged."""
     assert server.request("/other") == (404, "available pages: /page, /fails, /panics, /waits\n")
     assert server.request("/")[0] == 200
@@ -87,19 +89,30 @@ def test_malformed_requests_are_rejected(
 
 STALLED = pytest.mark.parametrize(
     ("sent", "each_second"),
-    [(b"", b""), (b"GET /page HTTP/1.0\r\nHost:", b""), (b"GET /", b"a"), (b"GET /large HTTP/1.0\r\n\r\n", b"")],
+    [
+        (b"", b""),
+        (b"GET /page HTTP/1.0\r\nHost:", b""),
+        (b"GET /", b"a"),
+        (b"GET /large HTTP/1.0\r\n\r\n", b""),
+    ],
     ids=["no request", "half a request", "byte by byte", "response not read"],
 )
 
 
 @contextmanager
-def stalled(count: int, sent: bytes, each_second: bytes) -> Iterator[tuple[HttpServer, list[socket.socket]]]:
+def stalled(
+    count: int, sent: bytes, each_second: bytes
+) -> Iterator[tuple[HttpServer, list[socket.socket]]]:
     """Run a server with clients that stall in sending or reading."""
     large = Page.text("x" * 20_000_000)  # exceeds the socket buffers
-    server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})
+    server = HttpServer(
+        "127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")}
+    )
     with closing(server), ExitStack() as clients:
         where = "127.0.0.1", server.port
-        slow = [clients.enter_context(socket.create_connection(where, DEADLINE)) for _ in range(count)]
+        slow = [
+            clients.enter_context(socket.create_connection(where, DEADLINE)) for _ in range(count)
+        ]
 
         def send(data: bytes) -> None:
             for client in slow:
@@ -124,7 +137,8 @@ def test_stalled_clients_delay_no_others(timings: Timings, sent: bytes, each_sec
     with stalled(40, sent, each_second) as (server, _):
         for _ in range(20):
             assert HttpClient(server.port).request("/page") == (200, "a page\n")
-            assert threads_since(before) <= 2 + http_server._MAX_REQUESTS  # accepting, and sending bytes
+            # accepting, and sending bytes
+            assert threads_since(before) <= 2 + http_server._MAX_REQUESTS
 
 
 @STALLED
@@ -158,7 +172,9 @@ def test_close_does_not_wait_for_clients(timings: Timings) -> None:
     server = HttpServer("127.0.0.1:0", {"/large": make})
     with ExitStack() as clients:
         for _ in range(17):
-            client = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
+            client = clients.enter_context(
+                socket.create_connection(("127.0.0.1", server.port), DEADLINE)
+            )
             client.sendall(b"GET /large HTTP/1.0\r\n\r\n")
         for _ in range(16):
             assert made.acquire(timeout=DEADLINE)
@@ -180,7 +196,8 @@ def test_client_beyond_thread_limit_waits(server: HttpClient) -> None:
     """While 16 clients are served, another client waits; all clients get their responses."""
     with ThreadPoolExecutor(17) as pool:
         answers = []
-        for _ in range(16):  # sequential: a client that has not yet sent its request may be disconnected
+        # sequential: a client that has not yet sent its request may be disconnected
+        for _ in range(16):
             answers.append(pool.submit(server.request, "/waits"))
             assert BUSY.acquire(timeout=DEADLINE)
         answers.append(pool.submit(server.request, "/waits"))

@@ -16,13 +16,17 @@ from tests.flights.messages import VLP, message
 from tests.waits import wait_for
 
 
-def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_losses_on_the_link_of_a_vehicle_are_live_events(
+    bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """Live `events` shows losses that a service reports, once each: begin, duration, count and the service."""
     event_log, address = EventLog(), Address("7", VLP)
     server = QueryServer(zenoh_session)
     server.answer_json(
         status_key("gcs", vehicle="7"),
-        lambda _: reply_parts(report_of(event_log, "gcs", "host", 200.0, within=math.inf, to_utc=1.7e9)),
+        lambda _: reply_parts(
+            report_of(event_log, "gcs", "host", 200.0, within=math.inf, to_utc=1.7e9)
+        ),
     )
 
     def lose(start: int) -> None:
@@ -46,4 +50,6 @@ def test_losses_on_the_link_of_a_vehicle_are_live_events(bus: nedbus.Bus, zenoh_
         wait_for(poll, what="the losses")
         poll()
     text = f"800 messages lost in 7.0 s ({VLP}), on the link to the service gcs"
-    assert [(event.vehicle, event.text, event.time) for event in shown] == [("7", text, 1.7e9 + 150)]
+    assert [(event.vehicle, event.text, event.time) for event in shown] == [
+        ("7", text, 1.7e9 + 150)
+    ]

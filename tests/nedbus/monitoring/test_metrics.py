@@ -44,7 +44,9 @@ from tests.peers.prometheus import start_promtool
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 # nedbus without the extra `metrics`.
-WITHOUT_CLIENT = "import sys; sys.modules['prometheus_client'] = None; from nedbus.cli import main; main()"
+WITHOUT_CLIENT = (
+    "import sys; sys.modules['prometheus_client'] = None; from nedbus.cli import main; main()"
+)
 SERVE, EXPORT = ("serve", "-s", "sim:"), ("export",)
 Serve = Callable[..., Process]
 
@@ -59,7 +61,9 @@ def serve(run_nedbus: Start, pages: HttpClient, endpoint: str) -> Serve:
     """Start services with HTTP pages at this test's router, and wait until they serve them."""
 
     def serve(*sources: str, connect: str = endpoint) -> Process:
-        service = run_nedbus("serve", "-c", connect, "--http", pages.where, *[f"--source={text}" for text in sources])
+        service = run_nedbus(
+            "serve", "-c", connect, "--http", pages.where, *[f"--source={text}" for text in sources]
+        )
         wait_for(lambda: pages.request("/healthz")[0] == 200, what=f"the pages: {service.err}")
         return service
 
@@ -70,7 +74,10 @@ def serve(run_nedbus: Start, pages: HttpClient, endpoint: str) -> Serve:
 def exporting(bus: nedbus.Bus) -> Iterator[HttpClient]:
     """Run an exporter as `nedbus export` does, and serve its pages."""
     exporter, stop = Exporter(bus, nedbus.Selection(), version="0"), threading.Event()
-    with ThreadPoolExecutor(1) as pool, closing(HttpServer("127.0.0.1:0", exporter.pages)) as server:
+    with (
+        ThreadPoolExecutor(1) as pool,
+        closing(HttpServer("127.0.0.1:0", exporter.pages)) as server,
+    ):
         reading = pool.submit(exporter.run, stop)
         try:
             yield HttpClient(server.port)
@@ -112,7 +119,10 @@ def test_exporter_measures_loss_latency_and_invalid_payloads(
     with exporting(bus) as pages:
         wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
         for number in numbers:
-            info, content = zenoh.SourceInfo(publisher.id, number), encode(message(10_000 * number, **VALID))
+            info, content = (
+                zenoh.SourceInfo(publisher.id, number),
+                encode(message(10_000 * number, **VALID)),
+            )
             publisher.put(content, source_info=info, timestamp=zenoh_session.new_timestamp())
         zenoh_session.put(f"nedbus/8/{VLP}", b"junk")
         received = "nedbus_messages_received_total"
@@ -120,7 +130,9 @@ def test_exporter_measures_loss_latency_and_invalid_payloads(
         assert pages.values("nedbus_messages_lost_total", **of_stream) == [2]
         assert pages.values("nedbus_latency_seconds_count", **of_stream) == [len(numbers)]
         assert 0 <= pages.values("nedbus_latency_seconds_sum", **of_stream)[0] < 60
-        wait_for(lambda: pages.values("nedbus_messages_invalid_total") == [1], what="the invalid payload")
+        wait_for(
+            lambda: pages.values("nedbus_messages_invalid_total") == [1], what="the invalid payload"
+        )
         assert (
             pages.values("nedbus_messages_dropped_total")
             == pages.values("nedbus_limit_reached_total", limit="keys")
@@ -134,23 +146,34 @@ def test_exporter_measures_loss_latency_and_invalid_payloads(
     assert "Traceback" not in caplog.text
 
 
-def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
+def test_healthy_vehicle_is_ok_on_vehicles_page(
+    serve: Serve, pages: HttpClient, tmp_path: Path
+) -> None:
     """/vehicles returns 200 with a line for each healthy vehicle, and no condition is exported."""
     times = range(100_000, 300_000_000, 100_000)
     well = write_log(tmp_path / "well.ulg", times, **VALID)
     serve(f"ulog:{well}?vehicle=7")
-    wait_for(lambda: pages.values("nedbus_vehicle_state", vehicle="7", state="ok") == [1], what="the vehicle")
+    wait_for(
+        lambda: pages.values("nedbus_vehicle_state", vehicle="7", state="ok") == [1],
+        what="the vehicle",
+    )
     assert pages.request("/vehicles") == (200, "7 ok\n")
     assert pages.values("nedbus_vehicle_condition") == []
     assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
 
 
-def test_bad_vehicle_returns_503_only_on_vehicles_page(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
+def test_bad_vehicle_returns_503_only_on_vehicles_page(
+    serve: Serve, pages: HttpClient, tmp_path: Path
+) -> None:
     """For a bad vehicle /vehicles returns 503 and a metric is exported; /healthz and /readyz still return 200."""
     times = range(100_000, 300_000_000, 100_000)
     logs = {
-        "lost": write_log(tmp_path / "lost.ulg", times, **{**VALID, "xy_valid": False, "dead_reckoning": True}),
-        "doubtful": write_log(tmp_path / "doubtful.ulg", times, **{**VALID, "dead_reckoning": True}),
+        "lost": write_log(
+            tmp_path / "lost.ulg", times, **{**VALID, "xy_valid": False, "dead_reckoning": True}
+        ),
+        "doubtful": write_log(
+            tmp_path / "doubtful.ulg", times, **{**VALID, "dead_reckoning": True}
+        ),
     }
     serve(*[f"ulog:{log}?vehicle={name}" for name, log in logs.items()])
     wait_for(lambda: len(pages.values("nedbus_vehicle_condition")) == 3, what="the conditions")
@@ -158,36 +181,55 @@ def test_bad_vehicle_returns_503_only_on_vehicles_page(serve: Serve, pages: Http
         (each.labels["vehicle"], each.labels["condition"])
         for each in pages.families()["nedbus_vehicle_condition"].samples
     }
-    assert found == {("lost", "xy_invalid"), ("lost", "dead_reckoning"), ("doubtful", "dead_reckoning")}
+    assert found == {
+        ("lost", "xy_invalid"),
+        ("lost", "dead_reckoning"),
+        ("doubtful", "dead_reckoning"),
+    }
     assert pages.values("nedbus_vehicle_state", vehicle="lost", state="bad") == [1]
     assert pages.values("nedbus_vehicle_state", vehicle="doubtful", state="watch") == [1]
     status, text = pages.request("/vehicles")
     assert status == 503
     assert re.fullmatch(r"vehicle lost: xy not valid, since [\d:.]+ UTC \(.*\)\n", text)
-    assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert (pages.request("/healthz"), pages.request("/readyz")) == (
+        (200, "ok\n"),
+        (200, "ready\n"),
+    )
 
 
-def test_exporter_reports_vehicle_states(bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
+def test_exporter_reports_vehicle_states(
+    bus: nedbus.Bus, zenoh_session: Session, endpoint: str
+) -> None:
     """An exporter derives vehicle states and event counts from the messages that it receives."""
     with nedbus.connect(endpoint) as reader, exporting(reader) as pages, ExitStack() as closing:
         wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
-        position, state = bus.publisher(VLP, vehicle="7"), bus.publisher("vehicle_status", vehicle="7")
+        position, state = (
+            bus.publisher(VLP, vehicle="7"),
+            bus.publisher("vehicle_status", vehicle="7"),
+        )
         numbers, failsafe = itertools.count(1), threading.Event()
 
         def publish() -> None:
             number = 20_000 * next(numbers)
             position.publish(message(number, **VALID))
-            state.publish(VehicleStatus.model_validate({"timestamp": number, "failsafe": failsafe.is_set()}))
+            state.publish(
+                VehicleStatus.model_validate({"timestamp": number, "failsafe": failsafe.is_set()})
+            )
 
         closing.enter_context(repeating(publish))
         wait_for(lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="the vehicle")
         (before,) = pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")
         failsafe.set()
-        wait_for(lambda: pages.request("/vehicles")[1].startswith("vehicle 7: failsafe, since "), what="failsafe")
+        wait_for(
+            lambda: pages.request("/vehicles")[1].startswith("vehicle 7: failsafe, since "),
+            what="failsafe",
+        )
         assert pages.values("nedbus_vehicle_condition", vehicle="7", condition="failsafe") == [1]
         assert pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")[0] > before
         failsafe.clear()
-        wait_for(lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="the end of the failsafe")
+        wait_for(
+            lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="the end of the failsafe"
+        )
 
 
 def test_text_from_peers_is_one_line_on_vehicles_page() -> None:
@@ -196,8 +238,14 @@ def test_text_from_peers_is_one_line_on_vehicles_page() -> None:
     page = vehicles_page(AccountReport("service", "host", 2.0, vehicles={"7": report}))
     assert page == Page.text("7 rejected:  8 ok [2J, since 00:00:01.0 UTC (1.0 s)")
     forgotten = VehicleReport("bad", "no position", 1.0, ("silent",))
-    assert vehicles_page(AccountReport("service", "host", 5000.0, vehicles={"7": forgotten})).status == 200
-    assert vehicles_page(AccountReport("service", "host", 50.0, vehicles={"7": forgotten})).status == 503
+    assert (
+        vehicles_page(AccountReport("service", "host", 5000.0, vehicles={"7": forgotten})).status
+        == 200
+    )
+    assert (
+        vehicles_page(AccountReport("service", "host", 50.0, vehicles={"7": forgotten})).status
+        == 503
+    )
     assert vehicles_page(AccountReport("service", "host", 50.0, {})) == Page.text("no vehicles")
 
 
@@ -207,14 +255,20 @@ def test_flapping_flag_stays_a_condition(every: int) -> None:
     event_log, address = EventLog(), Address("7", VLP)
     for number in range(100):
         is_valid = number // every % 2 == 0
-        event_log.add(address, message(20_000 * (number + 1), **{**VALID, "xy_valid": is_valid}), 0.02 * number)
+        event_log.add(
+            address,
+            message(20_000 * (number + 1), **{**VALID, "xy_valid": is_valid}),
+            0.02 * number,
+        )
         if number > 5 * every:
             assert event_log.state("7", 0.02 * number).text.startswith("xy not valid")
     event_log.update(10.0, {address: "ok"})
     assert event_log.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
-def test_metrics_pass_promtool_check(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
+def test_metrics_pass_promtool_check(
+    serve: Serve, pages: HttpClient, start: Start, tmp_path: Path
+) -> None:
     """`promtool check metrics` accepts all names, units, types and help texts."""
     serve("sim:", f"mavlink:udpin:127.0.0.1:{free_port()}")
     text = tmp_path / "metrics"
@@ -228,15 +282,28 @@ def test_rejections_are_counted_by_rule(serve: Serve, pages: HttpClient, tmp_pat
     log = tmp_path / "flight.ulg"
     writer = UlogWriter()
     writer.define([VLP])
-    wrong: tuple[dict[str, object], ...] = ({}, {"eph": -1.0}, {"timestamp_sample": 9}, {"eph": -2.0})
+    wrong: tuple[dict[str, object], ...] = (
+        {},
+        {"eph": -1.0},
+        {"timestamp_sample": 9},
+        {"eph": -2.0},
+    )
     for number, fields in enumerate(wrong, 1):
-        writer.add(VLP, VehicleLocalPosition.model_construct(**{**message(number).__dict__, **fields}))
+        writer.add(
+            VLP, VehicleLocalPosition.model_construct(**{**message(number).__dict__, **fields})
+        )
     writer.write(log)
     source = f"ulog:{log}"
     serve(source)
-    wait_for(lambda: pages.values("nedbus_source_rejected_total", source=source) == [3], what="the rejections")
+    wait_for(
+        lambda: pages.values("nedbus_source_rejected_total", source=source) == [3],
+        what="the rejections",
+    )
     rejected = pages.families()["nedbus_messages_rejected"].samples
-    rules = {"eph: must not be negative": 2, "timestamp_sample: must not be later than timestamp": 1}
+    rules = {
+        "eph: must not be negative": 2,
+        "timestamp_sample: must not be later than timestamp": 1,
+    }
     assert {sample.labels["rule"]: sample.value for sample in rejected} == rules
     assert pages.values("nedbus_messages_published_total") == [1]
 
@@ -251,7 +318,9 @@ def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: HttpCli
     assert len(pages.values("nedbus_source_state", source="sim: (2)")) == 6
 
 
-def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
+def test_failed_or_silent_source_is_not_ready(
+    serve: Serve, pages: HttpClient, tmp_path: Path
+) -> None:
     """/readyz returns 503 with a line for each failed and each silent live source; /healthz still returns 200.
 
     A replay that waits for a reader is ready.
@@ -259,13 +328,18 @@ def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: HttpClient, t
     missing, silent = f"ulog:{tmp_path / 'missing.ulg'}", f"mavlink:udpin:127.0.0.1:{free_port()}"
     serve(missing, silent, "sim:?wait=1")
     failed = f"{missing}: retrying: {tmp_path / 'missing.ulg'}: no such file or directory\n"
-    wait_for(lambda: pages.request("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"), what="both sources")
+    wait_for(
+        lambda: pages.request("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"),
+        what="both sources",
+    )
     assert pages.request("/healthz")[0] == 200
     assert sorted(pages.values("nedbus_source_addresses")) == [0, 0, 12]
     assert pages.values("nedbus_source_state", state="waiting") == [0, 1, 1]
 
 
-def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_nedbus: Start, pages: HttpClient) -> None:
+def test_service_and_exporter_without_router_are_not_ready(
+    serve: Serve, run_nedbus: Start, pages: HttpClient
+) -> None:
     """/readyz returns 503 before the router starts, 200 while it runs, and 503 after it has stopped."""
     where, exported = free_endpoint(), HttpClient(free_port())
     serve("sim:", connect=where)
@@ -274,12 +348,19 @@ def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_ned
     router = run_nedbus("router", "-l", where)
     run_nedbus("export", "--wait", "-c", where, "--http", exported.where)
     both = (pages, exported)
-    wait_for(lambda: {each.request("/readyz") for each in both} == {(200, "ready\n")}, what="the router")
+    wait_for(
+        lambda: {each.request("/readyz") for each in both} == {(200, "ready\n")}, what="the router"
+    )
     router.kill()
     no_router = (503, f"no router answers at {where}\n")
-    wait_for(lambda: {each.request("/readyz") for each in both} == {no_router}, what="the end of the router")
+    wait_for(
+        lambda: {each.request("/readyz") for each in both} == {no_router},
+        what="the end of the router",
+    )
     assert exported.request("/vehicles") == no_router
-    assert pages.values("nedbus_sessions", role="client") == exported.values("nedbus_connected") == [0]
+    assert (
+        pages.values("nedbus_sessions", role="client") == exported.values("nedbus_connected") == [0]
+    )
 
 
 def test_missing_prometheus_client_returns_501_with_install_hint(
@@ -291,7 +372,9 @@ def test_missing_prometheus_client_returns_501_with_install_hint(
     status, text = pages.request("/metrics")
     assert status == 501
     assert re.fullmatch(r"prometheus_client: not installed; .*pip install .*\[metrics\]'\n", text)
-    exporter = start("-c", WITHOUT_CLIENT, "export", "-c", endpoint, "--http", f"127.0.0.1:{free_port()}")
+    exporter = start(
+        "-c", WITHOUT_CLIENT, "export", "-c", endpoint, "--http", f"127.0.0.1:{free_port()}"
+    )
     assert exporter.wait() == 2
     assert exporter.err == f"nedbus: {text}"
 
@@ -310,7 +393,9 @@ def test_port_in_use_is_a_one_line_error(endpoint: str, command: tuple[str, ...]
 
 @pytest.mark.parametrize("command", [SERVE, EXPORT])
 @pytest.mark.parametrize("where", ["9464", "127.0.0.1:metrics", "127.0.0.1:65536", "::1:9464"])
-def test_malformed_http_address_is_a_one_line_error(endpoint: str, command: tuple[str, ...], where: str) -> None:
+def test_malformed_http_address_is_a_one_line_error(
+    endpoint: str, command: tuple[str, ...], where: str
+) -> None:
     """A malformed address is a one-line error with the expected form and exit code 2."""
     ended = run_command(*command, "-c", endpoint, "--http", where)
     assert (ended.exit_code, ended.err.count("\n")) == (2, 1)
@@ -330,16 +415,23 @@ def streams(count: int, topic: str = VLP) -> list[MeasuredStream]:
     for each in range(3):
         health.add(message(each), received=each, lost=each)
     return [
-        MeasuredStream((f"v{number}", topic, f"source {number % 2}"), health.snapshot(3)) for number in range(count)
+        MeasuredStream((f"v{number}", topic, f"source {number % 2}"), health.snapshot(3))
+        for number in range(count)
     ]
 
 
 def test_streams_beyond_limit_are_summed_by_source() -> None:
     """For streams beyond 1,000, only the sums of their counts per source are exported."""
     count = MAX_STREAMS + 201
-    families = {each.name: each for each in stream_metrics(streams(count), messages="nedbus_messages_received")}
+    families = {
+        each.name: each
+        for each in stream_metrics(streams(count), messages="nedbus_messages_received")
+    }
     assert families["nedbus_streams"].samples[0].value == count
-    messages = {tuple(sample.labels.values()): sample.value for sample in families["nedbus_messages_received"].samples}
+    messages = {
+        tuple(sample.labels.values()): sample.value
+        for sample in families["nedbus_messages_received"].samples
+    }
     assert len(messages) == MAX_STREAMS + 2
     assert messages["other", "other", "source 0"] == 3 * 101
     assert messages["other", "other", "source 1"] == 3 * 100
@@ -351,8 +443,12 @@ def test_streams_beyond_limit_are_summed_by_source() -> None:
 def test_positions_are_exported_before_other_streams() -> None:
     """Positions keep their series when the limit is exceeded; streams without a nominal rate have no age."""
     many = [*streams(2, "home_position"), *streams(MAX_STREAMS, "battery_status"), *streams(3)]
-    families = {each.name: each for each in stream_metrics(many, messages="nedbus_messages_received")}
-    topics = Counter(sample.labels["topic"] for sample in families["nedbus_messages_received"].samples)
+    families = {
+        each.name: each for each in stream_metrics(many, messages="nedbus_messages_received")
+    }
+    topics = Counter(
+        sample.labels["topic"] for sample in families["nedbus_messages_received"].samples
+    )
     assert topics == {VLP: 3, "home_position": 2, "battery_status": MAX_STREAMS - 5, "other": 2}
     ages = {sample.labels["topic"] for sample in families["nedbus_stream_age_seconds"].samples}
     assert ages == {VLP, "battery_status"}
@@ -366,7 +462,9 @@ def test_labels_are_escaped() -> None:
     families = stream_metrics([*streams(3), strange], messages="nedbus_messages_received")
     text = metrics_page(families).content.decode()
     found = read_families(text)
-    assert [each.labels["source"] for each in found["nedbus_messages_received"].samples][-1] == source
+    assert [each.labels["source"] for each in found["nedbus_messages_received"].samples][
+        -1
+    ] == source
     assert [each.value for each in found["nedbus_latency_seconds"].samples] == [0, 0, 0, 0, 0]
     assert text.count("\n# TYPE process_") == 6
 
@@ -376,7 +474,9 @@ def test_blocked_source_is_not_healthy(endpoint: str, monkeypatch: pytest.Monkey
     pages = service_pages(Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0"))
     assert pages["/healthz"]() == Page.text("ok")
     monkeypatch.setattr(Daemon, "busy", 20.0)
-    assert pages["/healthz"]() == Page.text("a source has been blocked by one message for 20 s", status=503)
+    assert pages["/healthz"]() == Page.text(
+        "a source has been blocked by one message for 20 s", status=503
+    )
 
 
 def test_failed_reader_ends_the_exporter(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -402,7 +502,10 @@ def test_forgotten_stream_has_no_series(bus: nedbus.Bus, endpoint: str, timings:
     ):
 
         def ages() -> set[str]:
-            return {each.labels["vehicle"] for each in pages.families()["nedbus_stream_age_seconds"].samples}
+            return {
+                each.labels["vehicle"]
+                for each in pages.families()["nedbus_stream_age_seconds"].samples
+            }
 
         for publisher in (here, gone):
             for number in (1, 2, 3):
@@ -422,7 +525,9 @@ def test_forgotten_stream_has_no_series(bus: nedbus.Bus, endpoint: str, timings:
 
 
 @pytest.mark.parametrize(("state", "active"), [("running", {"on", "off"}), ("done", set())])
-def test_ended_stream_has_no_age(monkeypatch: pytest.MonkeyPatch, state: State, active: set[str]) -> None:
+def test_ended_stream_has_no_age(
+    monkeypatch: pytest.MonkeyPatch, state: State, active: set[str]
+) -> None:
     """Streams of a replay that has ended have only counts; stale streams also have an age."""
     health = streams(1)[0].health
     both = tuple(StreamStatus(f"{vehicle}/{VLP}", health) for vehicle in ("on", "off"))
@@ -431,9 +536,13 @@ def test_ended_stream_has_no_age(monkeypatch: pytest.MonkeyPatch, state: State, 
     page = service_pages(Daemon(load_settings(source=("sim:",)), version="0"))["/metrics"]()
     found = read_families(page.content.decode())
     counts, of_now = ("messages_published", "resets"), ("age_seconds", "rate_hertz", "flag_ratio")
-    expected = {name: {"on", "off"} for name in counts} | {f"stream_{name}": active for name in of_now}
+    expected = {name: {"on", "off"} for name in counts} | {
+        f"stream_{name}": active for name in of_now
+    }
     for name, vehicles in expected.items():
-        assert {each.labels["vehicle"] for each in found[f"nedbus_{name}"].samples} == vehicles, name
+        assert {each.labels["vehicle"] for each in found[f"nedbus_{name}"].samples} == vehicles, (
+            name
+        )
 
 
 def test_report_of_950_vehicles_is_complete(endpoint: str) -> None:
@@ -448,7 +557,9 @@ def test_report_of_950_vehicles_is_complete(endpoint: str) -> None:
     try:
         with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
             wait_for(bus.services, what="the service")
-            for seconds, flags in enumerate(({}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False})):
+            for seconds, flags in enumerate(
+                ({}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False})
+            ):
                 for name in names:
                     sent = message((seconds + 1) * 10**6, **VALID | flags)
                     daemon.event_log.add(Address(name, VLP), sent, clock.steady())
@@ -467,14 +578,17 @@ def test_report_of_950_vehicles_is_complete(endpoint: str) -> None:
     assert sum(len(report.events) for report in reports) >= 1900
 
 
-def test_scrape_takes_one_snapshot_per_stream(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scrape_takes_one_snapshot_per_stream(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A scrape computes the health of each stream once, because a page may list a thousand streams."""
     daemon = Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0")
     running = threading.Thread(target=daemon.run)
     running.start()
     try:
         wait_for(
-            lambda: [len(source.status.streams) for source in daemon.measures] == [12], what="a message of each stream"
+            lambda: [len(source.status.streams) for source in daemon.measures] == [12],
+            what="a message of each stream",
         )
         snapshots: list[StreamHealth] = []
         original = StreamHealth.snapshot

@@ -37,10 +37,10 @@ TIMEOUT = 90.0  # s until all alerts have fired, or cleared
 # nedbus with timeouts of one second for retransmission and backoff, and queues of 100 instead of 65,536 messages, which
 # a small burst overflows.
 SHORT_TIMEOUTS = """
-import nedbus.client.receiving.inbox
+import nedbus.limits
 from nedbus.cli import main
 from nedbus.timings import TIMINGS
-nedbus.client.receiving.inbox.CAPACITY = 100
+nedbus.limits.UNREAD_MESSAGES = 100
 TIMINGS.retransmit_timeout, TIMINGS.backoff = 1.0, (1.0,)
 main()
 """
@@ -54,9 +54,13 @@ def traffic(bus: nedbus.Bus, zenoh_session: Session, udp_port: int) -> Iterator[
     position, dead reckoning and failsafe, "many" sends bursts, and junk is sent to a key and to a MAVLink port.
     """
     bad = threading.Event()
-    gone, doubtful, many = (bus.publisher(VLP, vehicle=name) for name in ("gone", "doubtful", "many"))
+    gone, doubtful, many = (
+        bus.publisher(VLP, vehicle=name) for name in ("gone", "doubtful", "many")
+    )
     status = bus.publisher("vehicle_status", vehicle="doubtful")
-    junk, numbered = (zenoh_session.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost"))
+    junk, numbered = (
+        zenoh_session.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost")
+    )
     burst = to_array([message(number, **VALID) for number in range(1, 401)])
     numbers = count(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -70,10 +74,16 @@ def traffic(bus: nedbus.Bus, zenoh_session: Session, udp_port: int) -> Iterator[
             doubtful.publish(
                 message(
                     20_000 * number,
-                    **{**VALID, **dict.fromkeys(("xy_valid", "z_valid"), not is_bad), "dead_reckoning": is_bad},
+                    **{
+                        **VALID,
+                        **dict.fromkeys(("xy_valid", "z_valid"), not is_bad),
+                        "dead_reckoning": is_bad,
+                    },
                 )
             )
-            status.publish(VehicleStatus.model_validate({"timestamp": 20_000 * number, "failsafe": is_bad}))
+            status.publish(
+                VehicleStatus.model_validate({"timestamp": 20_000 * number, "failsafe": is_bad})
+            )
             numbered.put(encode(now), source_info=zenoh.SourceInfo(numbered.id, number))
             burst["timestamp"] += 20_000
             many.publish_many(burst if is_bad else burst[:1])
@@ -114,7 +124,9 @@ def test_every_alert_fires_and_clears(
         return start(PEER, "--to", f"127.0.0.1:{port}", "--values", str(values), *options)
 
     route = partial(run_nedbus, "router", "-l", second)
-    export_ended = partial(run_nedbus, "export", "-c", endpoint, "--vehicle", "gone", "--http", ended)
+    export_ended = partial(
+        run_nedbus, "export", "-c", endpoint, "--vehicle", "gone", "--http", ended
+    )
     sources = {
         "silent": f"mavlink:udpin:127.0.0.1:{silent}?vehicles=1:silent",
         "lossy": f"mavlink:udpin:127.0.0.1:{lossy}?vehicles=1:lossy",
@@ -139,7 +151,11 @@ def test_every_alert_fires_and_clears(
         *[f"--source={text}" for text in sources.values()],
     )
     prometheus = Prometheus(start, tmp_path, rules, {"nedbus": addresses})
-    wait_for(lambda: len(prometheus.query("up == 1")) == 8, what="all eight to be scraped", seconds=TIMEOUT)
+    wait_for(
+        lambda: len(prometheus.query("up == 1")) == 8,
+        what="all eight to be scraped",
+        seconds=TIMEOUT,
+    )
 
     expected: dict[str, list[dict[str, str]]] = {
         "NedbusDown": [{"instance": ended}],
@@ -149,10 +165,15 @@ def test_every_alert_fires_and_clears(
         "NedbusSourceDown": [{"source": sources["missing"], "state": "retrying"}],
         "NedbusSourceSilent": [{"source": sources["silent"]}],
         "NedbusStreamStale": [{"vehicle": "gone", "topic": VLP, "instance": exporter}],
-        "NedbusPositionInvalid": [{"vehicle": "doubtful", "condition": kind} for kind in ("xy_invalid", "z_invalid")],
+        "NedbusPositionInvalid": [
+            {"vehicle": "doubtful", "condition": kind} for kind in ("xy_invalid", "z_invalid")
+        ],
         "NedbusDeadReckoning": [{"vehicle": "doubtful"}],
         "NedbusVehicleFailsafe": [{"vehicle": "doubtful"}],
-        "NedbusMessagesLost": [{"source": sources["lossy"]}, {"vehicle": "lost", "instance": exporter}],
+        "NedbusMessagesLost": [
+            {"source": sources["lossy"]},
+            {"vehicle": "lost", "instance": exporter},
+        ],
         "NedbusMessagesRejected": [{"source": sources["silent"]}],
         "NedbusPayloadsInvalid": [{"instance": exporter}],
         "NedbusReaderSlow": [{"instance": exporter}],
@@ -161,7 +182,9 @@ def test_every_alert_fires_and_clears(
 
     with traffic(bus, zenoh_session, silent) as bad, ExitStack() as crowd:
         of_gone = f'nedbus_messages_received_total{{instance="{exporter}", vehicle="gone"}} > 10'
-        wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=TIMEOUT)
+        wait_for(
+            lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=TIMEOUT
+        )
         bad.set()
         for _ in range(6):  # with the exporter's two sessions, eight of ten
             crowd.enter_context(nedbus.connect(small))
@@ -169,8 +192,13 @@ def test_every_alert_fires_and_clears(
         to_end.kill()
         for name, causes in expected.items():
             for cause in causes:
-                wait_for(partial(prometheus.alerts, name, **cause), what=f"{name} {cause}", seconds=TIMEOUT)
-        assert not [text for text in prometheus.annotations() if "<" in text]  # <no value>, <error expanding template>
+                wait_for(
+                    partial(prometheus.alerts, name, **cause),
+                    what=f"{name} {cause}",
+                    seconds=TIMEOUT,
+                )
+        # <no value>, <error expanding template>
+        assert not [text for text in prometheus.annotations() if "<" in text]
 
         bad.clear()
         crowd.close()
@@ -180,9 +208,12 @@ def test_every_alert_fires_and_clears(
         vehicle.kill()
         fly(lossy)
         fly(silent)
-        write_log(missing, range(0, 10_000_000, 100_000), topic="vehicle_local_position_groundtruth")
+        write_log(
+            missing, range(0, 10_000_000, 100_000), topic="vehicle_local_position_groundtruth"
+        )
         for name in expected:
-            wait_for(lambda: not prometheus.alerts(name), what=f"the end of {name}", seconds=TIMEOUT)  # noqa: B023 - called immediately
+            has_ended = partial(lambda alert: not prometheus.alerts(alert), name)
+            wait_for(has_ended, what=f"the end of {name}", seconds=TIMEOUT)
     assert not any(prometheus.scrape_errors().values())
     assert not prometheus.process.err
 
@@ -200,12 +231,18 @@ def start_small_router(run_nedbus: Start, folder: Path, service: str, exporter: 
 
 def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], None]:
     """Start a service whose router refuses its vehicle; return a function that adds access rules for it."""
-    pki, file, endpoint = folder / "pki", folder / "secure.json5", free_endpoint().replace("tcp/", "tls/")
+    pki, file, endpoint = (
+        folder / "pki",
+        folder / "secure.json5",
+        free_endpoint().replace("tcp/", "tls/"),
+    )
     make_authority(pki)
     make_certificate(pki, "router", hosts=["127.0.0.1"])
     make_certificate(pki, "vehicle-2")
     shipped = (PACKAGING.parent / "config" / "router-secure.json5").read_text()
-    file.write_text(shipped.replace("/etc/nedbus/pki", str(pki)).replace("tls/0.0.0.0:7447", endpoint))
+    file.write_text(
+        shipped.replace("/etc/nedbus/pki", str(pki)).replace("tls/0.0.0.0:7447", endpoint)
+    )
     router = run_nedbus("router", str(file))
     files = {"ca": "ca.crt", "certificate": "vehicle-2.crt", "key": "vehicle-2.key"}
     shown = [f"--tls-{option}={pki / name}" for option, name in files.items()]
@@ -233,7 +270,8 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
             "nedbus_stream_age_seconds 0+1x30; nedbus_stream_usual_rate_hertz 0.2x30",
             {"14s": False, "21s": True},
         ),
-        (  # a count by rule first appears as 1, which increase() misses; the source's count was 0 before
+        # a count by rule first appears as 1, which increase() misses; the source's count was 0 before
+        (
             "NedbusMessagesRejected",
             "nedbus_source_rejected_total 0x30 1x500; nedbus_messages_rejected_total _x30 1x500",
             {"25s": False, "45s": True, "5m45s": False},
@@ -265,7 +303,9 @@ def test_rules_fire_only_after_their_duration(
         inputs.append({"series": f"{metric}}}" if "{" in metric else metric, "values": values})
     head, *rules = ALERTS.read_text().split("      - alert: ")
     alone, file = tmp_path / "alone.yml", tmp_path / "test.yml"  # JSON is YAML
-    alone.write_text(head + "".join(f"      - alert: {rule}" for rule in rules if rule.startswith(f"{name}\n")))
+    alone.write_text(
+        head + "".join(f"      - alert: {rule}" for rule in rules if rule.startswith(f"{name}\n"))
+    )
     expected = [{"eval_time": time, "alertname": name, "exp_alerts": []} for time in times]
     file.write_text(
         json.dumps({"rule_files": [str(alone)], "evaluation_interval": "1s", "tests": [
@@ -297,7 +337,11 @@ def test_dashboard_and_rules_use_existing_metrics(
 ) -> None:
     """Each metric in rules and dashboard is exported by a service or an exporter; each query returns data."""
     dashboard = json.loads((PACKAGING / "grafana" / "nedbus.json").read_text())
-    assert {each["name"] for each in dashboard["templating"]["list"]} == {"datasource", "vehicle", "topic"}
+    assert {each["name"] for each in dashboard["templating"]["list"]} == {
+        "datasource",
+        "vehicle",
+        "topic",
+    }
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     addresses = [f"127.0.0.1:{free_port()}" for _ in range(3)]
     run_nedbus("serve", "-c", endpoint, "-s", "sim:", "--http", addresses[0])
@@ -305,15 +349,22 @@ def test_dashboard_and_rules_use_existing_metrics(
     run_nedbus("export", "-c", endpoint, "--http", addresses[1])
     prometheus = Prometheus(start, tmp_path, ALERTS.read_text(), {"nedbus": addresses})
     for query in queries:
-        filled = re.sub(r"\$__(rate_interval|range)", "10s", query).replace("$vehicle", ".*").replace("$topic", "ve.*")
+        filled = (
+            re.sub(r"\$__(rate_interval|range)", "10s", query)
+            .replace("$vehicle", ".*")
+            .replace("$topic", "ve.*")
+        )
         assert "$" not in filled
-        found = partial(prometheus.query, filled.removesuffix(" > 0"))  # the panel shows only increases
+        # the panel shows only increases
+        found = partial(prometheus.query, filled.removesuffix(" > 0"))
         if "rejected" in query:  # no series before the first rejection
             found()
         else:
             wait_for(found, what=query)
     exposed = {each["__name__"] for each, _ in prometheus.query('{__name__!=""}')}
     used = set(re.findall(r"\b(?:nedbus|process)_\w+", " ".join([*queries, ALERTS.read_text()])))
-    without = {"nedbus_messages_rejected_total", "nedbus_vehicle_refused"}  # only with a fault or TLS
-    assert used - exposed - {"nedbus_vehicle_condition"} == without  # exported by the simulation only at times
+    # only with a fault or TLS
+    without = {"nedbus_messages_rejected_total", "nedbus_vehicle_refused"}
+    # exported by the simulation only at times
+    assert used - exposed - {"nedbus_vehicle_condition"} == without
     assert len(used) > 20

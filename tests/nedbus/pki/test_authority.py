@@ -102,7 +102,8 @@ def join(file: Path, pki: Path) -> Iterator[Join]:
 
 def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others: list[str]) -> None:
     """Assert that a reader receives what the bus publishes as this vehicle, but nothing it published as others before."""
-    publishers = {name: bus._publishers.publisher(Address(name, VLP)) for name in [*others, vehicle]}  # as a service
+    # as a service
+    publishers = {name: bus._publishers.publisher(Address(name, VLP)) for name in [*others, vehicle]}
     with reader.subscribe("*", mode="every") as subscription:
 
         def publish() -> bool:

@@ -39,7 +39,13 @@ from nedbus.flights import RecordingWriter
 from nedbus.flights.readers.mcap import McapReader
 from nedbus_msgs import DEFAULT, TOPICS, Address, Provenance
 from nedbus_msgs.arrays import MessageArray, to_array
-from tests.flights.local_position import ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
+from tests.flights.local_position import (
+    ROS2_TYPE,
+    downgrade,
+    encode_cdr,
+    message_definition,
+    upgrade,
+)
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_recording, open_replay
 from tests.flights.ulogs import LOGS, UlogWriter
@@ -79,7 +85,11 @@ def write_recording(path: Path, *, finish: bool) -> Path:
     writer = RecordingWriter(path)
     for start in range(0, len(messages), 40):
         part = messages[start : start + 40]
-        streams = [(Address(vehicle, a.topic, a.instance), Provenance("sim")) for vehicle in "12" for a, _ in part]
+        streams = [
+            (Address(vehicle, a.topic, a.instance), Provenance("sim"))
+            for vehicle in "12"
+            for a, _ in part
+        ]
         both = to_array([each for _, each in part] * 2)
         times = [each * 1000 for each in both["timestamp"].tolist()]
         writer.write(both, DEFAULT, streams, logged=times, published=times)
@@ -92,7 +102,10 @@ def write_recording(path: Path, *, finish: bool) -> Path:
 
 
 def make_recordings(folder: Path) -> list[Path]:
-    found = [write_recording(folder / "whole.mcap", finish=True), write_recording(folder / "cut.mcap", finish=False)]
+    found = [
+        write_recording(folder / "whole.mcap", finish=True),
+        write_recording(folder / "cut.mcap", finish=False),
+    ]
     for log in sorted(LOGS.glob("*.ulg")) if TRIES > 1000 else []:
         convert_replay(f"ulog:{log}", folder / f"{log.stem}.mcap")
         found.append(folder / f"{log.stem}.mcap")
@@ -102,7 +115,9 @@ def make_recordings(folder: Path) -> list[Path]:
 def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], McapReader]:
     with open_recording(path) as reader:
         messages = [(each.stream, each.payload) for each in reader.records()]
-    return Counter((each.address, data + repr(sorted(each.lacking)).encode()) for each, data in messages), reader
+    return Counter(
+        (each.address, data + repr(sorted(each.lacking)).encode()) for each, data in messages
+    ), reader
 
 
 @pytest.mark.timeout(120 + TRIES)
@@ -110,7 +125,9 @@ def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], McapReader]
 def test_damaged_recording_yields_only_original_messages(tmp_path: Path, tries: int) -> None:
     """Each message that is read is an original one, none is repeated, and losses are reported."""
     rng = random.Random(12)
-    originals = [(path.read_bytes(), payloads_of(path)[0], path.stem) for path in make_recordings(tmp_path)]
+    originals = [
+        (path.read_bytes(), payloads_of(path)[0], path.stem) for path in make_recordings(tmp_path)
+    ]
     path = tmp_path / "damaged.mcap"
     outcomes: Counter[str] = Counter()
     for number in range(tries * 3 // 4):
@@ -139,7 +156,9 @@ def test_damaged_recording_yields_only_original_messages(tmp_path: Path, tries: 
             address = rng.choice([each for each, _ in original])
             expected = sum(count for (each, _), count in read.items() if each == address)
             if expected:
-                array = nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
+                array = nedbus.read(
+                    path, address.topic, vehicle=address.vehicle, instance=address.instance
+                )
                 assert len(array) == expected, where
     assert outcomes["lost"] > outcomes["rejected"], outcomes
     assert outcomes["whole"], outcomes
@@ -175,7 +194,10 @@ def shorten(log: Path, path: Path) -> Path:
 
 def make_logs(folder: Path) -> list[Path]:
     logs = sorted([*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").glob("*.ulg")])
-    return [write_log(folder / "ours.ulg"), *(shorten(log, folder / f"{log.stem}.ulg") for log in logs)]
+    return [
+        write_log(folder / "ours.ulg"),
+        *(shorten(log, folder / f"{log.stem}.ulg") for log in logs),
+    ]
 
 
 def rows_of(path: Path) -> dict[Address, MessageArray]:
@@ -184,18 +206,29 @@ def rows_of(path: Path) -> dict[Address, MessageArray]:
     Without log_message, because one flipped bit of the metadata alters all events.
     """
     return {
-        address: nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
+        address: nedbus.read(
+            path, address.topic, vehicle=address.vehicle, instance=address.instance
+        )
         for address in nedbus.addresses_of(path)
         if address.topic in TOPICS and address.topic != "log_message"
     }
 
 
-def count_rows(streams: dict[Address, MessageArray], missing: Mapping[str, set[str]]) -> Counter[tuple[str, bytes]]:
+def count_rows(
+    streams: dict[Address, MessageArray], missing: Mapping[str, set[str]]
+) -> Counter[tuple[str, bytes]]:
     """Count the messages of each topic by the values of all logged fields; damage may change the vehicle's name."""
     found: Counter[tuple[str, bytes]] = Counter()
     for address, messages in streams.items():
-        fields = [name for name in messages.dtype.names or () if name not in missing.get(address.topic, ())]
-        columns = [np.ascontiguousarray(messages[name]).view(np.uint8).reshape(len(messages), -1) for name in fields]
+        fields = [
+            name
+            for name in messages.dtype.names or ()
+            if name not in missing.get(address.topic, ())
+        ]
+        columns = [
+            np.ascontiguousarray(messages[name]).view(np.uint8).reshape(len(messages), -1)
+            for name in fields
+        ]
         found.update((address.topic, row.tobytes()) for row in np.hstack(columns))
     return found
 
@@ -304,11 +337,21 @@ def add_chunk(path: Path, records: bytes, *, size: int, compression: str, in_ind
 
 @pytest.mark.parametrize(
     ("size", "declared", "compression", "in_index"),
-    [(2**21, declared, compression, False) for declared in (2**21, 2**16) for compression in ("zstd", "lz4")]
+    [
+        (2**21, declared, compression, False)
+        for declared in (2**21, 2**16)
+        for compression in ("zstd", "lz4")
+    ]
     + [(2**21, 2**21, "zstd", True), (2**19, 2**19, "zstd", False)],
 )
 def test_oversized_chunk_is_skipped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, declared: int, compression: str, *, in_index: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    size: int,
+    declared: int,
+    compression: str,
+    *,
+    in_index: bool,
 ) -> None:
     """A chunk that would decompress to twice the limit, here 1 MiB, is skipped, whatever its declared size.
 
@@ -416,7 +459,9 @@ INVALID = {
 
 
 @pytest.mark.parametrize("invalid", INVALID.values(), ids=INVALID)
-def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_undecodable_message_is_skipped(
+    tmp_path: Path, invalid: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     """An undecodable message is rejected with its position, and counted; the others are replayed and read."""
     path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), invalid, payload(3)])
     run = open_replay(f"mcap:{path}")
@@ -433,7 +478,9 @@ def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: 
 def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
     """An undecodable message does not restart the replay: later messages are published once; the exit code is 0."""
     path = write_payloads(tmp_path / "a.mcap", [payload(1), BAD_BOOL, payload(2)])
-    service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
+    service = run_command(
+        "serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max"
+    )
     assert service.exit_code == 0, service.err
     assert "xy_valid is 2, not a bool (0 or 1) (message 2 of the recording)" in service.err
     assert "done, 2 published, 1 rejected" in service.err
@@ -442,7 +489,10 @@ def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
 def test_payloads_of_wrong_size_are_rejected(tmp_path: Path) -> None:
     """55 payloads, all too long by the same amount, are 55 invalid messages, not 56 misaligned ones."""
     path = write_payloads(tmp_path / "a.mcap", [payload(each) + bytes(60) for each in range(55)])
-    with pytest.raises(SourceError, match=r"no message of .* can be read: .* 280 bytes, expected 220 for layout 1.16"):
+    with pytest.raises(
+        SourceError,
+        match=r"no message of .* can be read: .* 280 bytes, expected 220 for layout 1.16",
+    ):
         nedbus.read(path)
     with nedbus.open(path) as flight:
         samples = flight()
@@ -451,7 +501,9 @@ def test_payloads_of_wrong_size_are_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["1.13", "V0", "1.16"])
-def test_invalid_message_is_skipped(tmp_path: Path, layout: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_message_is_skipped(
+    tmp_path: Path, layout: str, caplog: pytest.LogCaptureFixture
+) -> None:
     """`read` skips one invalid message and counts it, in any layout."""
     bad = bytearray(payload(2, layout=layout, ref_lat=12.5))
     offset = bad.index(struct.pack("<d", 12.5))

@@ -64,7 +64,9 @@ def _mcap(texts: Iterable[str], path: Path) -> bytes:
         writer = Writer(file)
         writer.start()
         for number, text in enumerate(texts):
-            schema = writer.register_schema(f"px4_msgs/msg/Other{number}x", "ros2msg", text.encode())
+            schema = writer.register_schema(
+                f"px4_msgs/msg/Other{number}x", "ros2msg", text.encode()
+            )
             channel = writer.register_channel(f"/fmu/out/other{number}x", "cdr", schema)
             writer.add_message(channel, 0, b"\0\1\0\0" + bytes(8), 0)
         writer.finish()
@@ -91,7 +93,9 @@ LIMITS: Final[dict[str, tuple[Callable[[], Iterable[str]], str]]] = {
 
 
 @pytest.mark.parametrize("kind", LIMITS)
-def test_recording_beyond_a_limit_has_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_recording_beyond_a_limit_has_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
     """A recording whose definitions exceed a limit reports it; here the limit for all definitions is an eighth."""
     monkeypatch.setattr("nedbus.flights.readers.mcap._DEFINITION_BUDGET", 2000)
     make, reason = LIMITS[kind]
@@ -115,7 +119,9 @@ def test_log_beyond_a_limit_is_read_within_limits(start: Start, tmp_path: Path, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", LIMITS)
-def test_recording_beyond_a_limit_is_read_within_limits(start: Start, tmp_path: Path, kind: str) -> None:
+def test_recording_beyond_a_limit_is_read_within_limits(
+    start: Start, tmp_path: Path, kind: str
+) -> None:
     """All code that reads recordings stays within limits of time and memory, whatever the schemas describe."""
     _mcap(LIMITS[kind][0](), tmp_path / "limits.mcap")
     _check(start, tmp_path / "limits.mcap")
@@ -123,10 +129,14 @@ def test_recording_beyond_a_limit_is_read_within_limits(start: Start, tmp_path: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nested fields", "topics", "subscriptions"])
-def test_service_ends_after_log_beyond_a_limit(run_nedbus: Start, endpoint: str, tmp_path: Path, kind: str) -> None:
+def test_service_ends_after_log_beyond_a_limit(
+    run_nedbus: Start, endpoint: str, tmp_path: Path, kind: str
+) -> None:
     """A service publishes the decodable messages of a log beyond a limit, and exits with 1."""
     (tmp_path / "limits.ulg").write_bytes(log_limits.LIMITS[kind][0]())
-    service = run_nedbus("serve", "-s", f"ulog:{tmp_path}/limits.ulg?topics=*", "-c", endpoint, "--until-done")
+    service = run_nedbus(
+        "serve", "-s", f"ulog:{tmp_path}/limits.ulg?topics=*", "-c", endpoint, "--until-done"
+    )
     assert service.wait() == 1
     assert "more than" in service.err
     assert (" 0 published" in service.err) == (kind == "nested fields")
@@ -141,7 +151,9 @@ def _check(start: Start, path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", ["", "&speed=max&loop=1"])
-def test_service_with_many_topics_stops(run_nedbus: Start, endpoint: str, tmp_path: Path, options: str) -> None:
+def test_service_with_many_topics_stops(
+    run_nedbus: Start, endpoint: str, tmp_path: Path, options: str
+) -> None:
     """Ctrl-C stops a service whose log rotates through 450 topics, without waiting for a timeout."""
     log = UlogWriter()
     fields = "".join(f"float value_{number};" for number in range(15))
@@ -151,7 +163,9 @@ def test_service_with_many_topics_stops(run_nedbus: Start, endpoint: str, tmp_pa
     for number in range(10_000):
         log.put("D", struct.pack("<HQ60x", number % 450, 1_000_000 + 100 * number))
     path = log.write(tmp_path / "many.ulg")
-    service = run_nedbus("serve", "-s", f"ulog:{path}?topics=*{options}", "-c", endpoint, coverage=False)
+    service = run_nedbus(
+        "serve", "-s", f"ulog:{path}?topics=*{options}", "-c", endpoint, coverage=False
+    )
     wait_for(lambda: "MB" in service.err, what="the start of the replay")
     with Stopwatch(service.popen.pid) as watch:
         service.signal(signal.SIGINT)

@@ -14,14 +14,26 @@ from nedbus.sources import parse_source
     ("sources", "texts"),
     [
         ('[{ kind = "sim" }]', ["sim:"]),
-        ('[{ kind = "sim", vehicle = 7, wait = true, duration = 2.5 }]', ["sim:?vehicle=7&wait=1&duration=2.5"]),
-        ('[{ kind = "ulog", file = "a?b 100%.ulg", speed = "max" }]', ["ulog:a%3Fb 100%25.ulg?speed=max"]),
+        (
+            '[{ kind = "sim", vehicle = 7, wait = true, duration = 2.5 }]',
+            ["sim:?vehicle=7&wait=1&duration=2.5"],
+        ),
+        (
+            '[{ kind = "ulog", file = "a?b 100%.ulg", speed = "max" }]',
+            ["ulog:a%3Fb 100%25.ulg?speed=max"],
+        ),
         (
             '[{ kind = "mavlink", link = "udpin::1", vehicles = { 1 = "a", 2 = "b" } }]',
             ["mavlink:udpin::1?vehicles=1:a,2:b"],
         ),
-        ('[{ kind = "px4-zenoh", vehicles = { left = "a", right = "b" } }]', ["px4-zenoh:?vehicles=left:a,right:b"]),
-        ('[{ kind = "px4-zenoh", endpoint = "tcp/b:7447", domain = 5 }]', ["px4-zenoh:tcp/b:7447?domain=5"]),
+        (
+            '[{ kind = "px4-zenoh", vehicles = { left = "a", right = "b" } }]',
+            ["px4-zenoh:?vehicles=left:a,right:b"],
+        ),
+        (
+            '[{ kind = "px4-zenoh", endpoint = "tcp/b:7447", domain = 5 }]',
+            ["px4-zenoh:tcp/b:7447?domain=5"],
+        ),
         (
             '[{ kind = "mavlink", link = "udpin::1", log = true, save = "/a+b c&d%20" }]',
             ["mavlink:udpin::1?log=1&save=/a+b%20c%26d%2520"],
@@ -46,8 +58,14 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
         ({"kind": "ulog"}, 'it needs file = "..."'),
         ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
         ({"kind": "sim", "speed": 0}, "speed=0 is invalid; expected a factor from 0.001"),
-        ({"kind": "mcap", "file": "a.mcap", "layout": "9.9"}, "if not those in the file: 1.13, 1.14, "),
-        ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
+        (
+            {"kind": "mcap", "file": "a.mcap", "layout": "9.9"},
+            "if not those in the file: 1.13, 1.14, ",
+        ),
+        (
+            {"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}},
+            "vehicles=x:a is invalid",
+        ),
     ],
 )
 def test_invalid_source_table_raises(source: dict[str, object], reason: str) -> None:

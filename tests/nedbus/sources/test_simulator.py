@@ -11,7 +11,14 @@ import pytest
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import SourceMessage
-from nedbus_msgs import BY_TOPIC, DEFAULT, RESET_COUNTERS, TOPICS, VehicleLocalPosition, upgrade_with
+from nedbus_msgs import (
+    BY_TOPIC,
+    DEFAULT,
+    RESET_COUNTERS,
+    TOPICS,
+    VehicleLocalPosition,
+    upgrade_with,
+)
 from nedbus_msgs.frames import quaternion_to_euler, to_global
 from tests.flights.local_position import FIELD_TYPES, encode, upgrade
 from tests.flights.messages import VLP
@@ -53,7 +60,11 @@ def test_origin_option_moves_the_flight() -> None:
         for options in ("&origin=10.5,-20.25,100", "")
     )
     assert moved[VLP]["x"] == standard[VLP]["x"]
-    assert (moved[VLP]["ref_lat"], moved[VLP]["ref_lon"], moved[VLP]["ref_alt"]) == (10.5, -20.25, 100.0)
+    assert (moved[VLP]["ref_lat"], moved[VLP]["ref_lon"], moved[VLP]["ref_alt"]) == (
+        10.5,
+        -20.25,
+        100.0,
+    )
     for topic, latitude in (
         ("sensor_gps/0", "latitude_deg"),
         ("vehicle_global_position", "lat"),
@@ -69,7 +80,11 @@ def test_origin_option_moves_the_flight() -> None:
 def encoded(options: str) -> list[tuple[float, str, bytes]]:
     """Return all messages of a flight, in order."""
     return [
-        (each.at, str(each.address), encode(upgrade_with(BY_TOPIC[each.address.topic], each.fields)))
+        (
+            each.at,
+            str(each.address),
+            encode(upgrade_with(BY_TOPIC[each.address.topic], each.fields)),
+        )
         for each in simulate(options)
     ]
 
@@ -80,7 +95,9 @@ def test_same_seed_yields_identical_flight() -> None:
     assert one != other
 
 
-@pytest.mark.parametrize("topic", ["vehicle_local_position", "estimator_local_position", "vehicle_attitude", "*"])
+@pytest.mark.parametrize(
+    "topic", ["vehicle_local_position", "estimator_local_position", "vehicle_attitude", "*"]
+)
 def test_selected_topics_equal_those_of_whole_flight(topic: str) -> None:
     """A flight of selected topics has exactly the messages of these topics in the whole flight."""
     whole, chosen = encoded("?duration=18"), encoded(f"?duration=18&topics={topic}")
@@ -94,16 +111,22 @@ def test_selection_without_simulated_topic_raises() -> None:
 
 def test_rates_are_nominal(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """Each stream has the nominal rate of its topic, without jitter."""
-    assert set(streams) == {name for name, topic in DEFAULT.topics.items() if not topic.instances} | {
+    assert set(streams) == {
+        name for name, topic in DEFAULT.topics.items() if not topic.instances
+    } | {
         "estimator_local_position/0",
         "estimator_local_position/1",
     }
     for stream, messages in streams.items():
-        steps = {after.timestamp - before.timestamp for before, after in itertools.pairwise(messages)}
+        steps = {
+            after.timestamp - before.timestamp for before, after in itertools.pairwise(messages)
+        }
         assert steps == {round(1e6 / DEFAULT.topics[stream.split("/")[0]].rate)}
 
 
-@pytest.mark.parametrize("options", ["?duration=3.3", "?duration=0.5", "?duration=3.3&topics=home_position,SensorGps"])
+@pytest.mark.parametrize(
+    "options", ["?duration=3.3", "?duration=0.5", "?duration=3.3&topics=home_position,SensorGps"]
+)
 def test_messages_are_in_time_order_and_counted(options: str) -> None:
     """A finite flight has exactly `total` messages, in order of `due`, and only at the announced addresses."""
     run = open_replay(f"sim:{options}")
@@ -117,7 +140,10 @@ def test_messages_are_in_time_order_and_counted(options: str) -> None:
 def test_gps_outage_causes_dead_reckoning(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """Without GPS dead_reckoning is set, error and sigma grow, and xy becomes invalid after 10 s."""
     outage = [message for message in streams[VLP] if message.dead_reckoning]
-    assert [(message.timestamp / 1e6 - 10.0) // 1 for message in (outage[0], outage[-1])] == [60.0, 74.0]
+    assert [(message.timestamp / 1e6 - 10.0) // 1 for message in (outage[0], outage[-1])] == [
+        60.0,
+        74.0,
+    ]
     assert outage[-1].eph > outage[len(outage) // 2].eph > outage[0].eph
     assert outage[0].xy_valid
     assert not outage[-1].xy_valid
@@ -134,7 +160,11 @@ def test_gps_outage_causes_dead_reckoning(streams: dict[str, list[VehicleLocalPo
     ],
 )
 def test_reset_delta_equals_the_jump(
-    streams: dict[str, list[VehicleLocalPosition]], quantity: str, fields: tuple[str, ...], motion: float, count: int
+    streams: dict[str, list[VehicleLocalPosition]],
+    quantity: str,
+    fields: tuple[str, ...],
+    motion: float,
+    count: int,
 ) -> None:
     """At a reset the counter increments, and the delta equals the jump up to 10 ms of motion; nothing else jumps."""
     resets = 0
@@ -142,12 +172,17 @@ def test_reset_delta_equals_the_jump(
         jump = [getattr(after, name) - getattr(before, name) for name in fields]
         if quantity == "heading" and abs(jump[0]) > 3:
             continue  # the heading wrapped at pi
-        rise = getattr(after, f"{quantity}_reset_counter") - getattr(before, f"{quantity}_reset_counter")
+        rise = getattr(after, f"{quantity}_reset_counter") - getattr(
+            before, f"{quantity}_reset_counter"
+        )
         assert rise in {0, 1}
         if rise:
             resets += 1
             delta = getattr(after, f"delta_{quantity}")
-            jump = [a - b for a, b in zip(jump, delta if isinstance(delta, tuple) else (delta,), strict=True)]
+            jump = [
+                a - b
+                for a, b in zip(jump, delta if isinstance(delta, tuple) else (delta,), strict=True)
+            ]
         elif quantity == "heading" and abs(after.timestamp / 1e6 - 10 - 115) < 0.02:
             continue  # the heading disturbance that the next alignment corrects
         assert all(abs(value) <= motion for value in jump), (after.timestamp, jump)
@@ -156,7 +191,9 @@ def test_reset_delta_equals_the_jump(
 
 def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """With GPS estimates stay within a few sigma of the groundtruth, whose velocity matches its positions."""
-    truth = {message.timestamp: message for message in streams["vehicle_local_position_groundtruth"]}
+    truth = {
+        message.timestamp: message for message in streams["vehicle_local_position_groundtruth"]
+    }
     for message in streams[VLP]:
         if message.timestamp in truth and not message.dead_reckoning:
             true = truth[message.timestamp]
@@ -170,11 +207,14 @@ def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPositi
 
 def test_origin_is_set_in_flight(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """There is no global origin for the first two seconds, as before the first fix."""
-    assert all(each.xy_global == (each.timestamp >= 12_000_000) for each in streams[VLP])  # boot is at 10 s
+    # boot is at 10 s
+    assert all(each.xy_global == (each.timestamp >= 12_000_000) for each in streams[VLP])
     assert streams[VLP][-1].ref_lat == 47.397742
 
 
-def test_external_ins_has_neither_outage_nor_resets(streams: dict[str, list[VehicleLocalPosition]]) -> None:
+def test_external_ins_has_neither_outage_nor_resets(
+    streams: dict[str, list[VehicleLocalPosition]],
+) -> None:
     """The position aiding of the external INS never fails, so its estimate is always valid, and is not reset."""
     for message in streams["external_ins_local_position"]:
         assert message.xy_valid
@@ -206,7 +246,9 @@ def test_attitude_is_consistent_with_estimate(
             estimate.delta_heading, abs=1e-5
         )
         thrust = math.hypot(estimate.ax, estimate.ay, estimate.az - 9.80665)
-        assert thrust * math.cos(roll) * math.cos(pitch) == pytest.approx(9.80665 - estimate.az, abs=1e-4)
+        assert thrust * math.cos(roll) * math.cos(pitch) == pytest.approx(
+            9.80665 - estimate.az, abs=1e-4
+        )
         if 26e6 < message.timestamp < 124e6:  # without a heading error
             along = estimate.ax * math.cos(heading) + estimate.ay * math.sin(heading)
             assert -thrust * math.cos(roll) * math.sin(pitch) == pytest.approx(along, abs=1e-4)
@@ -224,10 +266,14 @@ def test_global_position_matches_local_position(
         estimate = estimates[message.timestamp]
         where = to_global(estimate)
         assert where
-        assert (message.lat, message.lon) == pytest.approx((where.latitude, where.longitude), abs=1e-8)
+        assert (message.lat, message.lon) == pytest.approx(
+            (where.latitude, where.longitude), abs=1e-8
+        )
         assert message.alt == pytest.approx(where.altitude, abs=1e-4)
         names = ("dead_reckoning", "eph", "epv")
-        assert [getattr(message, name) for name in names] == [getattr(estimate, name) for name in names]
+        assert [getattr(message, name) for name in names] == [
+            getattr(estimate, name) for name in names
+        ]
         assert message.lat_lon_valid == estimate.xy_valid
 
 
@@ -245,7 +291,9 @@ def test_status_and_gps_are_consistent_with_outage(
     for message in others["sensor_gps/0"]:
         seconds = message.timestamp / 1e6 - 10
         has_fix = 2 <= seconds % 120 < 60 or seconds % 120 >= 75 or seconds >= 120
-        assert (message.fix_type == 3, message.satellites_used > 5, message.eph < 5) == (has_fix,) * 3
+        assert (message.fix_type == 3, message.satellites_used > 5, message.eph < 5) == (
+            has_fix,
+        ) * 3
         assert message.vel_ned_valid is has_fix
         assert (message.time_utc_usec > 0) is (seconds >= 2)
         if has_fix:
@@ -259,7 +307,9 @@ def test_status_and_gps_are_consistent_with_outage(
 def test_battery_home_and_land_detection_are_consistent(others: dict[str, list[Any]]) -> None:
     """The battery discharges, home_position is sent at the start and with the origin; the vehicle takes off once."""
     batteries = others["battery_status/0"]
-    assert all(after.remaining < before.remaining for before, after in itertools.pairwise(batteries))
+    assert all(
+        after.remaining < before.remaining for before, after in itertools.pairwise(batteries)
+    )
     assert all(0.8 < each.remaining <= 1 and 14 < each.voltage_v < 17 for each in batteries)
     homes = others["home_position"]
     assert [(each.timestamp, each.valid_hpos, each.update_count) for each in homes] == [

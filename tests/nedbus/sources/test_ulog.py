@@ -59,7 +59,9 @@ def test_real_log_is_read_completely_and_exactly(name: str) -> None:
     for data in ULog(str(path), list(DEFAULT.topics)).data_list:
         address = data.name, data.multi_id
         read = [
-            upgrade(each.fields) for each in messages if (each.address.topic, each.address.instance or 0) == address
+            upgrade(each.fields)
+            for each in messages
+            if (each.address.topic, each.address.instance or 0) == address
         ]
         for column, values in data.data.items():
             base, _, index = column.partition("[")
@@ -128,12 +130,16 @@ def test_no_message_is_lost_between_chunks(tmp_path: Path) -> None:
     ("timestamps", "places"),
     [
         ([10, 20, 15, 30, 40], [10, 20, 20, 30, 40]),  # one is late
-        ([10, 20, 10**15, 30, 40], [10, 20, 20, 30, 40]),  # one is in the future, which must not delay the others
+        # one is in the future, which must not delay the others
+        ([10, 20, 10**15, 30, 40], [10, 20, 20, 30, 40]),
         ([10, 20, 30, 40, 10**15], [10, 20, 30, 40, 40]),  # the last one is in the future
-        ([10, 20, 10**15, 30, 0, 40, 50], [10, 20, 20, 30, 30, 40, 50]),  # one in the future, one without a time
+        # one in the future, one without a time
+        ([10, 20, 10**15, 30, 0, 40, 50], [10, 20, 20, 30, 30, 40, 50]),
     ],
 )
-def test_unordered_timestamps_keep_logged_order(tmp_path: Path, timestamps: list[int], places: list[int]) -> None:
+def test_unordered_timestamps_keep_logged_order(
+    tmp_path: Path, timestamps: list[int], places: list[int]
+) -> None:
     """Out-of-order timestamps and impossible gaps lose no message and never stall the replay; there is a warning."""
     run = open_log(write_log(tmp_path / "a.ulg", timestamps))
     messages = list(run.messages)
@@ -162,7 +168,9 @@ def test_old_first_message_does_not_delay_replay(tmp_path: Path, age: int) -> No
     for time in range(300_000_000, 310_000_000, 20_000):
         writer.add(VLP, message(time))
     run = open_log(writer.write(tmp_path / "a.ulg"), "?topics=*")
-    assert [each.at for each in run.messages] == pytest.approx([0.0, *(number / 50 for number in range(500))])
+    assert [each.at for each in run.messages] == pytest.approx(
+        [0.0, *(number / 50 for number in range(500))]
+    )
     assert run.warnings == ()
 
 
@@ -170,17 +178,22 @@ def test_bool_whose_byte_is_not_0_is_true(tmp_path: Path, caplog: pytest.LogCapt
     """PX4 logs bools that it did not initialize: any byte but 0 is true; their number is logged once per topic."""
     topics = {
         "rtl_status": ("uint64_t timestamp;bool[3] flags;bool ok;", "Q4B"),
-        "battery_status": ("uint64_t timestamp;bool connected;int32_t cell_count;", "QBi"),  # is converted
+        # is converted
+        "battery_status": ("uint64_t timestamp;bool connected;int32_t cell_count;", "QBi"),
     }
     rows = [("rtl_status", (time, 194, 0, 1, time % 3)) for time in range(3000)]
     path = write_raw_log(tmp_path / "a.ulg", topics, [*rows, ("battery_status", (3000, 94, 6))])
     run = open_log(path, "?topics=*")
     *messages, battery = run.messages
     assert battery.fields == {"timestamp": 3000, "connected": True, "cell_count": 6}
-    assert [tuple(upgrade_with(each.definition or DEFAULT, each.fields).__dict__.values()) for each in messages] == [
-        (time, (True, False, True), time % 3 > 0) for time in range(3000)
+    assert [
+        tuple(upgrade_with(each.definition or DEFAULT, each.fields).__dict__.values())
+        for each in messages
+    ] == [(time, (True, False, True), time % 3 > 0) for time in range(3000)]
+    assert [each.encode().payload[-5:] for each in messages[:2]] == [
+        b"\x93\xc3\xc2\xc3\xc2",
+        b"\x93\xc3\xc2\xc3\xc3",
     ]
-    assert [each.encode().payload[-5:] for each in messages[:2]] == [b"\x93\xc3\xc2\xc3\xc2", b"\x93\xc3\xc2\xc3\xc3"]
     warnings = [
         f"bools of {topic} whose byte is neither 0 nor 1 are read as true ({count})"
         for topic, count in (("rtl_status", 4000), ("battery_status", 1))
@@ -194,14 +207,22 @@ def test_bool_whose_byte_is_not_0_is_true(tmp_path: Path, caplog: pytest.LogCapt
 
 
 @pytest.mark.logs
-@pytest.mark.parametrize(("name", "count"), [("cuav_1.16_gps_interference.ulg", 31), ("nxp_v0_ekf_failure.ulg", 39)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("cuav_1.16_gps_interference.ulg", 31), ("nxp_v0_ekf_failure.ulg", 39)]
+)
 def test_topic_of_real_flight_with_uninitialized_bools_is_read(name: str, count: int) -> None:
     path = LOGS / name
     if not path.exists():
         pytest.skip(f"real log not found: {path}")
     run = open_log(path, "?topics=rtl_status")
-    assert len([each.encode() for each in run.messages]) == len(nedbus.read(path, "rtl_status")) == count
-    assert run.warnings == (f"bools of rtl_status whose byte is neither 0 nor 1 are read as true ({count})",)
+    assert (
+        len([each.encode() for each in run.messages])
+        == len(nedbus.read(path, "rtl_status"))
+        == count
+    )
+    assert run.warnings == (
+        f"bools of rtl_status whose byte is neither 0 nor 1 are read as true ({count})",
+    )
 
 
 def test_topic_that_is_subscribed_again_is_one_stream(tmp_path: Path) -> None:
@@ -242,7 +263,9 @@ def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> 
         ),
     ],
 )
-def test_unreadable_log_raises(tmp_path: Path, write: Callable[[Path], object], reason: str) -> None:
+def test_unreadable_log_raises(
+    tmp_path: Path, write: Callable[[Path], object], reason: str
+) -> None:
     """The error names the file and the problem, even for a log of other topics."""
     path = tmp_path / "a.ulg"
     write(path)
@@ -266,7 +289,10 @@ def test_damaged_format_is_detected(tmp_path: Path) -> None:
     """An invalid field type, or the lack of a field that every release has, is damage; no field is read as another."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000), topic="estimator_local_position")
     good = path.read_bytes()
-    for before, after in ((b"float[2] delta_xy;", b"float[0] delta_xy;"), (b"float z;", b"float \0;")):
+    for before, after in (
+        (b"float[2] delta_xy;", b"float[0] delta_xy;"),
+        (b"float z;", b"float \0;"),
+    ):
         assert good.count(before) == 1
         path.write_bytes(good.replace(before, after))
         try:
@@ -285,8 +311,15 @@ OLD_STATUS = "uint64_t timestamp;uint32_t system_id;uint32_t component_id;uint8_
 def write_old_log(path: Path, counts: Sequence[int], *, temperature: float = 20.5) -> Path:
     """Write a log like PX4 1.9's, without its release: fields have other types than today's."""
     topics = {"battery_status": (OLD_BATTERY, "Qid3fB"), "vehicle_status": (OLD_STATUS, "QIIB")}
-    rows = [("battery_status", (10 + n, count, temperature, 4.1, 4.2, 4.0, 1)) for n, count in enumerate(counts)]
-    return write_raw_log(path, topics, [*rows, ("vehicle_status", (100, 1, 1, 2)), ("vehicle_status", (200, 1, 1, 5))])
+    rows = [
+        ("battery_status", (10 + n, count, temperature, 4.1, 4.2, 4.0, 1))
+        for n, count in enumerate(counts)
+    ]
+    return write_raw_log(
+        path,
+        topics,
+        [*rows, ("vehicle_status", (100, 1, 1, 2)), ("vehicle_status", (200, 1, 1, 5))],
+    )
 
 
 def test_field_of_another_type_is_converted(tmp_path: Path) -> None:
@@ -294,7 +327,11 @@ def test_field_of_another_type_is_converted(tmp_path: Path) -> None:
     path = write_old_log(tmp_path / "a.ulg", [6, 6])
     run = open_log(path, "?topics=*")
     first, *_, last = run.messages
-    assert (first.fields["cell_count"], first.fields["temperature"], first.fields["connected"]) == (6, 20.5, True)
+    assert (first.fields["cell_count"], first.fields["temperature"], first.fields["connected"]) == (
+        6,
+        20.5,
+        True,
+    )
     assert (last.fields["system_id"], last.fields["nav_state"]) == (1, 5)
     assert (run.warnings, run.damage) == ((), None)
     convert_replay(f"ulog:{path}?topics=*", tmp_path / "a.mcap")
@@ -337,12 +374,18 @@ def test_dropout_is_an_event(tmp_path: Path) -> None:
     for is_recorded in (True, False):
         writer = UlogWriter()
         writer.define([VLP])
-        for time in [*range(10_000_000, 16_000_000, 100_000), *range(21_000_000, 25_000_000, 100_000)]:
+        for time in [
+            *range(10_000_000, 16_000_000, 100_000),
+            *range(21_000_000, 25_000_000, 100_000),
+        ]:
             if is_recorded and time == 21_000_000:
                 writer.put("O", struct.pack("<H", 5000))
             writer.add(VLP, message(time, **VALID))
         lines = run_command("events", str(writer.write(tmp_path / "a.ulg"))).out
-        assert ("logging dropout of 5.0 s" in lines, "silent" in lines) == (is_recorded, not is_recorded)
+        assert ("logging dropout of 5.0 s" in lines, "silent" in lines) == (
+            is_recorded,
+            not is_recorded,
+        )
 
 
 def test_event_before_the_first_timestamp_has_a_time_since_boot(tmp_path: Path) -> None:

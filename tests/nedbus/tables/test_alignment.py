@@ -16,7 +16,15 @@ import pytest
 import nedbus
 from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.flights import RecordingWriter, find_utc
-from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, define_msg, definition_of
+from nedbus_msgs import (
+    MESSAGES,
+    Address,
+    Definition,
+    Message,
+    Provenance,
+    define_msg,
+    definition_of,
+)
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
@@ -28,7 +36,9 @@ BOOT = 1_700_000_000_000_000  # us; Unix time of the boot, in 2023
 def array_of(topic: str, *fields: Mapping[str, object]) -> MessageArray:
     """Return an array of messages of a topic."""
     definition: Definition[Message] = definition_of(topic)
-    return arrays_of(definition).of([definition.model.model_validate(dict(each)) for each in fields])
+    return arrays_of(definition).of(
+        [definition.model.model_validate(dict(each)) for each in fields]
+    )
 
 
 def yaw(angle: float) -> tuple[float, float, float, float]:
@@ -52,8 +62,12 @@ def write(path: Path, streams: dict[str, MessageArray], vehicle: str = "1") -> P
     return path
 
 
-POSITIONS = array_of(VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": float(number)} for number in range(5)))
-HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0})
+POSITIONS = array_of(
+    VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": float(number)} for number in range(5))
+)
+HOME = array_of(
+    "home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0}
+)
 
 
 def test_derived_columns_are_offered_by_name() -> None:
@@ -61,10 +75,16 @@ def test_derived_columns_are_offered_by_name() -> None:
 
     Angles follow from the interpolated quaternion, so they do not jump at a half turn.
     """
-    flown = array_of(VLP, {"timestamp": 1_000_000, "z": -4.0, "z_valid": True}, {"timestamp": 1_100_000, "z": -9.0})
+    flown = array_of(
+        VLP,
+        {"timestamp": 1_000_000, "z": -4.0, "z_valid": True},
+        {"timestamp": 1_100_000, "z": -9.0},
+    )
     first, second = math.radians(179.0), math.radians(-179.0)
     turned = array_of(
-        "vehicle_attitude", {"timestamp": 1_050_000, "q": yaw(first)}, {"timestamp": 1_150_000, "q": yaw(second)}
+        "vehicle_attitude",
+        {"timestamp": 1_050_000, "q": yaw(first)},
+        {"timestamp": 1_150_000, "q": yaw(second)},
     )
     streams = {VLP: flown, "vehicle_attitude": turned}
     table = nedbus.align(streams, fields=["height", "vehicle_attitude.yaw_deg"], method="linear")
@@ -82,8 +102,12 @@ def test_method_last_never_uses_future_messages() -> None:
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME})
     assert table["timestamp"].tolist() == POSITIONS["timestamp"].tolist()
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4]
-    assert np.array_equal(table["home_position.alt"], np.array([np.nan, np.nan, 7, 9, 9]), equal_nan=True)
-    assert np.allclose(table["home_position.age"], [np.nan, np.nan, 0.05, 0.05, 0.15], equal_nan=True)
+    assert np.array_equal(
+        table["home_position.alt"], np.array([np.nan, np.nan, 7, 9, 9]), equal_nan=True
+    )
+    assert np.allclose(
+        table["home_position.age"], [np.nan, np.nan, 0.05, 0.05, 0.15], equal_nan=True
+    )
     assert table["home_position.timestamp"].tolist() == [0, 0, 1_150_000, 1_250_000, 1_250_000]
     assert table[f"{VLP}.age"].tolist() == [0] * 5
     exactly = nedbus.align({"home_position": HOME}, on=[1_150_000, 1_149_999])
@@ -93,7 +117,9 @@ def test_method_last_never_uses_future_messages() -> None:
 
 def test_method_nearest_may_use_future_messages() -> None:
     """With method "nearest" a later message has a negative age; of two equally near messages the earlier is used."""
-    table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
+    table = nedbus.align(
+        {"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest"
+    )
     assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
     assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
 
@@ -102,14 +128,32 @@ def test_method_linear_interpolates_only_floats() -> None:
     """With method "linear" floats are interpolated; integers, flags, NaN and infinities keep the last value."""
     messages = array_of(
         VLP,
-        {"timestamp": 1_000_000, "x": 1.0, "ref_lon": 179.0, "vx": math.nan, "vxy_max": math.inf, "ref_timestamp": 2},
-        {"timestamp": 2_000_000, "x": 3.0, "ref_lon": -179.0, "vx": 1.0, "vxy_max": math.inf, "ref_timestamp": 4},
+        {
+            "timestamp": 1_000_000,
+            "x": 1.0,
+            "ref_lon": 179.0,
+            "vx": math.nan,
+            "vxy_max": math.inf,
+            "ref_timestamp": 2,
+        },
+        {
+            "timestamp": 2_000_000,
+            "x": 3.0,
+            "ref_lon": -179.0,
+            "vx": 1.0,
+            "vxy_max": math.inf,
+            "ref_timestamp": 4,
+        },
     )
-    table = nedbus.align({VLP: messages}, on=[999_999, 1_000_000, 1_250_000, 1_750_000, 2_500_000], method="linear")
+    table = nedbus.align(
+        {VLP: messages}, on=[999_999, 1_000_000, 1_250_000, 1_750_000, 2_500_000], method="linear"
+    )
     assert np.array_equal(table[f"{VLP}.x"], np.array([np.nan, 1, 1.5, 2.5, 3]), equal_nan=True)
     assert table[f"{VLP}.ref_timestamp"].tolist() == [0, 2, 2, 2, 4]
     assert table[f"{VLP}.ref_lon"][2:].tolist() == [179.5, -179.5, -179.0]
-    assert np.array_equal(table[f"{VLP}.vx"][1:], np.array([np.nan, np.nan, np.nan, 1]), equal_nan=True)
+    assert np.array_equal(
+        table[f"{VLP}.vx"][1:], np.array([np.nan, np.nan, np.nan, 1]), equal_nan=True
+    )
     assert table[f"{VLP}.vxy_max"][1:].tolist() == [math.inf] * 4
     assert np.allclose(table[f"{VLP}.age"], [np.nan, 0, 0.25, 0.75, 0.5], equal_nan=True)
 
@@ -123,10 +167,16 @@ def test_method_linear_interpolates_only_floats() -> None:
         ("cog_rad", 0.2, 6.2, 6.2 + (2 * math.pi - 6.0) / 2),
     ],
 )
-def test_angles_are_interpolated_along_the_shorter_arc(field: str, first: float, second: float, middle: float) -> None:
+def test_angles_are_interpolated_along_the_shorter_arc(
+    field: str, first: float, second: float, middle: float
+) -> None:
     """An angle is interpolated along the shorter arc, and stays in the range of its field: from -pi, or from 0."""
-    messages = array_of("vehicle_gps_position", {"timestamp": 1, field: first}, {"timestamp": 3, field: second})
-    [value] = nedbus.align({"vehicle_gps_position": messages}, on=[2], method="linear")[f"vehicle_gps_position.{field}"]
+    messages = array_of(
+        "vehicle_gps_position", {"timestamp": 1, field: first}, {"timestamp": 3, field: second}
+    )
+    [value] = nedbus.align({"vehicle_gps_position": messages}, on=[2], method="linear")[
+        f"vehicle_gps_position.{field}"
+    ]
     assert math.remainder(value - middle, math.tau) == pytest.approx(0, abs=1e-6)
     low = -math.pi if min(first, second) < 0 else 0.0
     assert low - 1e-6 <= value <= low + math.tau + 1e-6
@@ -135,7 +185,9 @@ def test_angles_are_interpolated_along_the_shorter_arc(field: str, first: float,
 def test_quaternions_are_interpolated_by_slerp() -> None:
     """Interpolated quaternions rotate at a constant rate with norm 1, even if the sign flips; NaN remains NaN."""
     turns = [yaw(0.0), tuple(-each for each in yaw(2.0)), yaw(2.0), (math.nan,) * 4]
-    messages = array_of("vehicle_attitude", *({"timestamp": 4 * n, "q": q} for n, q in enumerate(turns)))
+    messages = array_of(
+        "vehicle_attitude", *({"timestamp": 4 * n, "q": q} for n, q in enumerate(turns))
+    )
     table = nedbus.align({"vehicle_attitude": messages}, on=[0, 1, 2, 3, 4, 6, 10], method="linear")
     q = table["vehicle_attitude.q"]
     angles = 2 * np.arctan2(q[:5, 3], q[:5, 0])
@@ -155,9 +207,17 @@ def test_fields_select_the_columns() -> None:
     """`stream.field` selects one column, `field` one column per stream; time columns remain; unknown fields raise."""
     flight = {VLP: POSITIONS, "home_position": HOME}
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
-    assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
+    assert table.dtype.names == (
+        "timestamp",
+        "utc",
+        f"{VLP}.z",
+        "home_position.age",
+        "home_position.z",
+    )
     assert np.array_equal(table[f"{VLP}.z"], nedbus.align(flight)[f"{VLP}.z"], equal_nan=True)
-    with pytest.raises(ArgumentError, match=rf"fields \['zz'\] are in no stream: expected any of .*, {VLP}.age, "):
+    with pytest.raises(
+        ArgumentError, match=rf"fields \['zz'\] are in no stream: expected any of .*, {VLP}.age, "
+    ):
         nedbus.align(flight, fields=["zz"])
 
 
@@ -200,7 +260,8 @@ def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize(("start", "first"), [
-    (300_900_000, 300_000_000),  # up to a second of older messages: logging had begun before the header was written
+    # up to a second of older messages: logging had begun before the header was written
+    (300_900_000, 300_000_000),
     (301_100_000, 301_100_000),
     (400_000_000, 300_000_000),  # a damaged start, after the last message
 ])  # fmt: skip
@@ -228,7 +289,8 @@ def test_streams_on_different_clocks_raise() -> None:
     """Aligning a stream in Unix time with one in time since boot raises; the error names both and the remedy."""
     unix = array_of(VLP, {"timestamp": BOOT}, {"timestamp": BOOT + 1_000_000})
     with pytest.raises(
-        ArgumentError, match=rf"home_position begins at 1 s, {VLP} ends at 1700000001 s\): expected topics on one"
+        ArgumentError,
+        match=rf"home_position begins at 1 s, {VLP} ends at 1700000001 s\): expected topics on one",
     ):
         nedbus.align({VLP: unix, "home_position": HOME}, on=50)
 
@@ -246,11 +308,18 @@ def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4, 5]
     assert nedbus.align({VLP: twice}, on=[1_000_000, 1_300_000])[f"{VLP}.x"].tolist() == [1, 3]
     again = np.concatenate([POSITIONS, POSITIONS])
-    with pytest.raises(ConfigError, match=f"^{VLP}: timestamps restart; align the messages of each boot"):
+    with pytest.raises(
+        ConfigError, match=f"^{VLP}: timestamps restart; align the messages of each boot"
+    ):
         nedbus.align({VLP: again})
-    with pytest.raises(ArgumentError, match="method 'spline' is not valid: expected one of last, nearest, linear"):
+    with pytest.raises(
+        ArgumentError, match="method 'spline' is not valid: expected one of last, nearest, linear"
+    ):
         nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # invalid on purpose
-    with pytest.raises(AddressError, match=f"topic 'home_position' is not among these arrays: expected one of {VLP}"):
+    with pytest.raises(
+        AddressError,
+        match=f"topic 'home_position' is not among these arrays: expected one of {VLP}",
+    ):
         nedbus.align({VLP: POSITIONS}, topics=["home_position"])
     with pytest.raises(ArgumentError, match="expected pandas or polars"):
         nedbus.align({VLP: POSITIONS}, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
@@ -258,7 +327,10 @@ def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
 
 def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
     """`read` returns a dict of one vehicle's streams; `align` adds the stream that defines the rows to a selection."""
-    batteries = [array_of("battery_status", {"timestamp": 1_200_000, "voltage_v": volts}) for volts in (16.0, 12.0)]
+    batteries = [
+        array_of("battery_status", {"timestamp": 1_200_000, "voltage_v": volts})
+        for volts in (16.0, 12.0)
+    ]
     streams = {
         VLP: POSITIONS,
         "home_position": HOME,
@@ -273,7 +345,11 @@ def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
     assert nedbus.read(path, ["battery_status/1"])["battery_status/1"]["voltage_v"] == [12]
     assert nedbus.align(path).tobytes() == nedbus.align(nedbus.read(path, ["*"])).tobytes()
     table = nedbus.align(path, topics=["battery_status/1"])
-    assert {name.partition(".")[0] for name in table.dtype.names or ()} == {"timestamp", VLP, "battery_status/1"}
+    assert {name.partition(".")[0] for name in table.dtype.names or ()} == {
+        "timestamp",
+        VLP,
+        "battery_status/1",
+    }
     for wrong in ("home_positions", "battery_status/7", "battery_status/x", "vehicle_status"):
         with pytest.raises(AddressError):
             nedbus.read(path, [wrong])
@@ -282,19 +358,29 @@ def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
             definition = MESSAGES["VehicleLocalPosition" if vehicle == "1" else "HomePosition"]
             address = Address(vehicle, next(iter(definition.topics)))
             writer.write(
-                array, definition, repeat((address, Provenance())), logged=[1] * len(array), published=repeat(1)
+                array,
+                definition,
+                repeat((address, Provenance())),
+                logged=[1] * len(array),
+                published=repeat(1),
             )
-    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: expected one vehicle of .*: 1, 2"):
+    with pytest.raises(
+        AddressError, match=r"vehicle '\*' is not valid: expected one vehicle of .*: 1, 2"
+    ):
         nedbus.read(tmp_path / "two.mcap", ["*"])
     with pytest.raises(AddressError, match=r"vehicle '\*' is not valid"):
         nedbus.utc_of(tmp_path / "two.mcap")
 
 
 @pytest.mark.parametrize("wrong", [{"topics": [VLP, "nope"]}, {"on": "nope"}, {"topics": ["nope"]}])
-def test_unknown_stream_is_one_error_with_the_streams_of_the_file(tmp_path: Path, wrong: Any) -> None:
+def test_unknown_stream_is_one_error_with_the_streams_of_the_file(
+    tmp_path: Path, wrong: Any
+) -> None:
     """An unknown stream raises one error without a chained one; it lists all known streams of the file."""
     path = write(tmp_path / "a.mcap", {VLP: POSITIONS, "home_position": HOME})
-    with pytest.raises(AddressError, match=r"topic '.*nope' is not in .*: expected one of .*") as raised:
+    with pytest.raises(
+        AddressError, match=r"topic '.*nope' is not in .*: expected one of .*"
+    ) as raised:
         nedbus.align(path, **wrong)
     assert f"1/home_position, 1/{VLP}" in str(raised.value)
     assert raised.value.__cause__ is None
@@ -304,10 +390,15 @@ def test_unknown_stream_is_one_error_with_the_streams_of_the_file(tmp_path: Path
 def test_rows_may_be_those_of_a_message_that_only_the_file_defines(tmp_path: Path) -> None:
     """`on` accepts each stream of a file, without `topics` too."""
     definition = define_msg("Gripper", "uint64 timestamp\nfloat32 width\n")
-    grips = arrays_of(definition).of([definition.model.model_validate({"timestamp": 1_150_000, "width": 0.5})])
+    grips = arrays_of(definition).of(
+        [definition.model.model_validate({"timestamp": 1_150_000, "width": 0.5})]
+    )
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
-        for topic, kind, array in ((VLP, definition_of(VLP), POSITIONS), ("gripper", definition, grips)):
+        for topic, kind, array in (
+            (VLP, definition_of(VLP), POSITIONS),
+            ("gripper", definition, grips),
+        ):
             addresses = repeat((Address("1", topic), Provenance()))
             writer.write(array, kind, addresses, logged=[1] * len(array), published=repeat(1))
     table = nedbus.align(path, on="gripper")
@@ -329,9 +420,14 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     """Values before the first message are null, arrays have a column per element, and `utc` has a time zone."""
     pytest.importorskip("pandas")
     pl = pytest.importorskip("polars")
-    gps = array_of("sensor_gps", {"timestamp": 1_100_000, "time_utc_usec": BOOT + 1_100_000, "satellites_used": 9})
+    gps = array_of(
+        "sensor_gps",
+        {"timestamp": 1_100_000, "time_utc_usec": BOOT + 1_100_000, "satellites_used": 9},
+    )
     attitude = array_of("vehicle_attitude", {"timestamp": 1_100_000, "q": yaw(1.0)})
-    path = write(tmp_path / "a.mcap", {VLP: POSITIONS, "sensor_gps/0": gps, "vehicle_attitude": attitude})
+    path = write(
+        tmp_path / "a.mcap", {VLP: POSITIONS, "sensor_gps/0": gps, "vehicle_attitude": attitude}
+    )
     in_pandas = nedbus.align(path, dataframe="pandas", utc=True)
     in_polars = nedbus.align(path, dataframe="polars", utc=True)
     assert list(in_pandas.columns) == in_polars.columns
@@ -339,7 +435,11 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     assert in_pandas["sensor_gps/0.satellites_used"].isna().tolist() == [True] + [False] * 4
     assert in_pandas["vehicle_attitude.q[3]"].iloc[1] == np.float32(math.sin(0.5))
     assert in_polars["utc"].dtype == pl.Datetime("us", "UTC")
-    assert in_pandas["utc"].iloc[1] == in_polars["utc"][1] == datetime.fromtimestamp(BOOT / 1e6 + 1.1, UTC)
+    assert (
+        in_pandas["utc"].iloc[1]
+        == in_polars["utc"][1]
+        == datetime.fromtimestamp(BOOT / 1e6 + 1.1, UTC)
+    )
     assert nedbus.utc_of(path) == nedbus.UtcOffset("sensor_gps/0", BOOT, 1, 0)
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
 
@@ -351,11 +451,15 @@ def test_fields_that_a_message_lacks_are_null_in_a_table(tmp_path: Path) -> None
     with RecordingWriter(path) as writer:
         for number in range(4):
             missing = frozenset({"xy_valid", "x"} if number in (1, 2) else ())
-            writer.write_messages([(message(1_000_000 + number), address, Provenance("sim", missing), number)])
+            writer.write_messages(
+                [(message(1_000_000 + number), address, Provenance("sim", missing), number)]
+            )
     table = nedbus.align(path, dataframe="polars")
     assert table[f"{VLP}.xy_valid"].to_list() == [False, None, None, False]
     assert table[f"{VLP}.x"].is_null().to_list() == [False, True, True, False]
-    assert nedbus.align(path, on=[999_999, 1_000_000], dataframe="polars")[f"{VLP}.xy_valid"].to_list() == [None, False]
+    assert nedbus.align(path, on=[999_999, 1_000_000], dataframe="polars")[
+        f"{VLP}.xy_valid"
+    ].to_list() == [None, False]
 
 
 def test_utc_comes_from_gnss_then_companion_clock() -> None:
@@ -363,19 +467,32 @@ def test_utc_comes_from_gnss_then_companion_clock() -> None:
     times = range(1_000_000, 11_000_000, 1_000_000)
     gnss = array_of(
         "sensor_gps",
-        *({"timestamp": t, "timestamp_time_relative": -200, "time_utc_usec": BOOT + t - 200 + t % 7} for t in times),
+        *(
+            {
+                "timestamp": t,
+                "timestamp_time_relative": -200,
+                "time_utc_usec": BOOT + t - 200 + t % 7,
+            }
+            for t in times
+        ),
     )
     silent = array_of("sensor_gps", *({"timestamp": t} for t in times))
-    companion = array_of("timesync_status", *({"timestamp": t, "estimated_offset": -BOOT - 5} for t in times))
-    monotonic = array_of("timesync_status", *({"timestamp": t, "estimated_offset": -12_345} for t in times))
+    companion = array_of(
+        "timesync_status", *({"timestamp": t, "estimated_offset": -BOOT - 5} for t in times)
+    )
+    monotonic = array_of(
+        "timesync_status", *({"timestamp": t, "estimated_offset": -12_345} for t in times)
+    )
     found = nedbus.utc_of({"sensor_gps/0": gnss, "timesync_status": companion})
     assert found is not None
     assert (found.source, found.count) == ("sensor_gps/0", 10)
     assert 0 <= found.offset_us - BOOT <= found.spread_us <= 6
-    assert found.at(5) == datetime.fromtimestamp(0, UTC) + timedelta(microseconds=found.offset_us + 5)
-    assert nedbus.utc_of({"sensor_gps/0": silent, "timesync_status": companion}) == nedbus.UtcOffset(
-        "timesync_status", BOOT + 5, 10, 0
+    assert found.at(5) == datetime.fromtimestamp(0, UTC) + timedelta(
+        microseconds=found.offset_us + 5
     )
+    assert nedbus.utc_of(
+        {"sensor_gps/0": silent, "timesync_status": companion}
+    ) == nedbus.UtcOffset("timesync_status", BOOT + 5, 10, 0)
     assert nedbus.utc_of({"sensor_gps/0": silent, "timesync_status": monotonic}) is None
     rebooted = gnss.copy()
     rebooted["time_utc_usec"][5:] += 3_600_000_000
@@ -389,7 +506,9 @@ def gnss_with(offsets: Sequence[int], times: Sequence[int] = ()) -> MessageArray
     """Return messages of a receiver each second, with these errors of UTC [us]."""
     stamps = times or [1_000_000 * number for number in range(1, len(offsets) + 1)]
     pairs = zip(stamps, offsets, strict=True)
-    return array_of("sensor_gps", *({"timestamp": t, "time_utc_usec": BOOT + t + off} for t, off in pairs))
+    return array_of(
+        "sensor_gps", *({"timestamp": t, "time_utc_usec": BOOT + t + off} for t, off in pairs)
+    )
 
 
 _OFF = 2_000_000
@@ -418,16 +537,24 @@ def test_utc_after_a_correction_holds(offsets: Sequence[int], corrected: int | N
         assert found.startswith("the UTC of sensor_gps/0 varies by ")
     else:
         assert isinstance(found, nedbus.UtcOffset)
-        assert (found.source, found.offset_us, found.corrected_us) == ("sensor_gps/0", BOOT, corrected)
+        assert (found.source, found.offset_us, found.corrected_us) == (
+            "sensor_gps/0",
+            BOOT,
+            corrected,
+        )
 
 
 def test_utc_of_two_boots_is_unknown() -> None:
     """Timestamps that start anew are another boot, whose offset does not correct that of the first."""
     times = [*range(1_000_000, 11_000_000, 1_000_000)] * 2
-    assert isinstance(find_utc({"sensor_gps/0": gnss_with([0] * 10 + [15_000_000] * 10, times)}), str)
+    assert isinstance(
+        find_utc({"sensor_gps/0": gnss_with([0] * 10 + [15_000_000] * 10, times)}), str
+    )
 
 
-@pytest.mark.parametrize(("shift", "is_used"), [(0, True), (9_000_000, True), (5_000_000_000, False)])
+@pytest.mark.parametrize(
+    ("shift", "is_used"), [(0, True), (9_000_000, True), (5_000_000_000, False)]
+)
 def test_utc_of_a_source_on_another_clock_is_not_used(shift: int, is_used: bool) -> None:
     """A receiver whose timestamps do not overlap those of the other messages cannot date them."""
     gnss, positions = gnss_with([0] * 10), np.repeat(POSITIONS, 2)
@@ -436,7 +563,10 @@ def test_utc_of_a_source_on_another_clock_is_not_used(shift: int, is_used: bool)
     found = find_utc({"sensor_gps/0": gnss, VLP: positions})
     assert isinstance(found, nedbus.UtcOffset) == is_used
     if isinstance(found, str):
-        assert found == "the timestamps of sensor_gps/0, which has UTC, are not on the clock of the other messages"
+        assert (
+            found
+            == "the timestamps of sensor_gps/0, which has UTC, are not on the clock of the other messages"
+        )
 
 
 def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:
@@ -452,7 +582,9 @@ def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:
 
 
 @pytest.mark.parametrize(("late", "is_restart"), [(1, False), (2, False), (6, True), (20, True)])
-def test_more_than_one_percent_of_earlier_timestamps_are_a_restart(late: int, *, is_restart: bool) -> None:
+def test_more_than_one_percent_of_earlier_timestamps_are_a_restart(
+    late: int, *, is_restart: bool
+) -> None:
     """Up to 1 % of the messages may be out of order; more of them are those of another boot, which raises."""
     stamps = [10_000_000 + 10_000 * number for number in range(200 - late)] + [
         10_000 * number for number in range(late)

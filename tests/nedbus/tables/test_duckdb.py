@@ -24,7 +24,21 @@ PAGE: Final = Path(__file__).parents[3] / "docs" / "beside-other-tools.md"
 TYPES: Final = {"f4": "FLOAT", "f8": "DOUBLE"}
 LARGEST: Final = float(np.finfo(np.float32).max)
 SMALLEST: Final = float(np.finfo(np.float32).smallest_subnormal)
-VALUES: Final = (math.nan, math.inf, -math.inf, 0.0, -0.0, 0.1, -0.1, 1 / 3, SMALLEST, LARGEST, -LARGEST, 5.0, 2.0**24)
+VALUES: Final = (
+    math.nan,
+    math.inf,
+    -math.inf,
+    0.0,
+    -0.0,
+    0.1,
+    -0.1,
+    1 / 3,
+    SMALLEST,
+    LARGEST,
+    -LARGEST,
+    5.0,
+    2.0**24,
+)
 LIMITS: Final = (*VALUES[1:], 0.3, 2.0**24 + 1)
 
 _Column = npt.NDArray[np.floating[Any]]
@@ -110,7 +124,9 @@ def different_filters(path: Path, folder: Path, columns: dict[str, tuple[float, 
                 for limit in limits:
                     text = repr(limit) if math.isfinite(limit) else f"'{limit!r}'"
                     with_limit = query.replace("0.1::FLOAT", f"{text}::{kind}")
-                    expected = array["timestamp"][compare(values, values.dtype.type(limit))].tolist()
+                    expected = array["timestamp"][
+                        compare(values, values.dtype.type(limit))
+                    ].tolist()
                     if export.timestamps(with_limit) != expected:
                         differences.append(f"{export.name}: {with_limit}")
     return differences

@@ -21,7 +21,9 @@ from tests.flights.ulogs import LOGS, cached_events
 from tests.peers.command_line import run_command
 
 REAL = sorted(LOGS.parent.glob("*/*.ulg"))
-LARGE = [pytest.param(path, marks=pytest.mark.slow) for path in REAL if path.stat().st_size > 2_600_000]
+LARGE = [
+    pytest.param(path, marks=pytest.mark.slow) for path in REAL if path.stat().st_size > 2_600_000
+]
 SMALL = [path for path in REAL if path.stat().st_size <= 2_600_000]
 
 
@@ -37,10 +39,13 @@ def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, Message
 
 
 def drawn(
-    streams: Sequence[tuple[Address, MessageArray]], events: Sequence[Event] = (), times: Times | None = None
+    streams: Sequence[tuple[Address, MessageArray]],
+    events: Sequence[Event] = (),
+    times: Times | None = None,
 ) -> dict[str, Any]:
     """Return the axes of a plot, by name."""
-    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)  # imported late: Matplotlib takes a second
+    # imported late: Matplotlib takes a second
+    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)
     figure = plot.draw_figure(streams, title="a flight", events=events, times=times or Times())
     figure.draw_without_rendering()
     return {str(axes.get_label()): axes for axes in figure.axes}
@@ -48,13 +53,24 @@ def drawn(
 
 def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) -> Event:
     """Return an event of the flight that `flight_of` returns."""
-    return Event("7", kind, change, severity, fields.pop("text", kind.replace("_", " ")), boot - 1.0, boot, **fields)
+    return Event(
+        "7",
+        kind,
+        change,
+        severity,
+        fields.pop("text", kind.replace("_", " ")),
+        boot - 1.0,
+        boot,
+        **fields,
+    )
 
 
 def events_of(path: Path) -> list[Event]:
     """Return the events of a log, including the start of its initial conditions."""
     event_log = cached_events(path).event_log
-    known = (each for vehicle in event_log.vehicles.values() for each in vehicle.conditions.values())
+    known = (
+        each for vehicle in event_log.vehicles.values() for each in vehicle.conditions.values()
+    )
     held = [each.begin for each in known if each.initial]
     return [*held, *event_log.events_since(0)[0]]
 
@@ -76,11 +92,15 @@ def bars_of(axes: Any) -> dict[str, list[tuple[float, float]]]:
     for bar in axes.collections:
         for path in bar.get_paths():
             (left, low), (right, high) = path.vertices.min(axis=0), path.vertices.max(axis=0)
-            found[rows_of(axes)[round((low + high) / 2)]].append((round(float(left), 6), round(float(right), 6)))
+            found[rows_of(axes)[round((low + high) / 2)]].append(
+                (round(float(left), 6), round(float(right), 6))
+            )
     return found
 
 
-@pytest.mark.parametrize("others", [[], [flight_of(vehicle="8")]], ids=["one vehicle", "two vehicles"])
+@pytest.mark.parametrize(
+    "others", [[], [flight_of(vehicle="8")]], ids=["one vehicle", "two vehicles"]
+)
 def test_invalid_estimate_is_drawn_thin_without_affecting_axis_limits(
     others: list[tuple[Address, MessageArray]],
 ) -> None:
@@ -97,7 +117,11 @@ def test_invalid_estimate_is_drawn_thin_without_affecting_axis_limits(
     assert parts["altitude"].get_ylim() == pytest.approx((-0.05 * 4.95, 1.05 * 4.95), rel=1e-3)
     assert parts["speed"].get_ylim()[1] < 2
     for name, field, sign in (("track", "x", 1), ("altitude", "z", -1), ("speed", "vx", 1)):
-        [thin, *_] = [line for line in parts[name].lines if line.get_linewidth() == 0.5 and line.get_linestyle() == "-"]
+        [thin, *_] = [
+            line
+            for line in parts[name].lines
+            if line.get_linewidth() == 0.5 and line.get_linestyle() == "-"
+        ]
         assert np.array_equal(thin.get_ydata(), sign * array[field]), name
         thick = next(line for line in parts[name].lines if line.get_linewidth() > 0.8)
         assert np.array_equal(np.isfinite(np.asarray(thick.get_ydata())), array["xy_valid"]), name
@@ -118,8 +142,12 @@ def test_never_valid_estimate_sets_axis_limits() -> None:
 def test_flight_without_flags_is_drawn(events: list[Event]) -> None:
     """LOCAL_POSITION_NED without ESTIMATOR_STATUS has no flags: the plot has no rows for them."""
     address, array = flight_of()
-    names = tuple(name for name in array.dtype.names or () if array.dtype[name].kind == "b" or "reset" in name)
-    messages = array.view(np.dtype(array.dtype.descr, metadata={"missing": (*names, "heading_reset_counter")}))
+    names = tuple(
+        name for name in array.dtype.names or () if array.dtype[name].kind == "b" or "reset" in name
+    )
+    messages = array.view(
+        np.dtype(array.dtype.descr, metadata={"missing": (*names, "heading_reset_counter")})
+    )
     axes = drawn([(address, messages)], events)
     assert axes.keys() == {"track", "altitude", "speed"} | ({"events"} if events else set())
 
@@ -131,10 +159,14 @@ def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
         array[f"{counter}_reset_counter"][10 * number :] = 1
     parts = drawn([(address, array)])
     dashed = [
-        float(np.asarray(line.get_xdata())[0]) for line in parts["altitude"].lines if line.get_linestyle() == "--"
+        float(np.asarray(line.get_xdata())[0])
+        for line in parts["altitude"].lines
+        if line.get_linestyle() == "--"
     ]
     assert dashed == [2.0, 4.0]
-    resets = dict(zip([row for row in rows_of(parts["flags"]) if "resets" in row], range(1, 6), strict=True))
+    resets = dict(
+        zip([row for row in rows_of(parts["flags"]) if "resets" in row], range(1, 6), strict=True)
+    )
     assert list(resets) == [f"{name} resets" for name in ("xy", "z", "vxy", "vz", "heading")]
     assert [x for x, _ in marks_of(parts["flags"], "|")] == [1.0, 2.0, 3.0, 4.0, 5.0]
 
@@ -188,7 +220,11 @@ def test_events_are_marked_by_severity() -> None:
     ("offsets", "ticks", "label"),
     [
         ({}, ["2", "4", "6", "8", "10"], "time [s since boot]"),
-        ({"7": 1.7e9 + 1.3}, ["22:13:24", "22:13:26", "22:13:28", "22:13:30", "22:13:32"], "time [UTC]"),
+        (
+            {"7": 1.7e9 + 1.3},
+            ["22:13:24", "22:13:26", "22:13:28", "22:13:30", "22:13:32"],
+            "time [UTC]",
+        ),
         ({"8": 1.7e9}, ["2", "4", "6", "8", "10"], "time [s since boot]"),
     ],
 )
@@ -210,7 +246,9 @@ def test_time_axis_names_its_clock(offsets: dict[str, float], ticks: list[str], 
 
 def test_time_axis_of_vehicles_with_different_boots_is_since_boot() -> None:
     """Vehicles whose UTC offsets differ are plotted over seconds since boot."""
-    parts = drawn([flight_of(), flight_of(vehicle="8")], times=Times(offsets={"7": 1.7e9, "8": 1.7e9 + 30}))
+    parts = drawn(
+        [flight_of(), flight_of(vehicle="8")], times=Times(offsets={"7": 1.7e9, "8": 1.7e9 + 30})
+    )
     assert parts["speed"].get_xlabel() == "time [s since boot]"
 
 
@@ -241,7 +279,9 @@ def test_fields_are_drawn_by_name() -> None:
     address, array = flight_of()
     array["z_valid"][:10] = False
     events = [event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",))]
-    figure = plot.draw_field_figure([(address, array)], ["z", "height", "speed"], title="a", events=events)
+    figure = plot.draw_field_figure(
+        [(address, array)], ["z", "height", "speed"], title="a", events=events
+    )
     parts = {str(axes.get_label()): axes for axes in figure.axes}
     assert list(parts) == ["z", "height", "speed", "events"]
     z, height, speed = (parts[name].lines[0].get_ydata() for name in ("z", "height", "speed"))
@@ -250,7 +290,9 @@ def test_fields_are_drawn_by_name() -> None:
     assert np.array_equal(height, -z, equal_nan=True)
     assert np.allclose(speed, 1.0)
     assert "above the origin of the local frame [m]" in parts["height"].get_title("right")
-    with pytest.raises(nedbus.ConfigError, match=r"no selected stream has a number 'delta_xy'; they have .*speed"):
+    with pytest.raises(
+        nedbus.ConfigError, match=r"no selected stream has a number 'delta_xy'; they have .*speed"
+    ):
         plot.draw_field_figure([(address, array)], ["delta_xy"], title="a")
 
 
@@ -272,12 +314,22 @@ def test_plot_command_draws_angles(tmp_path: Path) -> None:
 def test_plot_command_marks_events(tmp_path: Path) -> None:
     """`nedbus plot` marks the events of a simulated loss of GPS."""
     flight = tmp_path / "flight.mcap"
-    convert_replay("sim:?duration=80&topics=VehicleLocalPosition,SensorGps,VehicleStatus,EstimatorStatusFlags", flight)
+    convert_replay(
+        "sim:?duration=80&topics=VehicleLocalPosition,SensorGps,VehicleStatus,EstimatorStatusFlags",
+        flight,
+    )
     with pytest.importorskip("matplotlib").rc_context({"svg.fonttype": "none"}):
         plot = run_command("plot", str(flight), "-o", str(tmp_path / "a.svg"))
     assert plot.exit_code == 0, plot.err
     texts = set(re.findall(r"<text[^>]*>([^<]*)</text>", (tmp_path / "a.svg").read_text()))
-    assert {"xy invalid", "gps fix lost", "mode", "Mission", "only 0 satellites", "bad event"} <= texts
+    assert {
+        "xy invalid",
+        "gps fix lost",
+        "mode",
+        "Mission",
+        "only 0 satellites",
+        "bad event",
+    } <= texts
 
 
 @pytest.mark.logs
@@ -306,7 +358,11 @@ def test_labels_of_real_flights_do_not_overlap(path: Path) -> None:
             assert end <= begin
     titles = [parts[name].title.get_window_extent() for name in ("track", "altitude")]
     assert titles[0].x1 < titles[1].x0
-    bad = {KINDS[event.kind].row or event.kind.replace("_", " ") for event in events if event.severity != "info"}
+    bad = {
+        KINDS[event.kind].row or event.kind.replace("_", " ")
+        for event in events
+        if event.severity != "info"
+    }
     assert bad <= set(rows_of(axes))
 
 

@@ -34,7 +34,8 @@ from .test_alignment import array_of, write
 # pandas, polars and matplotlib take a second to import, so only the tests that need them import them.
 
 DOCS = Path(__file__).parents[3] / "docs"
-COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")  # of the streams in a plot, in order
+# of the streams in a plot, in order
+COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +58,14 @@ def test_recording_is_read_as_an_array(flight: Path) -> None:
     expected = [upgrade(each.fields) for each in messages if each.address.topic == VLP]
     assert array.dtype == DTYPE
     assert len(array) == len(expected) == 2000
-    assert all(to_message(element) == each for element, each in zip(array[::100], expected[::100], strict=True))
-    assert nedbus.read(flight, "estimator_local_position", instance=1)["timestamp"][0] == array["timestamp"][0]
+    assert all(
+        to_message(element) == each
+        for element, each in zip(array[::100], expected[::100], strict=True)
+    )
+    assert (
+        nedbus.read(flight, "estimator_local_position", instance=1)["timestamp"][0]
+        == array["timestamp"][0]
+    )
     assert nedbus.read(flight, vehicle=1).tobytes() == array.tobytes()
 
 
@@ -80,7 +87,10 @@ def test_data_frames_have_all_columns(flight: Path) -> None:
 
 def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
     """A selection that matches no stream or several raises; the error lists the available streams."""
-    with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match; set instance to one of 1/"):
+    with pytest.raises(
+        AddressError,
+        match=r"^instance None is not valid: .*several match; set instance to one of 1/",
+    ):
         nedbus.read(flight, "estimator_local_position")
     has = f"expected one of 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
     with pytest.raises(AddressError, match=f"^vehicle '2' is not in {flight}: {has}"):
@@ -99,14 +109,22 @@ def test_ambiguous_selection_names_the_missing_argument(tmp_path: Path) -> None:
     with RecordingWriter(path) as writer:
         rows = to_array([message(1)] * len(addresses))
         writer.write(
-            rows, DEFAULT, ((address, Provenance()) for address in addresses), logged=repeat(1), published=repeat(1)
+            rows,
+            DEFAULT,
+            ((address, Provenance()) for address in addresses),
+            logged=repeat(1),
+            published=repeat(1),
         )
-    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: .*set vehicle to one of 1/.* and 3 more$"):
+    with pytest.raises(
+        AddressError, match=r"vehicle '\*' is not valid: .*set vehicle to one of 1/.* and 3 more$"
+    ):
         nedbus.read(path)
     with pytest.raises(AddressError, match="set topic and vehicle and instance to one of"):
         nedbus.read(path, "*")
     truth = f"{VLP}_groundtruth"
-    with pytest.raises(AddressError, match=f"topic '{truth}' is not in .*: expected one of 1/.* more$"):
+    with pytest.raises(
+        AddressError, match=f"topic '{truth}' is not in .*: expected one of 1/.* more$"
+    ):
         nedbus.read(path, truth)
     with pytest.raises(AddressError, match=f"topic '{VLP}' is not in"):
         nedbus.read(path, vehicle="99")
@@ -119,14 +137,30 @@ def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
     noise = to_array([message(0)] * 1000)
     with RecordingWriter(path) as writer:
         for chunk in range(20):
-            for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading_var", "tilt_var"):
+            for name in (
+                "x",
+                "y",
+                "z",
+                "vx",
+                "vy",
+                "vz",
+                "ax",
+                "ay",
+                "az",
+                "heading_var",
+                "tilt_var",
+            ):
                 noise[name] = rng.random(1000)
             noise["timestamp"] = np.arange(1000) + chunk * 1000
             times = list(range(1000))
             for vehicle in ("1", "2"):
                 rows = noise if vehicle == "1" else noise[:10]
                 writer.write(
-                    rows, DEFAULT, repeat((Address(vehicle, VLP), Provenance())), logged=times, published=times
+                    rows,
+                    DEFAULT,
+                    repeat((Address(vehicle, VLP), Provenance())),
+                    logged=times,
+                    published=times,
                 )
             writer.flush()
     assert path.stat().st_size > 1_300_000
@@ -139,9 +173,13 @@ def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
     assert peak < 1_100_000, f"{peak} bytes for {path.stat().st_size}"
 
 
-def test_missing_package_error_contains_the_pip_command(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_error_contains_the_pip_command(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without pandas or mcap the error includes the pip command; an unknown data frame library raises."""
-    with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
+    with pytest.raises(
+        ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"
+    ):
         nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed; run pip install pandas"):
@@ -188,9 +226,13 @@ def count_pixels(pixels: np.ndarray, color: str) -> int:
     return int(np.count_nonzero(np.abs(pixels - wanted).max(axis=-1) < 0.02))
 
 
-def texts_of(streams: list[tuple[Address, np.ndarray]], path: Path, *, title: str = "") -> list[str]:
+def texts_of(
+    streams: list[tuple[Address, np.ndarray]], path: Path, *, title: str = ""
+) -> list[str]:
     """Plot to an SVG file, and return its texts."""
-    with pytest.importorskip("matplotlib").rc_context({"path.simplify": False, "svg.fonttype": "none"}):
+    with pytest.importorskip("matplotlib").rc_context(
+        {"path.simplify": False, "svg.fonttype": "none"}
+    ):
         tables.draw(streams, path, title=title)
     return re.findall(r"<text[^>]*>([^<]*)</text>", path.read_text())
 
@@ -206,22 +248,45 @@ def test_track_has_every_valid_position(tmp_path: Path) -> None:
     array["z_reset_counter"][50:] = 1
     texts = set(texts_of([(Address("7", VLP), array)], tmp_path / "a.svg", title="a flight"))
     svg = (tmp_path / "a.svg").read_text()
-    flags = {"xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning"}
-    assert {"a flight", f"7/{VLP}", "east [m]", "north [m]", "z resets", "heading resets", *flags} <= texts
+    flags = {
+        "xy_valid",
+        "z_valid",
+        "v_xy_valid",
+        "v_z_valid",
+        "heading_good_for_control",
+        "dead_reckoning",
+    }
+    assert {
+        "a flight",
+        f"7/{VLP}",
+        "east [m]",
+        "north [m]",
+        "z resets",
+        "heading resets",
+        *flags,
+    } <= texts
     assert not {"xy resets", "vz resets"} & texts
     paths = re.findall(r'<path [^>]*?d="([^"]*)"[^>]*?style="([^"]*)"', svg)
-    [track] = [path for path, style in paths if "stroke-width: 1.2" in style and path.count("L") > 10]
+    [track] = [
+        path for path, style in paths if "stroke-width: 1.2" in style and path.count("L") > 10
+    ]
     points = np.array(re.findall(r"[ML] (\S+) (\S+)", track), float)
     valid = array[array["xy_valid"]]
     assert len(points) == len(valid) == 45
     assert track.count("M") == 2  # interrupted while xy is invalid
     east, north = np.polyfit(valid["y"], points[:, 0], 1), np.polyfit(valid["x"], points[:, 1], 1)
-    assert east[0] == pytest.approx(-north[0], rel=5e-3)  # Matplotlib accepts an aspect within 0.5 %
+    # Matplotlib accepts an aspect within 0.5 %
+    assert east[0] == pytest.approx(-north[0], rel=5e-3)
     assert east[0] > 0
     assert np.allclose(np.polyval(east, valid["y"]), points[:, 0], atol=0.01)
     assert np.allclose(np.polyval(north, valid["x"]), points[:, 1], atol=0.01)
-    bars = [np.array(re.findall(r"[ML] (\S+)", path), float) for path, style in paths if f"fill: {COLORS[0]}" in style]
-    first, second = (float(np.ptp(bar)) for bar in bars)  # bars of xy_valid: for 0.2 s, and from 0.35 s to 0.59 s
+    bars = [
+        np.array(re.findall(r"[ML] (\S+)", path), float)
+        for path, style in paths
+        if f"fill: {COLORS[0]}" in style
+    ]
+    # bars of xy_valid: for 0.2 s, and from 0.35 s to 0.59 s
+    first, second = (float(np.ptp(bar)) for bar in bars)
     assert second == pytest.approx(first * 0.24 / 0.2, rel=1e-4)
 
 
@@ -244,7 +309,9 @@ def test_plot_of_invalid_messages_has_explanatory_titles(tmp_path: Path) -> None
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
     texts = texts_of([(Address("1", VLP), array)], tmp_path / "a.svg", title=name)
-    assert {"height; thin: z invalid, dashed: z or vz reset", "speed; thin: v_xy invalid"} <= set(texts)
+    assert {"height; thin: z invalid, dashed: z or vz reset", "speed; thin: v_xy invalid"} <= set(
+        texts
+    )
     assert name.replace("\udcff", "?") in texts
 
 
@@ -260,7 +327,13 @@ def test_missing_fields_are_listed(tmp_path: Path) -> None:
     missing = nedbus.missing_of(array)
     assert {"dead_reckoning", "heading_var", "dist_bottom_reset_counter"} <= missing
     assert not {"x", "xy_valid", "hagl_max_z", "hagl_max_xy"} & missing
-    for part in (array[1:3], array[array["x"] > 0], array.copy(), np.sort(array, order="timestamp"), array[0]):
+    for part in (
+        array[1:3],
+        array[array["x"] > 0],
+        array.copy(),
+        np.sort(array, order="timestamp"),
+        array[0],
+    ):
         assert nedbus.missing_of(part) == missing
     in_pandas = nedbus.read(path, dataframe="pandas")
     in_polars = nedbus.read(path, dataframe="polars")
@@ -280,7 +353,9 @@ def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
     array = to_array([message(1, eph=1.0), message(2, eph=2.0)])
     without = Provenance("mavlink", frozenset({"dead_reckoning", "delta_xy", "eph"}))
     with RecordingWriter(path) as writer:
-        for row, provenance in zip((array[:1], array[1:]), (Provenance("sim"), without), strict=True):
+        for row, provenance in zip(
+            (array[:1], array[1:]), (Provenance("sim"), without), strict=True
+        ):
             writer.write(row, DEFAULT, [(Address("1", VLP), provenance)], logged=[1], published=[1])
     assert nedbus.missing_of(nedbus.read(path)) == without.missing
     assert nedbus.read(path, dataframe="pandas")["dead_reckoning"].isna().tolist() == [False, True]
@@ -289,10 +364,14 @@ def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
     assert in_polars["eph"].to_list() == [1.0, None]
 
 
-def test_names_in_the_docs_exist_and_scripts_run(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_in_the_docs_exist_and_scripts_run(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Names in docs/data.md and docs/recordings.md exist in `nedbus`; the scripts in docs/recordings.md run."""
     data, recordings = ((DOCS / name).read_text() for name in ("data.md", "recordings.md"))
-    names = set(re.findall(r"\bnedbus\.([A-Za-z]\w*)", re.sub(r"nedbus\.toml", "", data + recordings)))
+    names = set(
+        re.findall(r"\bnedbus\.([A-Za-z]\w*)", re.sub(r"nedbus\.toml", "", data + recordings))
+    )
     names |= set(re.findall(r"`(\w+_to_\w+)`", data))
     assert len(names) > 15
     assert names <= {*dir(nedbus), *nedbus.frames.__all__}
@@ -317,7 +396,9 @@ def test_names_in_the_docs_exist_and_scripts_run(flight: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("library", ["pandas", "polars"])
-def test_time_differences_in_data_frames_may_be_negative(tmp_path: Path, library: Literal["pandas", "polars"]) -> None:
+def test_time_differences_in_data_frames_may_be_negative(
+    tmp_path: Path, library: Literal["pandas", "polars"]
+) -> None:
     """uint64 fields are int64 in data frames, also of `align`: differences do not wrap; arrays keep PX4's type."""
     pytest.importorskip(library)
     log = UlogWriter(layout="1.13")
@@ -345,15 +426,22 @@ def test_addresses_of_lists_messages_that_only_the_file_defines() -> None:
     assert {each.stream for each in addresses} == nedbus.read(path, ["*"]).keys()
 
 
-def test_messages_of_another_type_are_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_messages_of_another_type_are_skipped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Positions on the topic of attitudes are not read as attitudes; the reason is logged."""
     path, addresses = tmp_path / "a.mcap", [Address("1", "vehicle_attitude"), Address("1", VLP)]
     with RecordingWriter(path) as writer:
         streams = [(address, Provenance("sim")) for address in addresses]
-        writer.write(to_array([message(1), message(2)]), DEFAULT, streams, logged=(1, 2), published=(1, 2))
+        writer.write(
+            to_array([message(1), message(2)]), DEFAULT, streams, logged=(1, 2), published=(1, 2)
+        )
     assert nedbus.addresses_of(path) == addresses[1:]
     nedbus.read(path)
-    assert "its messages are VehicleLocalPosition, but vehicle_attitude has VehicleAttitude" in caplog.text
+    assert (
+        "its messages are VehicleLocalPosition, but vehicle_attitude has VehicleAttitude"
+        in caplog.text
+    )
 
 
 def test_message_id_of_a_log_can_be_reused(tmp_path: Path) -> None:
@@ -365,10 +453,15 @@ def test_message_id_of_a_log_can_be_reused(tmp_path: Path) -> None:
     writer.put("A", struct.pack("<BH", 0, 0) + other.encode())
     writer.add(VLP, message(2))  # with message id 0
     streams = nedbus.read(writer.write(tmp_path / "a.ulg"), [VLP, other])
-    assert {name: own["timestamp"].tolist() for name, own in streams.items()} == {VLP: [1], other: [2]}
+    assert {name: own["timestamp"].tolist() for name, own in streams.items()} == {
+        VLP: [1],
+        other: [2],
+    }
 
 
-def test_reading_several_topics_reads_the_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_several_topics_reads_the_file_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The file is read in one pass for any number of topics."""
     path = tmp_path / "flight.mcap"
     convert_replay("sim:?duration=20", path)
@@ -392,20 +485,36 @@ def test_ground_truth_recipe_measures_the_error(
     origin = MapProjection(47.0, 8.0)
     latitude, longitude = origin.reproject(100.0, -50.0)
     streams: dict[str, list[VehicleLocalPosition]] = {VLP: [], f"{VLP}_groundtruth": []}
-    common = {"xy_valid": True, "z_valid": True, "xy_global": True, "z_global": True, "ref_alt": 400.0, "z": 0.0}
+    common = {
+        "xy_valid": True,
+        "z_valid": True,
+        "xy_global": True,
+        "z_global": True,
+        "ref_alt": 400.0,
+        "z": 0.0,
+    }
     for time in range(1_000_000, 9_000_000, 10_000):
         north, east = time / 1e5, -time / 2e5
         if time % 20_000 == 0 and time < 8_000_000:
             stamps = {"timestamp": time + 3000 * sampled, "timestamp_sample": time * sampled}
-            there = {"x": north - 100.0, "y": east + 50.0, "ref_lat": latitude, "ref_lon": longitude}
-            streams[f"{VLP}_groundtruth"].append(VehicleLocalPosition.model_validate(common | stamps | there))
+            there = {
+                "x": north - 100.0,
+                "y": east + 50.0,
+                "ref_lat": latitude,
+                "ref_lon": longitude,
+            }
+            streams[f"{VLP}_groundtruth"].append(
+                VehicleLocalPosition.model_validate(common | stamps | there)
+            )
         stamps = {"timestamp": time + 40_000, "timestamp_sample": time}
         here = {"x": north + 3.0, "y": east - 4.0, "ref_lat": 47.0, "ref_lon": 8.0}
         streams[VLP].append(VehicleLocalPosition.model_validate(common | stamps | here))
     with RecordingWriter(tmp_path / "flight.mcap") as writer:
         for topic, messages in streams.items():
             addresses = repeat((Address("1", topic), Provenance()))
-            writer.write(to_array(messages), DEFAULT, addresses, logged=repeat(1), published=repeat(1))
+            writer.write(
+                to_array(messages), DEFAULT, addresses, logged=repeat(1), published=repeat(1)
+            )
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
     [recipe] = [block for block in blocks if "rms" in block]
@@ -422,8 +531,16 @@ def test_ground_truth_recipe_measures_the_error(
             2,
             "vehicle '9' is not in flight.mcap: expected one of 1/estimator_local_position/0, 1/est",
         ),
-        ("flight.mcap -o a.foo", 2, "a.foo: not an image format; the name must end with .png or .svg or .pdf"),
-        ("flight.mcap -o /dev/full", 2, "/dev/full: not an image format; the name must end with .png or .svg or .pdf"),
+        (
+            "flight.mcap -o a.foo",
+            2,
+            "a.foo: not an image format; the name must end with .png or .svg or .pdf",
+        ),
+        (
+            "flight.mcap -o /dev/full",
+            2,
+            "/dev/full: not an image format; the name must end with .png or .svg or .pdf",
+        ),
         ("flight.mcap -o /nowhere/a.png", 1, "cannot be written"),
         ("invalid.mcap", 1, "the selected streams have no valid message"),
     ],
@@ -435,7 +552,13 @@ def test_plot_that_cannot_be_drawn_exits_with_an_error(
     array = to_array([message(1), message(2)])
     array["xy_valid"] = True
     with RecordingWriter(flight.with_name("invalid.mcap")) as writer:
-        writer.write(array, DEFAULT, repeat((Address("1", VLP), Provenance())), logged=[1, 2], published=[1, 2])
+        writer.write(
+            array,
+            DEFAULT,
+            repeat((Address("1", VLP), Provenance())),
+            logged=[1, 2],
+            published=[1, 2],
+        )
     plot = run_command("plot", *arguments.split())
     assert plot.exit_code == exit_code
     assert reason in plot.err

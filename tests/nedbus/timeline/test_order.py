@@ -13,7 +13,9 @@ from nedbus_msgs import Address
 
 STEP = 20_000  # us
 PARTS = st.lists(
-    st.tuples(st.integers(30, 80), st.sampled_from(["pause", "host", "reboot"]), st.integers(-3600, 3600)),
+    st.tuples(
+        st.integers(30, 80), st.sampled_from(["pause", "host", "reboot"]), st.integers(-3600, 3600)
+    ),
     min_size=1,
     max_size=5,
 )
@@ -72,7 +74,9 @@ def test_some_messages_have_the_axis_of_all(host: int) -> None:
     order = Order[Message]()
     order.whole = whole.axis
     found = list(order.arrange(own))
-    assert [each.at for each in found[1:]] == pytest.approx([(each.timestamp - 5_000_000) / 1e6 for each in found[1:]])
+    assert [each.at for each in found[1:]] == pytest.approx(
+        [(each.timestamp - 5_000_000) / 1e6 for each in found[1:]]
+    )
     assert order.duration == pytest.approx(whole.duration)
 
 
@@ -81,10 +85,15 @@ def test_streams_written_in_batches_are_sorted() -> None:
     host = [0 if number < 300 else -3_000_000 for number in range(600)]
     stamps = [1_000_000 + number * STEP for number in range(600)]
     streams: list[list[Message]] = [
-        [Message(stamp, stamp + shift, logged=index) for stamp, shift in zip(stamps, host, strict=True)][index::2]
+        [
+            Message(stamp, stamp + shift, logged=index)
+            for stamp, shift in zip(stamps, host, strict=True)
+        ][index::2]
         for index in range(2)
     ]
-    messages = [each for begin in range(0, 300, 50) for own in streams for each in own[begin : begin + 50]]
+    messages = [
+        each for begin in range(0, 300, 50) for own in streams for each in own[begin : begin + 50]
+    ]
     found = [each.timestamp for each in Order[Message]().arrange(messages)]
     assert found == stamps
 
@@ -124,7 +133,11 @@ def test_last_message_after_a_pause_is_a_pause(*, has_log_times: bool) -> None:
     for last, duration, unordered in ((90_000_000, 89.0, 0), (10**15, 4.0, 1)):
         stamps = [*range(1_000_000, 6_000_000, 1_000_000), last]
         order = Order[Message](has_log_times=has_log_times)
-        times = stamps if not has_log_times else [1_760_000_000_000_000 + number for number in range(len(stamps))]
+        times = (
+            stamps
+            if not has_log_times
+            else [1_760_000_000_000_000 + number for number in range(len(stamps))]
+        )
         messages = [Message(stamp, time) for stamp, time in zip(stamps, times, strict=True)]
         *_, end = order.arrange(messages)
         assert end.at == pytest.approx(duration)
@@ -134,7 +147,13 @@ def test_last_message_after_a_pause_is_a_pause(*, has_log_times: bool) -> None:
 def test_pace_alone_shortens_pauses() -> None:
     """A pause of up to a minute is kept; a longer one takes no time, and is counted."""
     pace = Pace(speed=2.0)
-    assert [pace.publish_at(at) for at in (0.0, 1.0, 1.0 + MAX_PAUSE, 1000.0, 1001.0)] == [0.0, 0.5, 30.5, 30.5, 31.0]
+    assert [pace.publish_at(at) for at in (0.0, 1.0, 1.0 + MAX_PAUSE, 1000.0, 1001.0)] == [
+        0.0,
+        0.5,
+        30.5,
+        30.5,
+        31.0,
+    ]
     assert pace.skipped == 1
 
 
@@ -144,15 +163,22 @@ UNIX = 1_710_000_000_000_000  # us
 def recorded_at_full_speed(*messages: tuple[str, int]) -> list[Message]:
     """Return messages of streams with these timestamps, which a recorder received 0.1 ms apart."""
     host = 1_760_000_000_000_000
-    return [Message(stamp, host + 100 * number, logged=stream) for number, (stream, stamp) in enumerate(messages)]
+    return [
+        Message(stamp, host + 100 * number, logged=stream)
+        for number, (stream, stamp) in enumerate(messages)
+    ]
 
 
 def assert_times_are_those_of_the_vehicle(messages: list[Message]) -> None:
     order = Order[Message]()
     found = list(order.arrange(messages))
     first = min(message.timestamp for message in messages)
-    assert [message.timestamp for message in found] == sorted(message.timestamp for message in messages)
-    assert [message.at for message in found] == pytest.approx([(each.timestamp - first) / 1e6 for each in found])
+    assert [message.timestamp for message in found] == sorted(
+        message.timestamp for message in messages
+    )
+    assert [message.at for message in found] == pytest.approx(
+        [(each.timestamp - first) / 1e6 for each in found]
+    )
     assert order.remarks == []
 
 
@@ -171,7 +197,9 @@ def test_stream_that_runs_ahead_is_sorted(epoch: int) -> None:
     stamps = [epoch + stamp for stamp in range(1_000_000, 9_000_000, STEP)]
     messages = [(stream, stamp) for stamp in stamps for stream in "ab"]
     ahead = [("c", stamps[100]), ("c", stamps[150]), ("c", stamps[200])]
-    assert_times_are_those_of_the_vehicle(recorded_at_full_speed(*messages[:20], *ahead, *messages[20:]))
+    assert_times_are_those_of_the_vehicle(
+        recorded_at_full_speed(*messages[:20], *ahead, *messages[20:])
+    )
 
 
 def test_single_message_with_a_wild_time_has_its_place_in_the_file() -> None:
@@ -179,6 +207,8 @@ def test_single_message_with_a_wild_time_has_its_place_in_the_file() -> None:
     stamps = range(1_000_000, 9_000_000, STEP)
     messages = [(stream, stamp) for stamp in stamps for stream in "ab"]
     order = Order[Message]()
-    found = list(order.arrange(recorded_at_full_speed(*messages[:20], ("c", 40_000_000), *messages[20:])))
+    found = list(
+        order.arrange(recorded_at_full_speed(*messages[:20], ("c", 40_000_000), *messages[20:]))
+    )
     assert [message.logged for message in found].index("c") == 20
     assert order.duration == pytest.approx(7.98)

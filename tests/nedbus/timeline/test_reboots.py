@@ -35,8 +35,14 @@ def test_delayed_message_of_another_stream_decides_nothing() -> None:
     """A message from before a reboot may arrive between the first two of the new boot."""
     detector = RebootDetector()
     first(detector)
-    assert detector.add("b", 100 * SECOND, before=99 * SECOND, other=99 * SECOND, elapsed=0.1) is RebootSign.NONE
-    assert detector.add("a", 2 * SECOND, before=SECOND, other=100 * SECOND, elapsed=1.0) is RebootSign.REBOOT
+    assert (
+        detector.add("b", 100 * SECOND, before=99 * SECOND, other=99 * SECOND, elapsed=0.1)
+        is RebootSign.NONE
+    )
+    assert (
+        detector.add("a", 2 * SECOND, before=SECOND, other=100 * SECOND, elapsed=1.0)
+        is RebootSign.REBOOT
+    )
 
 
 @pytest.mark.parametrize(
@@ -46,4 +52,7 @@ def test_delayed_message_of_another_stream_decides_nothing() -> None:
 def test_other_steps_back_are_no_reboots(time: int, other: int, elapsed: float) -> None:
     """No reboot: only the message before was later, or the vehicle cannot have been up for that long."""
     detector = RebootDetector()
-    assert detector.add("a", time, before=100 * SECOND, other=other, elapsed=elapsed) is RebootSign.NONE
+    assert (
+        detector.add("a", time, before=100 * SECOND, other=other, elapsed=elapsed)
+        is RebootSign.NONE
+    )

@@ -94,11 +94,15 @@ def test_nothing_runs_for_longer_than_it_exists() -> None:
     assert not is_boot_possible(UNIX, None)
 
 
-_SEGMENTS = st.lists(st.tuples(st.sampled_from(["go on", "pause", "reboot"]), st.integers(5, 600)), max_size=8)
+_SEGMENTS = st.lists(
+    st.tuples(st.sampled_from(["go on", "pause", "reboot"]), st.integers(5, 600)), max_size=8
+)
 
 
 @given(start=st.integers(3_000_000, MODULUS - 1_000_000), segments=_SEGMENTS)
-def test_any_flight_keeps_its_order_and_durations(start: int, segments: list[tuple[str, int]]) -> None:
+def test_any_flight_keeps_its_order_and_durations(
+    start: int, segments: list[tuple[str, int]]
+) -> None:
     """For any pauses, reboots and wraps: boots are counted, and within one, times and durations are the vehicle's."""
     clock, now, time, boots = VehicleClock(MODULUS), 100.0, start, 0
     for kind, seconds in [("go on", 0), *segments]:

@@ -31,7 +31,14 @@ from tests.flights.ulogs import write_log
 from tests.nedbus.client.downsampling import Clock, clock, publish, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import receive_timestamps
 from tests.nedbus.sources.px4.test_source import Px4
-from tests.peers.certificates import CONFIG, client_tls, pki, secure_endpoint, tls_options, write_config
+from tests.peers.certificates import (
+    CONFIG,
+    client_tls,
+    pki,
+    secure_endpoint,
+    tls_options,
+    write_config,
+)
 from tests.peers.command_line import run_command, run_until_shown
 from tests.peers.custom_timings import start_with_timings
 from tests.peers.http_client import HttpClient
@@ -71,14 +78,18 @@ def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iter
 def join(secure: str, pki: Path) -> Iterator[Join]:
     """Yield a function that connects a bus with the certificate of a given name."""
     with ExitStack() as opened:
-        yield lambda name: opened.enter_context(nedbus.connect(secure, tls=client_tls(pki, name), timeout=DEADLINE))
+        yield lambda name: opened.enter_context(
+            nedbus.connect(secure, tls=client_tls(pki, name), timeout=DEADLINE)
+        )
 
 
 @pytest.fixture
 def open_as(secure: str, pki: Path) -> Iterator[Open]:
     """Yield a function that opens a plain Zenoh session with the certificate of a given name."""
     with ExitStack() as opened:
-        yield lambda name: opened.enter_context(open_client([secure], tls=client_tls(pki, name), timeout=DEADLINE))
+        yield lambda name: opened.enter_context(
+            open_client([secure], tls=client_tls(pki, name), timeout=DEADLINE)
+        )
 
 
 def test_reader_receives_all_data_of_a_vehicle(join: Join) -> None:
@@ -118,7 +129,8 @@ def test_message_that_is_not_built_in_is_decoded(join: Join) -> None:
     """Readers may query vehicles for definitions that are not built in, although no rule names the topic."""
     vehicle, reader = join("vehicle-1"), join("reader")
     definition = define(
-        "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
+        "WheelEncoders",
+        [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))],
     )
     encoders = vehicle._publishers.publisher(Address("1", "wheel_encoders"), definition)
     attitude = vehicle.publisher("vehicle_attitude", vehicle="1")
@@ -183,10 +195,13 @@ def test_script_learns_that_it_may_not_publish(join: Join, certificate: str) -> 
     `latest` shows it what others see: its own message, which the router dropped, is not among them.
     """
     bus = join(certificate)
-    with pytest.raises(RefusedError, match=f"vehicle 1, .* certificate .*{certificate}.crt") as caught:
+    with pytest.raises(
+        RefusedError, match=f"vehicle 1, .* certificate .*{certificate}.crt"
+    ) as caught:
         bus.publisher(VLP, vehicle="1")
     assert caught.value.vehicle == "1"
-    with bus._publishers.publisher(Address("1", VLP)) as publisher:  # as one that was made before the rules changed
+    # as one that was made before the rules changed
+    with bus._publishers.publisher(Address("1", VLP)) as publisher:
         for number in range(3000):
             publisher.publish(message(number))
         with pytest.raises(RefusedError):
@@ -235,16 +250,26 @@ def test_vehicle_answers_schema_queries_for_itself_only(join: Join, open_as: Ope
             answering.enter_context(answer_queries(vehicle, key, reply_with({key: b"{}"})))
 
         def replies() -> list[str]:
-            return [str(each.key_expr) for each in query(reader, f"nedbus/@schema/*/{NAME}", timeout=DEADLINE)]
+            return [
+                str(each.key_expr)
+                for each in query(reader, f"nedbus/@schema/*/{NAME}", timeout=DEADLINE)
+            ]
 
         wait_for(replies, what="the reply of vehicle 1, which is declared last")
         assert replies() == keys[2:]
 
 
 @pytest.mark.parametrize("name", ["reader", "operator", "stranger"])
-def test_other_certificates_cannot_declare_liveliness_tokens(join: Join, open_as: Open, name: str) -> None:
+def test_other_certificates_cannot_declare_liveliness_tokens(
+    join: Join, open_as: Open, name: str
+) -> None:
     """Liveliness tokens of a vehicle are accepted only from its own certificate."""
-    vehicle, reader, own, stranger = join("vehicle-1"), join("reader"), open_as("vehicle-1"), open_as(name)
+    vehicle, reader, own, stranger = (
+        join("vehicle-1"),
+        join("reader"),
+        open_as("vehicle-1"),
+        open_as(name),
+    )
     keys = [f"nedbus/{each}/@alive/1a/{VLP}" for each in (1, 2, "x")]
     tokens = [stranger.liveliness().declare_token(key) for key in keys]
     tokens += [own.liveliness().declare_token(key) for key in keys[1:]]
@@ -261,7 +286,9 @@ def test_read_permissions_depend_on_the_certificate(join: Join, open_as: Open) -
     wait_for(join("reader").latest, what="the message")
     assert join("vehicle-2").latest("*") == join("vehicle-1").latest("*") == []
     operator, reader = open_as("operator"), open_as("reader")
-    wait_for(lambda: [reply.ok for reply in operator.get("@/*/router")], what="a reply to the operator")
+    wait_for(
+        lambda: [reply.ok for reply in operator.get("@/*/router")], what="a reply to the operator"
+    )
     assert [reply.ok for reply in reader.get("@/*/router")] == []
 
 
@@ -274,13 +301,21 @@ def test_read_permissions_depend_on_the_certificate(join: Join, open_as: Open) -
     ],
 )
 def test_incomplete_tls_settings_raise(
-    pki: Path, monkeypatch: pytest.MonkeyPatch, *, ca: str | None, certificate: str | None, key: str | None, reason: str
+    pki: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    ca: str | None,
+    certificate: str | None,
+    key: str | None,
+    reason: str,
 ) -> None:
     """A missing CA, certificate, key or file raises before connecting, from settings and from arguments."""
     paths = [pki / file if file else None for file in (ca, certificate, key)]
     if paths[0] is not None:
         with pytest.raises(nedbus.ConfigError, match=reason):
-            nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=nedbus.Tls(paths[0], paths[1], paths[2]))
+            nedbus.connect(
+                "tls/127.0.0.1:1", timeout=0.1, tls=nedbus.Tls(paths[0], paths[1], paths[2])
+            )
     for name, path in zip(("TLS_CA", "TLS_CERTIFICATE", "TLS_KEY"), paths, strict=True):
         if path is not None:
             monkeypatch.setenv(f"NEDBUS_{name}", str(path))
@@ -288,14 +323,32 @@ def test_incomplete_tls_settings_raise(
         nedbus.connect("tls/127.0.0.1:1", timeout=0.1)
 
 
-def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Path, run_nedbus: Start) -> None:
+def test_commands_accept_certificates_as_flags_or_variables(
+    secure: str, pki: Path, run_nedbus: Start
+) -> None:
     """Services and commands take TLS files as flags or variables. `health` reports a vehicle that the router denies."""
-    run_nedbus("serve", "-c", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+    run_nedbus(
+        "serve",
+        "-c",
+        secure,
+        *tls_options(pki, "vehicle-1"),
+        "-s",
+        "sim:?vehicle=1",
+        "-s",
+        "sim:?vehicle=2",
+    )
     wait_for(
-        lambda: run_command("health", "-c", secure, "-v", "1", *tls_options(pki, "reader")).exit_code == 0, what="1"
+        lambda: (
+            run_command("health", "-c", secure, "-v", "1", *tls_options(pki, "reader")).exit_code
+            == 0
+        ),
+        what="1",
     )
     files = {"CA": "ca.crt", "CERTIFICATE": "reader.crt", "KEY": "reader.key"}
-    environment = {"NEDBUS_CONNECT": secure, **{f"NEDBUS_TLS_{name}": f"{pki / file}" for name, file in files.items()}}
+    environment = {
+        "NEDBUS_CONNECT": secure,
+        **{f"NEDBUS_TLS_{name}": f"{pki / file}" for name, file in files.items()},
+    }
     echo = run_command("echo", "-n", "20", **environment)
     assert (echo.exit_code, len(echo.out.splitlines())) == (0, 20), echo.err
 
@@ -309,7 +362,10 @@ def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Pa
     def is_refused() -> bool:
         refused = run_command("health", "-v", "2", **environment)
         assert refused.exit_code == 1
-        return "vehicle 2 is not published, although its service reports it as published" in refused.err
+        return (
+            "vehicle 2 is not published, although its service reports it as published"
+            in refused.err
+        )
 
     wait_for(is_refused, what="the service to learn and report the refusal, under its own vehicle")
 
@@ -333,10 +389,22 @@ def test_px4_without_tls_is_bridged_to_the_secure_router(
         for timestamp in range(1, 101):
             px4.put(timestamp)
         samples = [subscription.receive(DEADLINE) for _ in range(100)]
-    assert {(sample.vehicle, sample.topic, sample.source) for sample in samples} == {("1", VLP, "px4-zenoh")}
+    assert {(sample.vehicle, sample.topic, sample.source) for sample in samples} == {
+        ("1", VLP, "px4-zenoh")
+    }
     assert [sample.message.timestamp for sample in samples] == list(range(1, 101))
     assert beyond.try_recv() is None
-    invalid = run_nedbus("serve", "--listen", free_endpoint(), "--connect", secure, "--tls-ca", "no.crt", "-s", "sim:")
+    invalid = run_nedbus(
+        "serve",
+        "--listen",
+        free_endpoint(),
+        "--connect",
+        secure,
+        "--tls-ca",
+        "no.crt",
+        "-s",
+        "sim:",
+    )
     assert invalid.wait() == 2
     assert "no.crt cannot be read" in invalid.err
 
@@ -346,9 +414,12 @@ def test_list_suggests_info_if_a_service_replies(secure: str, pki: Path, run_ned
 
     def hint() -> str:
         listed = run_command("list", "--wait", "-c", secure, *tls_options(pki, "reader"))
-        return listed.err if listed.exit_code == 0 else ""  # 1 if the router has not listed all streams in time
+        # 1 if the router has not listed all streams in time
+        return listed.err if listed.exit_code == 0 else ""
 
-    wait_for(lambda: "start a source with 'nedbus serve'" in hint(), what="the hint without a service")
+    wait_for(
+        lambda: "start a source with 'nedbus serve'" in hint(), what="the hint without a service"
+    )
     run_nedbus("serve", "--connect", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
     wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
 
@@ -357,7 +428,10 @@ def test_pki_commands_never_overwrite_keys(tmp_path: Path) -> None:
     """Keys are never overwritten or printed, and are readable by their owner only."""
     folder = tmp_path / "pki"
     assert run_command("pki", "cert", str(folder), "reader").exit_code == 1
-    for arguments in (["ca", str(folder)], ["cert", str(folder), "router", "--host", "127.0.0.1", "--host", "gcs"]):
+    for arguments in (
+        ["ca", str(folder)],
+        ["cert", str(folder), "router", "--host", "127.0.0.1", "--host", "gcs"],
+    ):
         created = run_command("pki", *arguments)
         assert created.exit_code == 0, created.err
         key = Path(created.out.splitlines()[0])
@@ -375,10 +449,16 @@ def test_pki_commands_never_overwrite_keys(tmp_path: Path) -> None:
 def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Path) -> None:
     """A router without its certificates exits with an error that names the missing file."""
     file = tmp_path / "secure.json5"
-    file.write_text((CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(tmp_path / "nowhere")))
+    file.write_text(
+        (CONFIG / "router-secure.json5")
+        .read_text()
+        .replace("/etc/nedbus/pki", str(tmp_path / "nowhere"))
+    )
     router = run_nedbus("router", str(file))
     assert router.wait() == 2
-    assert re.search(r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: check that it exists", router.err)
+    assert re.search(
+        r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: check that it exists", router.err
+    )
 
 
 @pytest.mark.parametrize(
@@ -387,7 +467,12 @@ def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Pa
     ids=["router", "service"],
 )
 def test_refused_clients_are_logged(
-    run_nedbus: Start, pki: Path, configured: tuple[Path, str], *, command: tuple[str, ...], environment: dict[str, str]
+    run_nedbus: Start,
+    pki: Path,
+    configured: tuple[Path, str],
+    *,
+    command: tuple[str, ...],
+    environment: dict[str, str],
 ) -> None:
     """The client's error names a remedy, and the router's log the reason. Other Zenoh log lines stay on stdout."""
     file, endpoint = configured
@@ -398,10 +483,20 @@ def test_refused_clients_are_logged(
     assert "refused" not in router.err
 
     for name, ca, reason, advice in (
-        ("foreign/reader", "ca.crt", "its certificate is signed by another CA", "is not signed by the CA"),
+        (
+            "foreign/reader",
+            "ca.crt",
+            "its certificate is signed by another CA",
+            "is not signed by the CA",
+        ),
         ("expired", "ca.crt", "its certificate has expired", "expired.crt or its CA has expired"),
         (None, "ca.crt", "it sent no certificate", "no certificate given: "),
-        ("reader", "foreign/ca.crt", "it does not accept the certificate of this router", "is not signed by"),
+        (
+            "reader",
+            "foreign/ca.crt",
+            "it does not accept the certificate of this router",
+            "is not signed by",
+        ),
     ):
         with pytest.raises(nedbus.ConnectError) as refused:
             nedbus.connect(endpoint, tls=client_tls(pki, name, ca), timeout=0.1)
@@ -411,7 +506,10 @@ def test_refused_clients_are_logged(
         wait_for(lambda: f"WARNING refused a client: {reason}\n" in router.err, what=reason)  # noqa: B023 - called immediately
     with pytest.raises(nedbus.ConnectError):
         nedbus.connect(endpoint.replace("tls/", "tcp/"), timeout=0.1)
-    wait_for(lambda: "refused a client: it does not speak TLS\n" in router.err, what="the client without TLS")
+    wait_for(
+        lambda: "refused a client: it does not speak TLS\n" in router.err,
+        what="the client without TLS",
+    )
     assert ("Zenoh can be reached at" in router.out) == bool(environment)
     assert "certificate" not in router.out
 
@@ -449,7 +547,12 @@ def test_downsampled_stream_passes_the_secure_router(
 
 PERMISSION: Final = "nedbus.daemon.write_permission."
 SHORT_TIMINGS: Final = Timings(
-    probe_first=(0.1, 0.3), probe_confirm=0.3, probe_poll=0.3, probe=0.3, probe_unsure=0.3, probe_pause=0.3
+    probe_first=(0.1, 0.3),
+    probe_confirm=0.3,
+    probe_poll=0.3,
+    probe=0.3,
+    probe_unsure=0.3,
+    probe_pause=0.3,
 )
 
 
@@ -459,19 +562,31 @@ SHORT_TIMINGS: Final = Timings(
     ids=["certificate of another vehicle", "certificate without a rule"],
 )
 def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
-    configured: tuple[Path, str], pki: Path, run_nedbus: Start, start: Start, *, certificate: str, kind: str
+    configured: tuple[Path, str],
+    pki: Path,
+    run_nedbus: Start,
+    start: Start,
+    *,
+    certificate: str,
+    kind: str,
 ) -> None:
     """Log, health, metrics and `nedbus info` report that the router denies vehicle 2, until its rules allow it."""
     file, endpoint = configured
 
     def start_router() -> Process:
-        return run_nedbus("router", str(file)) if kind == "nedbus" else start_zenohd(start, "-c", str(file))
+        return (
+            run_nedbus("router", str(file))
+            if kind == "nedbus"
+            else start_zenohd(start, "-c", str(file))
+        )
 
     router, pages = start_router(), HttpClient(free_port())
     options = (*tls_options(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
     service = start_with_timings(start, SHORT_TIMINGS, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses messages of vehicle 2\n")
-    wait_for(lambda: "messages of vehicle 2, so they reach no reader" in service.err, what="the refusal")
+    wait_for(
+        lambda: "messages of vehicle 2, so they reach no reader" in service.err, what="the refusal"
+    )
     assert (pages.request("/healthz"), pages.request("/readyz")) == (refused, refused)
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
     assert json.loads(pages.request("/status")[1])["refused"] == ["2"]
@@ -486,11 +601,18 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     write_access_rules(file, ["1", "2"])
     own = '{ rules: ["vehicle-2-in"], subjects: ["vehicle-2"] }'
     assert own in file.read_text()
-    file.write_text(file.read_text().replace(own, own.replace('vehicle-2"] }', f'{certificate}"] }}')))
+    file.write_text(
+        file.read_text().replace(own, own.replace('vehicle-2"] }', f'{certificate}"] }}'))
+    )
     router.kill()
     start_router()
-    wait_for(lambda: "the router now accepts messages of vehicle 2" in service.err, what="the acceptance")
-    assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    wait_for(
+        lambda: "the router now accepts messages of vehicle 2" in service.err, what="the acceptance"
+    )
+    assert (pages.request("/healthz"), pages.request("/readyz")) == (
+        (200, "ok\n"),
+        (200, "ready\n"),
+    )
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [0.0]
     health = run_command("health", "--vehicle", "2", *reader)
     assert health.exit_code == 0, health.err
@@ -501,7 +623,9 @@ Outcome = tuple[bool | None, float]
 
 def permission_of(session: Session, endpoint: str, pki: Path, *vehicles: str) -> WritePermission:
     tls = client_tls(pki, "vehicle-1")
-    return WritePermission(session, [endpoint], tls=tls, prefix="nedbus", vehicles=lambda: set(vehicles))
+    return WritePermission(
+        session, [endpoint], tls=tls, prefix="nedbus", vehicles=lambda: set(vehicles)
+    )
 
 
 def check(permission: WritePermission) -> Mapping[str, bool]:
@@ -536,7 +660,9 @@ def test_vehicle_is_refused_after_three_consecutive_denials(
 ) -> None:
     """A vehicle counts as refused after three consecutive denials, until the router accepts a probe."""
     verdicts = iter(history)
-    monkeypatch.setattr("nedbus.transport.write_probe.probe_writes", lambda *_, **__: {"1": next(verdicts)})
+    monkeypatch.setattr(
+        "nedbus.transport.write_probe.probe_writes", lambda *_, **__: {"1": next(verdicts)}
+    )
     permission = permission_of(zenoh_session, endpoint, pki, "1")
     refused, pause = outcome
     assert [permission.check() for _ in history][-1] == pause
@@ -544,7 +670,11 @@ def test_vehicle_is_refused_after_three_consecutive_denials(
 
 
 def test_probes_continue_after_a_panic(
-    endpoint: str, zenoh_session: Session, pki: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings
+    endpoint: str,
+    zenoh_session: Session,
+    pki: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    timings: Timings,
 ) -> None:
     """After a panic of Zenoh the permission is probed again at the next interval."""
     timings.probe_poll, timings.probe_first, timings.probe_pause = 0.01, (0.0, 0.0), 0.01
@@ -565,14 +695,20 @@ def test_probes_continue_after_a_panic(
 def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timings: Timings) -> None:
     """The permissions of a service with an embedded router depend on the certificate of its uplink."""
     timings.probe = 0.5
-    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=client_tls(pki, "vehicle-1")) as session:
+    with open_router(
+        listen=(free_endpoint(),), connect=(secure,), tls=client_tls(pki, "vehicle-1")
+    ) as session:
         permission = permission_of(session, secure, pki, "1", "2")
         wait_for(lambda: check(permission) == {"1": False}, what="the allowed vehicle")
         wait_for(lambda: check(permission) == {"1": False, "2": True}, what="the denied vehicle")
 
 
 def test_unreachable_or_open_router_is_not_reported_as_refusing(
-    configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch, timings: Timings
+    configured: tuple[Path, str],
+    pki: Path,
+    run_nedbus: Start,
+    monkeypatch: pytest.MonkeyPatch,
+    timings: Timings,
 ) -> None:
     """A router does not count as refusing if it has older rules or no access control, or if it is stopped or frozen."""
     timings.probe_open, timings.probe = 0.1, 0.5
@@ -598,7 +734,9 @@ def test_unreachable_or_open_router_is_not_reported_as_refusing(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["short", "long"])
-def test_tokens_of_a_vehicle_do_not_hide_others(configured: tuple[Path, str], pki: Path, kind: str) -> None:
+def test_tokens_of_a_vehicle_do_not_hide_others(
+    configured: tuple[Path, str], pki: Path, kind: str
+) -> None:
     """With 2,000 tokens of one vehicle, short or long, `vehicles()` and `list` are complete for the others."""
     file, endpoint = configured
     write_access_rules(file, ["1", "2"])
@@ -606,16 +744,26 @@ def test_tokens_of_a_vehicle_do_not_hide_others(configured: tuple[Path, str], pk
         opened.enter_context(open_router(config_file=file))
 
         def join(name: str) -> nedbus.Bus:
-            return opened.enter_context(nedbus.connect(endpoint, tls=client_tls(pki, name), timeout=DEADLINE))
+            return opened.enter_context(
+                nedbus.connect(endpoint, tls=client_tls(pki, name), timeout=DEADLINE)
+            )
 
-        publishers = [join("vehicle-1").publisher(topic, vehicle="1") for topic in (VLP, "vehicle_attitude")]
+        publishers = [
+            join("vehicle-1").publisher(topic, vehicle="1") for topic in (VLP, "vehicle_attitude")
+        ]
         session, name = join("vehicle-2")._session, "x" * 60 * (kind == "long")
-        tokens = [session.liveliness().declare_token(f"nedbus/2/@alive/{name}{each}/{VLP}") for each in range(2000)]
+        tokens = [
+            session.liveliness().declare_token(f"nedbus/2/@alive/{name}{each}/{VLP}")
+            for each in range(2000)
+        ]
         list(session.liveliness().get("nedbus/2/@alive/-", timeout=100))  # after all tokens
         reader = join("reader")
         wait_for(lambda: reader.vehicles().get("1"), what="the other vehicle")
         addresses = {each.address for each in publishers}
-        wait_for(lambda: set(reader.vehicles()["1"]) == addresses and "2" not in reader.vehicles(), what="both streams")
+        wait_for(
+            lambda: set(reader.vehicles()["1"]) == addresses and "2" not in reader.vehicles(),
+            what="both streams",
+        )
         assert not reader.vehicles().complete
         listed = run_command("list", "-c", endpoint, *tls_options(pki, "reader"))
         assert all(str(each) in listed.out for each in addresses)

@@ -13,12 +13,25 @@ from tests.peers.command_line import run_command
 from tests.waits import DEADLINE, wait_for
 
 LIMIT = 20
-OTHERS = ["-", "1", "d", "drone", "drone-1", "drone-10", "drone-170", "drone-17a", "drone-18", "z" * 64]
+OTHERS = [
+    "-",
+    "1",
+    "d",
+    "drone",
+    "drone-1",
+    "drone-10",
+    "drone-170",
+    "drone-17a",
+    "drone-18",
+    "z" * 64,
+]
 NAMES = st.text("ab-", min_size=1, max_size=4)
 
 
 @pytest.fixture(params=[0.0, DEADLINE], ids=["slow router", "fast router"])
-def limits(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> Timings:
+def limits(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> Timings:
     """Lower the limit of tokens; a router is slow if it has not listed all tokens when they are first polled."""
     monkeypatch.setattr(fleet_tokens, "_MAX_TOKENS", LIMIT)
     timings.slow_list = request.param
@@ -37,16 +50,23 @@ def test_vehicle_with_too_many_tokens_does_not_hide_others(
 
     The list without it is incomplete.
     """
-    tokens = [declare(zenoh_session, vehicle, 1) for vehicle in OTHERS] + [declare(zenoh_session, "drone-16", LIMIT)]
+    tokens = [declare(zenoh_session, vehicle, 1) for vehicle in OTHERS] + [
+        declare(zenoh_session, "drone-16", LIMIT)
+    ]
     flood = declare(zenoh_session, "drone-17", LIMIT + 1)
     with nedbus.connect(endpoint) as bus:
-        wait_for(lambda: list(bus.vehicles()) == sorted([*OTHERS, "drone-16"]), what="the other vehicles")
+        wait_for(
+            lambda: list(bus.vehicles()) == sorted([*OTHERS, "drone-16"]), what="the other vehicles"
+        )
         assert not bus.vehicles(timeout=0.0).complete
         assert caplog.text.count("the streams of 'drone-17' are not listed") == 1
         tokens.append(declare(zenoh_session, "new", 1))
         wait_for(lambda: "new" in bus.vehicles(), what="a new vehicle")
         tokens.append(declare(zenoh_session, "drone-16", LIMIT + 1))
-        wait_for(lambda: list(bus.vehicles()) == sorted([*OTHERS, "new"]), what="the exclusion of another vehicle")
+        wait_for(
+            lambda: list(bus.vehicles()) == sorted([*OTHERS, "new"]),
+            what="the exclusion of another vehicle",
+        )
         assert not bus.vehicles(timeout=0.0).complete
     del flood  # declared until now
 
@@ -61,7 +81,10 @@ def test_excluded_vehicle_is_listed_again(
         wait_for(lambda: list(bus.vehicles(timeout=0.1)) == ["7"], what="the other vehicle")
         assert "the streams of '8' are not listed" in caplog.text
         tokens.pop().undeclare()
-        wait_for(lambda: (vehicles := bus.vehicles(timeout=0.1)).complete and len(vehicles) == 2, what="both vehicles")
+        wait_for(
+            lambda: (vehicles := bus.vehicles(timeout=0.1)).complete and len(vehicles) == 2,
+            what="both vehicles",
+        )
 
 
 def test_number_of_excluded_vehicles_is_bounded(
@@ -116,7 +139,10 @@ def test_tokens_are_queried_while_the_subscription_lists_none(
     monkeypatch.setattr(LivelinessTokens, "poll", lambda _: [])
     tokens = declare(zenoh_session, "7", 2)
     with nedbus.connect(endpoint) as bus:
-        wait_for(lambda: list(bus.publishers(timeout=0.1).values()) == [len(tokens)], what="the publishers")
+        wait_for(
+            lambda: list(bus.publishers(timeout=0.1).values()) == [len(tokens)],
+            what="the publishers",
+        )
         assert bus.vehicles().complete
 
 
@@ -137,7 +163,9 @@ def test_slow_list_is_complete(endpoint: str, zenoh_session: Session, timings: T
         wait_for(lambda: "later" not in bus.vehicles(), what="the departure of that vehicle")
         for token in tokens.pop(0):
             token.undeclare()
-        wait_for(lambda: list(bus.vehicles()) == sorted(OTHERS[1:]), what="the departure of a vehicle")
+        wait_for(
+            lambda: list(bus.vehicles()) == sorted(OTHERS[1:]), what="the departure of a vehicle"
+        )
         assert bus.vehicles().complete
 
 
@@ -163,4 +191,6 @@ def test_key_expressions_match_all_names_except_the_excluded_ones(
     key = zenoh.KeyExpr(f"nedbus/{name}/@alive/1a/{VLP}")
     found = fleet_tokens.key_exprs_without(excluded, selection, prefix="nedbus")
     selected = selection.topics in ((ANY,), (VLP,)) and selection.matches_vehicle(name)
-    assert any(zenoh.KeyExpr(each).intersects(key) for each in found) == (selected and name not in excluded)
+    assert any(zenoh.KeyExpr(each).intersects(key) for each in found) == (
+        selected and name not in excluded
+    )

@@ -25,7 +25,15 @@ from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
-from nedbus.transport import RouterState, Session, open_client, open_router, query_routers, read_router_config, router
+from nedbus.transport import (
+    RouterState,
+    Session,
+    open_client,
+    open_router,
+    query_routers,
+    read_router_config,
+    router,
+)
 from nedbus.transport.router import parse_state, raise_file_limit
 from tests.peers.certificates import CONFIG, write_config as write_shipped
 from tests.peers.ports import free_endpoint
@@ -39,7 +47,11 @@ ZID = "1ae1e25d2f7221abc366ddc8a944c8a4"
 def write_config(folder: Path, endpoint: str, **settings: object) -> Path:
     """Write a router configuration with a limit of ten sessions."""
     file = folder / "router.json5"
-    base = {"mode": "router", "listen": {"endpoints": [endpoint]}, "transport": {"unicast": {"max_sessions": 10}}}
+    base = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "transport": {"unicast": {"max_sessions": 10}},
+    }
     admin = {"adminspace": {"enabled": True, "permissions": {"read": True, "write": False}}}
     scouting = {"scouting": {"multicast": {"enabled": False}, "delay": 0}}
     file.write_text(json.dumps({**base, **admin, **scouting, **settings}))
@@ -47,7 +59,9 @@ def write_config(folder: Path, endpoint: str, **settings: object) -> Path:
 
 
 @contextmanager
-def in_thread(target: Callable[..., object], *arguments: object, stop: Callable[[], None]) -> Iterator[None]:
+def in_thread(
+    target: Callable[..., object], *arguments: object, stop: Callable[[], None]
+) -> Iterator[None]:
     """Run a function in a thread, and stop it on exit."""
     thread = threading.Thread(target=target, args=arguments)
     thread.start()
@@ -62,7 +76,9 @@ def in_thread(target: Callable[..., object], *arguments: object, stop: Callable[
 def limited(tmp_path: Path) -> Iterator[str]:
     """Run a router that is limited to ten sessions, although `metadata` in its file has another limit."""
     where = free_endpoint()
-    with open_router(config_file=write_config(tmp_path, where, metadata={"max_sessions": 7, "name": "base"})):
+    with open_router(
+        config_file=write_config(tmp_path, where, metadata={"max_sessions": 7, "name": "base"})
+    ):
         yield where
 
 
@@ -90,7 +106,10 @@ def test_every_router_of_a_mesh_reports_its_state(endpoint: str) -> None:
     """Each router reports its sessions, including those to other routers, and Zenoh's default limit of 1,000."""
     second = free_endpoint()
     with open_router(listen=[second], connect=[endpoint]) as router:
-        wait_for(lambda: sorted(state.sessions for state in router_states(endpoint)) == [1, 2], what="both routers")
+        wait_for(
+            lambda: sorted(state.sessions for state in router_states(endpoint)) == [1, 2],
+            what="both routers",
+        )
         states = router_states(endpoint)
         assert [state.max_sessions for state in states] == [1000, 1000]
         assert str(router.zid()) in {state.zid for state in states}
@@ -112,7 +131,9 @@ def test_shipped_metadata_repeats_max_sessions(name: str) -> None:
     limit = json.loads(config.get_json("transport/unicast/max_sessions"))
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
     sections = re.findall(r"^  (\w+):", (CONFIG / name).read_text(), re.MULTILINE)
-    assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(sections)
+    assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(
+        sections
+    )
     assert read_router_config().max_sessions == limit == 1000
 
 
@@ -121,7 +142,9 @@ def test_zenohd_reports_the_limit_of_the_shipped_file(start: Start, tmp_path: Pa
     where = free_endpoint()
     start_zenohd(start, "-c", str(write_shipped(tmp_path, tmp_path / "router.json5", where)))
     with open_client([where], timeout=DEADLINE) as session:
-        assert [(state.sessions, state.max_sessions) for state in query_routers(session, timeout=5.0)] == [(1, 1000)]
+        assert [
+            (state.sessions, state.max_sessions) for state in query_routers(session, timeout=5.0)
+        ] == [(1, 1000)]
 
 
 def test_malformed_router_file_raises(tmp_path: Path) -> None:
@@ -135,11 +158,20 @@ def test_malformed_router_file_raises(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "answer"),
     [
-        *((f"@/{ZID}/router", answer) for answer in (b"", b"\xff\xfe", b"[" * 2000, b"[]", b"null")),
+        *(
+            (f"@/{ZID}/router", answer)
+            for answer in (b"", b"\xff\xfe", b"[" * 2000, b"[]", b"null")
+        ),
         (f"@/{ZID}/router", b'{"sessions": 7}'),
         (f"@/{ZID}/router", b'{"sessions": {"a": 1}}'),
-        (f"@/{ZID}/router", b'{"sessions": [], "metadata": {"max_sessions": ' + b"9" * 5000 + b"}}"),
-        *((key, b'{"sessions": []}') for key in ("@/x y/router", f"@/{ZID}0/router", f"@/{ZID}/router/config")),
+        (
+            f"@/{ZID}/router",
+            b'{"sessions": [], "metadata": {"max_sessions": ' + b"9" * 5000 + b"}}",
+        ),
+        *(
+            (key, b'{"sessions": []}')
+            for key in ("@/x y/router", f"@/{ZID}0/router", f"@/{ZID}/router/config")
+        ),
         (f"a/{ZID}/router", b'{"sessions": []}'),
     ],
 )
@@ -171,7 +203,10 @@ def test_number_and_size_of_state_replies_are_limited(
 
     with open_client([endpoint], timeout=DEADLINE) as impostor:
         impostor.declare_queryable("@/*/router", answer)
-        wait_for(lambda: len(query_routers(zenoh_session, timeout=5.0)) == 21, what="the replies of the impostor")
+        wait_for(
+            lambda: len(query_routers(zenoh_session, timeout=5.0)) == 21,
+            what="the replies of the impostor",
+        )
         assert real.zid in {state.zid for state in query_routers(zenoh_session, timeout=5.0)}
         monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
         assert len(query_routers(zenoh_session, timeout=5.0)) == 5
@@ -199,13 +234,20 @@ def test_doctor_does_not_warn_about_unknown_session_limit(tmp_path: Path) -> Non
             assert [state.max_sessions for state in router_states(where)] == [None]
             assert router_finding(where, "connected sessions: 1").state == "ok"
     with open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False})):
-        assert router_finding(where, "connected; its other sessions are not visible to this client").state == "ok"
+        assert (
+            router_finding(
+                where, "connected; its other sessions are not visible to this client"
+            ).state
+            == "ok"
+        )
 
 
 def test_service_metrics_have_the_session_limit_of_its_router(tmp_path: Path) -> None:
     """/metrics has the sessions and the limit of an embedded router, but no limit in a client service."""
     where = free_endpoint()
-    daemon = Daemon(load_settings(source=("sim:",), router_config=write_config(tmp_path, where)), version="0")
+    daemon = Daemon(
+        load_settings(source=("sim:",), router_config=write_config(tmp_path, where)), version="0"
+    )
 
     def shows(text: str, daemon: Daemon = daemon) -> bool:
         return text in service_pages(daemon)["/metrics"]().content.decode()
@@ -242,7 +284,10 @@ def test_exporter_metrics_have_sessions_and_limits_of_routers(
     with nedbus.connect(limited) as bus, exporting(bus) as shows:
         (state,) = router_states(limited)
         label = f'{{router="{state.zid}"}}'
-        wait_for(lambda: shows(f"sessions{label} 2.0\n", f"sessions_max{label} 10.0\n"), what="the exporter's sessions")
+        wait_for(
+            lambda: shows(f"sessions{label} 2.0\n", f"sessions_max{label} 10.0\n"),
+            what="the exporter's sessions",
+        )
         with open_client([limited], timeout=5.0):
             wait_for(lambda: shows(f"sessions{label} 3.0\n"), what="another session")
         wait_for(lambda: shows(f"sessions{label} 2.0\n"), what="its close")
@@ -294,7 +339,9 @@ def test_connect_error_names_the_session_limit_of_a_full_router(tmp_path: Path) 
     unicast = {"unicast": {"max_sessions": 1}}
     with open_router(config_file=write_config(tmp_path, endpoint, transport=unicast)):
         with open_client([endpoint], timeout=5.0):
-            with pytest.raises(nedbus.ConnectError, match=r"at its session limit .*'nedbus doctor'"):
+            with pytest.raises(
+                nedbus.ConnectError, match=r"at its session limit .*'nedbus doctor'"
+            ):
                 nedbus.connect(endpoint, timeout=0.1)
             *_, finding = check_endpoint(endpoint, None)
             assert (finding.state, "max_sessions" in finding.advice) == ("wrong", True)
@@ -326,7 +373,11 @@ class FakeResource:
         (FakeResource(1024, 500_000), 500_000, False),
         (FakeResource(1024, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
         (FakeResource(20_000, 20_000), 20_000, False),
-        (FakeResource(resource.RLIM_INFINITY, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
+        (
+            FakeResource(resource.RLIM_INFINITY, resource.RLIM_INFINITY),
+            resource.RLIM_INFINITY,
+            False,
+        ),
         (FakeResource(1024, 1500), 1500, False),
         (FakeResource(256, 1024), 1024, True),
         (FakeResource(256, 4096, refused=True), 256, True),
@@ -334,7 +385,11 @@ class FakeResource:
     ids=["raised", "no hard limit", "enough", "none", "just enough", "too low", "refused"],
 )
 def test_soft_limit_of_open_files_is_raised(
-    fake: FakeResource, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    fake: FakeResource,
+    soft: int,
+    warns: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The soft limit is raised to the hard limit; a warning is logged if the hard limit is too low."""
     monkeypatch.setattr(router, "resource", fake)

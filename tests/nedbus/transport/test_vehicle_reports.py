@@ -24,7 +24,14 @@ from nedbus.transport import Session, open_client, query, token_keys
 from nedbus.web.server import LiveFleet
 from nedbus_msgs import Selection, ack_key
 from tests.flights.messages import VLP
-from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, tls_settings, write_config
+from tests.peers.certificates import (
+    client_tls,
+    pki,
+    secure_endpoint,
+    tls_options,
+    tls_settings,
+    write_config,
+)
 from tests.peers.command_line import CommandResult, run_command
 from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_port
@@ -51,7 +58,13 @@ with nedbus.connect() as bus:
         print(sample.message.timestamp, flush=True)
 """
 """A script that never reads the rejections and the messages to which it subscribes; it prints when it is reached."""
-HEALTHY: Final = {"severity": "info", "text": "ok", "has_position": True, "topics": [VLP], "first": 1e9}
+HEALTHY: Final = {
+    "severity": "info",
+    "text": "ok",
+    "has_position": True,
+    "topics": [VLP],
+    "first": 1e9,
+}
 
 
 class Fleet:
@@ -70,7 +83,9 @@ class Fleet:
         return self._opened.enter_context(nedbus.connect(self.endpoint, tls=tls, timeout=DEADLINE))
 
     def run(self, *arguments: str) -> CommandResult:
-        return run_command(*arguments, "--wait", "-c", self.endpoint, *tls_options(self._pki, "reader"))
+        return run_command(
+            *arguments, "--wait", "-c", self.endpoint, *tls_options(self._pki, "reader")
+        )
 
     def options(self, name: str) -> list[str]:
         return ["-c", self.endpoint, *tls_options(self._pki, name)]
@@ -99,7 +114,13 @@ class Fleet:
 def _reply(key: str, status: Mapping[str, object]) -> Callable[[zenoh.Query], None]:
     def reply(asked: zenoh.Query) -> None:
         now = 2e9
-        report = {"service": "x", "host": "h", "now": now, "vehicles": {"2": HEALTHY}, "events": [FORGED_EVENT]}
+        report = {
+            "service": "x",
+            "host": "h",
+            "now": now,
+            "vehicles": {"2": HEALTHY},
+            "events": [FORGED_EVENT],
+        }
         is_report = asked.parameters.get("events") is not None
         asked.reply(key, json.dumps(report if is_report else status), encoding="application/json")
 
@@ -119,7 +140,11 @@ def fleet(pki: Path, tmp_path: Path, start: Start) -> Iterator[Fleet]:
 
 def service_of(bus: nedbus.Bus, vehicle: str) -> str | None:
     """Return the id of the service that reports a vehicle as published."""
-    statuses = (each for each in bus.services() if each.vehicle == vehicle and any(s.addresses for s in each.sources))
+    statuses = (
+        each
+        for each in bus.services()
+        if each.vehicle == vehicle and any(s.addresses for s in each.sources)
+    )
     return next((each.service for each in statuses), None)
 
 
@@ -151,7 +176,10 @@ def test_claimed_refusal_lets_no_vehicle_report_about_another(fleet: Fleet) -> N
         publisher.publish(INVALID)
         with fleet.forging(refused=["2"]):
             reader = fleet.bus("reader")
-            wait_for(lambda: [each for each in reader.services() if each.refused == ("2",)], what="the forged status")
+            wait_for(
+                lambda: [each for each in reader.services() if each.refused == ("2",)],
+                what="the forged status",
+            )
             assert [each.own_streams for each in reader.services()] == [[], []]
             # 3 s without a message make the stream stale; the forged interval of years would not.
             wait_for(lambda: "stale" in fleet.run("list").out, what="a stale stream of vehicle 2")
@@ -197,7 +225,9 @@ def test_vehicle_without_a_service_has_no_forged_verdict(fleet: Fleet) -> None:
 @pytest.mark.process
 def test_refusal_cannot_be_hidden_by_another_vehicle(fleet: Fleet, run_nedbus: Start) -> None:
     """A service that is refused for vehicle 3 stays so in `info`, whatever vehicle 1 reports under its id."""
-    run_nedbus("serve", *fleet.options("vehicle-2"), "--vehicle", "2", "-s", "sim:", "-s", "sim:?vehicle=3")
+    run_nedbus(
+        "serve", *fleet.options("vehicle-2"), "--vehicle", "2", "-s", "sim:", "-s", "sim:?vehicle=3"
+    )
     reader = fleet.bus("reader")
 
     def refused() -> list[str]:
@@ -217,10 +247,19 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
     `why` also names the vehicles that only such a service could report.
     """
     session, key = fleet.session("vehicle-1"), "nedbus/@service/old-1/status"
-    status = {"host": "flyer", "version": "0.1.0", "sources": [{"source": "sim:", "addresses": [f"2/{VLP}"]}]}
+    status = {
+        "host": "flyer",
+        "version": "0.1.0",
+        "sources": [{"source": "sim:", "addresses": [f"2/{VLP}"]}],
+    }
     with answer_queries(session, key, _reply(key, status)):
         [found] = fleet.bus("reader").services()
-        assert (found.service, found.host, found.version, found.sources) == ("old-1", "flyer", "0.1.0", ())
+        assert (found.service, found.host, found.version, found.sources) == (
+            "old-1",
+            "flyer",
+            "0.1.0",
+            (),
+        )
         health = fleet.run("health", "--services", "1")
         assert health.exit_code == 1
         assert "service old-1 on flyer runs nedbus 0.1.0" in health.err
@@ -230,7 +269,9 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
             publisher.publish(INVALID)
             assert "service old-1 on flyer runs nedbus 0.1.0" in fleet.run("why", "-v", "1").err
         doctor = run_command("doctor", *fleet.options("reader")).out
-        assert "nedbus 0.1.0 on flyer: its status does not name its vehicle" in " ".join(doctor.split())
+        assert "nedbus 0.1.0 on flyer: its status does not name its vehicle" in " ".join(
+            doctor.split()
+        )
 
 
 @pytest.mark.process
@@ -239,7 +280,10 @@ def test_vehicle_without_reports_is_named_beside_others(fleet: Fleet, run_nedbus
     run_nedbus("serve", *fleet.options("vehicle-2"), "--vehicle", "2", "-s", "sim:")
     reader = fleet.bus("reader")
     wait_for(lambda: service_of(reader, "2"), what="the service of vehicle 2")
-    statuses = {f"nedbus/@service/old-{number}/status": b'{"host": "h", "version": "0.1.0"}' for number in range(30)}
+    statuses = {
+        f"nedbus/@service/old-{number}/status": b'{"host": "h", "version": "0.1.0"}'
+        for number in range(30)
+    }
     session = fleet.session("vehicle-1")
     with (
         fleet.bus("vehicle-1").publisher(VLP, vehicle="1") as publisher,
@@ -249,7 +293,10 @@ def test_vehicle_without_reports_is_named_beside_others(fleet: Fleet, run_nedbus
         result = fleet.run("why")
         assert result.exit_code == 0
         assert result.out.startswith("2: ")
-        assert "no verdict on 1: published, but no nedbus service keeps the event history" in result.err
+        assert (
+            "no verdict on 1: published, but no nedbus service keeps the event history"
+            in result.err
+        )
         assert "10 more older services" in result.err
         assert len(fleet.run("health", "--expect", "2").err.splitlines()) == 21
 
@@ -275,7 +322,9 @@ def test_other_certificates_cannot_put_on_keys_of_a_vehicle(fleet: Fleet, key: s
             other.put(key, b"1")
             other.put(key.replace("2", "*", 1), b"1")
         two.put(key, b"2")
-        received.extend(sample.payload.to_bytes() for sample in iter(subscriber.handler.try_recv, None))
+        received.extend(
+            sample.payload.to_bytes() for sample in iter(subscriber.handler.try_recv, None)
+        )
         return len(received) > 2
 
     wait_for(is_received, what="the messages of vehicle 2")
@@ -308,9 +357,16 @@ def test_vehicle_cannot_answer_or_announce_for_another(fleet: Fleet) -> None:
 @pytest.mark.process
 def test_only_readers_acknowledge(fleet: Fleet) -> None:
     """A query for the acknowledgements of vehicle 1 is answered by readers, and not by another vehicle."""
-    one, two, reader = fleet.session("vehicle-1"), fleet.session("vehicle-2"), fleet.session("reader")
+    one, two, reader = (
+        fleet.session("vehicle-1"),
+        fleet.session("vehicle-2"),
+        fleet.session("reader"),
+    )
     key = ack_key(f"nedbus/1/{VLP}")
-    with answer_queries(two, key, reply_with({key: b"2"})), answer_queries(reader, key, reply_with({key: b"reader"})):
+    with (
+        answer_queries(two, key, reply_with({key: b"2"})),
+        answer_queries(reader, key, reply_with({key: b"reader"})),
+    ):
 
         def answers() -> list[bytes]:
             return [reply.payload.to_bytes() for reply in query(one, key, timeout=DEADLINE)]
@@ -340,14 +396,21 @@ def test_service_of_several_vehicles_has_a_certificate_that_says_so(
     write_access_rules(file, ["1", "2"])
     rules = '["vehicle-1-in", "vehicle-2-in", "vehicle-out", "query-in", "query-out"]'
     subject, policy = '{ id: "routers",', '{ rules: ["router"],'
-    text = file.read_text().replace(subject, f'{{ id: "link", cert_common_names: ["stranger"] }},\n{subject}')
+    text = file.read_text().replace(
+        subject, f'{{ id: "link", cert_common_names: ["stranger"] }},\n{subject}'
+    )
     file.write_text(text.replace(policy, f'{{ rules: {rules}, subjects: ["link"] }},\n{policy}'))
     start_zenohd(start, "-c", str(file))
     with ExitStack() as opened:
         fleet = Fleet(endpoint, pki, opened)
-        run_nedbus("serve", *fleet.options("stranger"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+        run_nedbus(
+            "serve", *fleet.options("stranger"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2"
+        )
         reader = fleet.bus("reader")
-        wait_for(lambda: service_of(reader, "1") and service_of(reader, "2"), what="the reports about both vehicles")
+        wait_for(
+            lambda: service_of(reader, "1") and service_of(reader, "2"),
+            what="the reports about both vehicles",
+        )
         assert service_of(reader, "1") == service_of(reader, "2")
         assert fleet.run("health", "--expect", "1,2").exit_code == 0
 
@@ -368,7 +431,9 @@ def test_flood_of_reports_and_heartbeats_takes_little_memory(
     and the readers' own limits allow, and larger.
     """
     http = [HttpClient(free_port()) for _ in range(2)]
-    tls = {f"NEDBUS_{name.upper()}": str(path) for name, path in tls_settings(pki, "reader").items()}
+    tls = {
+        f"NEDBUS_{name.upper()}": str(path) for name, path in tls_settings(pki, "reader").items()
+    }
     script = start("-c", UNREAD, NEDBUS_CONNECT=fleet.endpoint, coverage=False, **tls)
     readers = [script, *(
         run_nedbus(command, "--wait", *fleet.options("reader"), "--http", client.where, coverage=False)
@@ -380,7 +445,10 @@ def test_flood_of_reports_and_heartbeats_takes_little_memory(
 
     def received() -> list[float]:
         """Return how many messages each reader has received."""
-        counts = [sum(client.values("nedbus_messages_received_total", topic="vehicle_attitude")) for client in http]
+        counts = [
+            sum(client.values("nedbus_messages_received_total", topic="vehicle_attitude"))
+            for client in http
+        ]
         return [len(script.out.split()), *counts]
 
     def reach_all() -> None:
@@ -408,11 +476,17 @@ def test_flood_of_reports_and_heartbeats_takes_little_memory(
         session.put(report, bytes(2**20 - 1000), congestion_control=block)
         reach_all()
     peaks = [peak_memory(process) for process in readers]
-    assert [peak < 1.5 * least for peak, least in zip(peaks, rest, strict=True)] == [True, True, True], (rest, peaks)
+    assert [peak < 1.5 * least for peak, least in zip(peaks, rest, strict=True)] == [
+        True,
+        True,
+        True,
+    ], (rest, peaks)
 
 
 @pytest.mark.process
-def test_zenohd_logs_certificate_and_key_of_a_denial(pki: Path, tmp_path: Path, start: Start) -> None:
+def test_zenohd_logs_certificate_and_key_of_a_denial(
+    pki: Path, tmp_path: Path, start: Start
+) -> None:
     """At the level that docs/security.md names, a real zenohd logs who was denied what; the doctor adds the rule."""
     endpoint = secure_endpoint()
     file = write_config(pki, tmp_path / "router-secure.json5", endpoint)

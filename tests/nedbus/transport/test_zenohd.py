@@ -74,7 +74,8 @@ def start_storage(start: Start, tmp_path: Path, router: str) -> Process:
 def http(method: str, url: str, body: bytes | None = None) -> tuple[int, bytes]:
     """Return status and body of an HTTP response; status 0 if the connection is refused."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, body, method=method), timeout=DEADLINE) as response:  # noqa: S310 - loopback
+        request = urllib.request.Request(url, body, method=method)  # noqa: S310 - loopback
+        with urllib.request.urlopen(request, timeout=DEADLINE) as response:  # noqa: S310 - loopback
             return response.status, response.read()
     except urllib.error.HTTPError as exc:
         return exc.code, b""
@@ -84,7 +85,9 @@ def http(method: str, url: str, body: bytes | None = None) -> tuple[int, bytes]:
 
 def last_messages(session: Session) -> list[int]:
     """Return the timestamps in all replies for vehicle 1."""
-    replies = session.get(f"nedbus/1/{VLP}", target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE)
+    replies = session.get(
+        f"nedbus/1/{VLP}", target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE
+    )
     return [decode(reply.ok.payload.to_bytes()).timestamp for reply in replies if reply.ok]
 
 
@@ -123,7 +126,9 @@ def test_live_reply_takes_precedence_over_the_storage(
 ) -> None:
     """A live reply takes precedence, even after a restart with an earlier clock; `get` marks stored messages."""
     start_storage(start, tmp_path, zenohd)
-    ahead = zenoh.Timestamp(zenoh_session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
+    ahead = zenoh.Timestamp(
+        zenoh_session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07"
+    )
 
     def is_stored() -> bool:
         zenoh_session.put(f"nedbus/1/{VLP}", encode(message(99)), timestamp=ahead)
@@ -169,12 +174,17 @@ def test_http_is_read_only(start: Start, secure: str, pki: Path, tmp_path: Path)
     """With config/rest-reader.json5, GET returns messages, and PUT and DELETE affect no other client of the router."""
     address = free_endpoint().removeprefix("tcp/")
     changes = {"tls/127.0.0.1:7447": secure, HTTP: address}
-    start_zenohd(start, "-c", str(write_config(pki, tmp_path / "rest-reader.json5", secure, **changes)))
+    start_zenohd(
+        start, "-c", str(write_config(pki, tmp_path / "rest-reader.json5", secure, **changes))
+    )
     url = f"http://{address}/nedbus"
     with join(secure, pki, "vehicle-1") as vehicle, join(secure, pki, "reader") as reader:
         publisher = vehicle.publisher(VLP, vehicle="1")
         publisher.publish(message(1))
-        wait_for(lambda: http("GET", f"{url}/1/{VLP}")[1].count(b'"key"') == 1, what="the vehicle over HTTP")
+        wait_for(
+            lambda: http("GET", f"{url}/1/{VLP}")[1].count(b'"key"') == 1,
+            what="the vehicle over HTTP",
+        )
         (answer,) = json.loads(http("GET", f"{url}/1/{VLP}")[1])
         assert decode(base64.b64decode(answer["value"])) == message(1)
         with reader.subscribe("*", mode="every") as subscription:
@@ -182,16 +192,24 @@ def test_http_is_read_only(start: Start, secure: str, pki: Path, tmp_path: Path)
             assert http("PUT", f"{url}/1/{VLP}", encode(message(666)))[0] == 200
             assert http("PUT", f"{url}/7/{VLP}", encode(message(667)))[0] == 200
             assert http("DELETE", f"{url}/1/{VLP}")[0] == 200
-            assert http("PUT", f"http://{address}/@/local/router/config/x", b"1")[0] in (200, 400, 500)
+            assert http("PUT", f"http://{address}/@/local/router/config/x", b"1")[0] in (
+                200,
+                400,
+                500,
+            )
             for timestamp in (2, 3):
                 publisher.publish(message(timestamp))
                 assert subscription.receive(DEADLINE).message.timestamp == timestamp
             assert subscription.counts == nedbus.Counts(received=3)
         assert [sample.message.timestamp for sample in reader.latest("*")] == [3]
-        assert [answer["key"] for answer in json.loads(http("GET", f"{url}/**")[1])] == [f"nedbus/1/{VLP}"]
+        assert [answer["key"] for answer in json.loads(http("GET", f"{url}/**")[1])] == [
+            f"nedbus/1/{VLP}"
+        ]
 
 
-def test_ros_2_bridge_requires_a_separate_router(run_nedbus: Start, secure: str, zenohd: str, pki: Path) -> None:
+def test_ros_2_bridge_requires_a_separate_router(
+    run_nedbus: Start, secure: str, zenohd: str, pki: Path
+) -> None:
     """`nedbus ros2` fails with the secure router, which has no rules for ROS 2, unless --to names another router."""
     flags = tls_options(pki, "reader")
     with join(secure, pki, "vehicle-1") as vehicle:

@@ -30,7 +30,11 @@ def by_fields(stream: LoggedStream, payload: bytes) -> Encoded | None:
 
 def compare(log: bytes) -> Counter[str]:
     """Compare both encodings of each message; return the number of valid, invalid and unusual messages."""
-    streams, counts, parser = dict[Subscription, LoggedStream](), Counter[str](), UlogParser(verify=True)
+    streams, counts, parser = (
+        dict[Subscription, LoggedStream](),
+        Counter[str](),
+        UlogParser(verify=True),
+    )
     for record in parser.feed(log):
         if not isinstance(record, Data):
             continue
@@ -41,7 +45,10 @@ def compare(log: bytes) -> Counter[str]:
             counts["converted"] += 1
             continue
         found, expected = stream.encode_valid(record.payload), by_fields(stream, record.payload)
-        assert (found and found[1:]) == (expected and expected[1:]), (stream.address, record.payload)
+        assert (found and found[1:]) == (expected and expected[1:]), (
+            stream.address,
+            record.payload,
+        )
         counts["invalid" if found is None else "valid"] += 1
     return counts
 

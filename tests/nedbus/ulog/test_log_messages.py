@@ -18,7 +18,11 @@ from nedbus.ulog import LogMessageBuilder, to_log_text
 from tests.flights.ulogs import LOGS, UlogWriter, log_messages_in
 
 REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
-ARMED: Final = {"arguments": [{"name": "by", "type": "by_t"}], "message": "Armed by {1}", "name": "armed"}
+ARMED: Final = {
+    "arguments": [{"name": "by", "type": "by_t"}],
+    "message": "Armed by {1}",
+    "name": "armed",
+}
 LIMIT: Final = {
     "arguments": [{"name": "a", "type": "float"}, {"name": "b", "type": "px4::bits_t"}],
     "message": 'At {1:.1m/s} \\{<profile name="dev">{2}</profile><profile name="x">no</profile><a href="x">b</a>\\}',
@@ -62,7 +66,11 @@ class Log(UlogWriter):
 
     def __init__(self, metadata: bytes | Mapping[str, Any] = METADATA) -> None:
         super().__init__()
-        packed = metadata if isinstance(metadata, bytes) else lzma.compress(json.dumps(metadata).encode())
+        packed = (
+            metadata
+            if isinstance(metadata, bytes)
+            else lzma.compress(json.dumps(metadata).encode())
+        )
         for at in range(0, len(packed), 60_000):
             key = f"uint8_t[{len(packed[at : at + 60_000])}] metadata_events".encode()
             self.put("M", bytes([at > 0, len(key)]) + key + packed[at : at + 60_000])
@@ -77,11 +85,19 @@ class Log(UlogWriter):
         self.put("L", b"%d" % level + struct.pack("<Q", timestamp) + text)
 
     def event(
-        self, timestamp: int, number: int, arguments: bytes = b"", level: int = 6, *, twice: bool = False
+        self,
+        timestamp: int,
+        number: int,
+        arguments: bytes = b"",
+        level: int = 6,
+        *,
+        twice: bool = False,
     ) -> None:
         """Add an event."""
         self.sequence += 1
-        body = struct.pack("<QIH25sB", timestamp, 1 << 24 | number, self.sequence, arguments, level << 4 | 1)
+        body = struct.pack(
+            "<QIH25sB", timestamp, 1 << 24 | number, self.sequence, arguments, level << 4 | 1
+        )
         for message_id in range(1 + twice):
             self.put("D", struct.pack("<H", message_id) + body)
 
@@ -99,9 +115,15 @@ class Log(UlogWriter):
 def test_real_log_yields_each_string_and_event_once(path: Path) -> None:
     """Each event that pyulog finds and each string without an event is one message; the others are failed checks."""
     log = ULog(str(path))
-    logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
+    logged = [
+        *log.logged_messages,
+        *(each for tagged in log.logged_messages_tagged.values() for each in tagged),
+    ]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
-    events = {(int(time), text) for time, _, text in (PX4Events().get_logged_events(log) if has_metadata else ())}
+    events = {
+        (int(time), text)
+        for time, _, text in (PX4Events().get_logged_events(log) if has_metadata else ())
+    }
     left = log_messages_in(path)
     for time, text in events:
         [one] = [each for each in left if each[0] == time and each[2].startswith(text)]
@@ -228,8 +250,16 @@ def test_invalid_event_metadata_loses_only_events(metadata: bytes) -> None:
         (lzma.compress(b" " * (2**21 + 1)), "incomplete, or more than 2097152 bytes"),
         (changed(lambda px4: px4.update(event_groups=[])), "unexpected structure"),
         (changed(lambda px4: px4["enums"].update(dict.fromkeys("abcdefghij" * 7))), ""),
-        (changed(lambda px4: px4["enums"].update(dict.fromkeys(map(str, range(62))))), "more than 64 components"),
-        (changed(lambda px4: px4["event_groups"].update(x={"events": dict.fromkeys(range(5000))})), "more than 5000 e"),
+        (
+            changed(lambda px4: px4["enums"].update(dict.fromkeys(map(str, range(62))))),
+            "more than 64 components",
+        ),
+        (
+            changed(
+                lambda px4: px4["event_groups"].update(x={"events": dict.fromkeys(range(5000))})
+            ),
+            "more than 5000 e",
+        ),
     ],
 )
 def test_unreadable_event_metadata_has_reason(metadata: bytes, reason: str) -> None:

@@ -16,7 +16,16 @@ import pytest
 from hypothesis import assume, given, strategies as st
 from pyulog import ULog
 
-from nedbus.ulog import Damage, Data, Dropout, LoggedText, Record, Subscription, UlogError, UlogParser
+from nedbus.ulog import (
+    Damage,
+    Data,
+    Dropout,
+    LoggedText,
+    Record,
+    Subscription,
+    UlogError,
+    UlogParser,
+)
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.messages import VLP
 from tests.flights.ulogs import LOGS, UlogWriter
@@ -67,18 +76,30 @@ def test_real_log_equals_pyulog(path: Path) -> None:
     for subscription, own in payloads.items():
         columns = theirs[subscription.name, subscription.multi_id, subscription.message_id]
         rows = np.frombuffer(b"".join(own), np.dtype(subscription.layout.dtype))
-        flat = {name.replace("[", "_").replace("]", "").replace(".", "_"): column for name, column in columns.items()}
+        flat = {
+            name.replace("[", "_").replace("]", "").replace(".", "_"): column
+            for name, column in columns.items()
+        }
         compared = 0
         for name in rows.dtype.names or ():
             is_text = rows[name].dtype.kind == "S"  # pyulog returns a column per character
-            values = (np.ascontiguousarray(rows[name]).view(np.uint8) if is_text else rows[name]).reshape(len(rows), -1)
+            values = (
+                np.ascontiguousarray(rows[name]).view(np.uint8) if is_text else rows[name]
+            ).reshape(len(rows), -1)
             is_array = is_text or rows[name].ndim > 1
             names = [f"{name}_{index}" for index in range(values.shape[1])] if is_array else [name]
             for column, value in zip(names, values.T, strict=True):
-                assert flat[column].tobytes() == np.ascontiguousarray(value).tobytes(), (subscription.name, column)
+                assert flat[column].tobytes() == np.ascontiguousarray(value).tobytes(), (
+                    subscription.name,
+                    column,
+                )
                 compared += 1
         assert compared == len([each for each in flat if "_padding" not in each])
-    texts = [(each.timestamp, each.text) for each in records if isinstance(each, LoggedText) and each.tag is None]
+    texts = [
+        (each.timestamp, each.text)
+        for each in records
+        if isinstance(each, LoggedText) and each.tag is None
+    ]
     assert texts == [(each.timestamp, each.message) for each in log.logged_messages]
     assert sum(isinstance(each, Dropout) for each in records) == len(log.dropouts)
 
@@ -121,7 +142,9 @@ def test_damage_does_not_alter_messages(rng: random.Random, kind: str) -> None:
         damaged[start] ^= 1 << rng.randrange(8)
     else:
         cut = start + size if kind == "cut" else start
-        damaged = bytearray(log[:start] + (b"" if kind == "cut" else rng.randbytes(size)) + log[cut:])
+        damaged = bytearray(
+            log[:start] + (b"" if kind == "cut" else rng.randbytes(size)) + log[cut:]
+        )
     try:
         found = data_of(parse(bytes(damaged)))
     except UlogError:
@@ -143,7 +166,9 @@ def test_sync_inside_message_is_detected_as_damage(chunk: int) -> None:
     assert len(found) == 9
 
 
-def log_of(formats: Iterable[str], subscriptions: Iterable[str], size: int = 8, repeat: int = 1) -> bytes:
+def log_of(
+    formats: Iterable[str], subscriptions: Iterable[str], size: int = 8, repeat: int = 1
+) -> bytes:
     """Return a log with these formats, and a message of this size per subscription; `NAME:1` is an instance."""
     writer = UlogWriter()
     for each in formats:
@@ -231,7 +256,9 @@ def held_memory(parser: UlogParser, data: bytes, chunk: int) -> int:
 
 
 @pytest.mark.parametrize(
-    ("verify", "limit"), [(True, 257 * 2**10), (False, 65 * 2**10)], ids=["with verification", "without"]
+    ("verify", "limit"),
+    [(True, 257 * 2**10), (False, 65 * 2**10)],
+    ids=["with verification", "without"],
 )
 @pytest.mark.parametrize("size", [60_000, 65_535])
 def test_held_data_is_bounded(verify: bool, limit: int, size: int) -> None:
@@ -282,7 +309,11 @@ def test_topic_that_is_subscribed_again_continues() -> None:
     parser = UlogParser(verify=False)
     records = parser.feed(bytes(writer.data))
     subscriptions = [each for each in records if isinstance(each, Subscription)]
-    assert [(each.message_id, each.name) for each in subscriptions] == [(1, "a"), (2, "b"), (3, "a")]
+    assert [(each.message_id, each.name) for each in subscriptions] == [
+        (1, "a"),
+        (2, "b"),
+        (3, "a"),
+    ]
     found = [
         (subscriptions.index(each.subscription), each.payload[0]) for each in records if isinstance(each, Data)
     ]  # fmt: skip

@@ -51,7 +51,11 @@ class Topic:
         self.types: dict[str, str] = {field.field_name: field.type_str for field in data.field_data}
         self.us = data.data["timestamp"].astype(np.int64)
         self.count = len(self.us)
-        self._columns = {name: values.astype(np.float64) for name, values in data.data.items() if name != "timestamp"}
+        self._columns = {
+            name: values.astype(np.float64)
+            for name, values in data.data.items()
+            if name != "timestamp"
+        }
 
     def __contains__(self, field: str) -> bool:
         return field in self._columns
@@ -129,7 +133,9 @@ def unexplained_step(position: Topic, index: int) -> tuple[float, float]:
     north, east = (
         position[axis][index]
         - position[axis][index - 1]
-        - 0.5 * (position[f"v{axis}"][index] + position[f"v{axis}"][index - 1]) * position.step(index)
+        - 0.5
+        * (position[f"v{axis}"][index] + position[f"v{axis}"][index - 1])
+        * position.step(index)
         for axis in "xy"
     )
     return north, east
@@ -137,7 +143,10 @@ def unexplained_step(position: Topic, index: int) -> tuple[float, float]:
 
 def origin_of(position: Topic, index: int) -> str | tuple[float, float] | None:
     """Return "set", or distance and height by which the origin moved; None if unchanged or unknown."""
-    before, now = ([position[name][each] for name in ("ref_lat", "ref_lon", "ref_alt")] for each in (index - 1, index))
+    before, now = (
+        [position[name][each] for name in ("ref_lat", "ref_lon", "ref_alt")]
+        for each in (index - 1, index)
+    )
     if not any(differs(*pair) for pair in zip(before, now, strict=True)):
         return None
 
@@ -166,14 +175,21 @@ def add_position(table: Table, position: Topic) -> None:
         if moved == "set":
             table.add(time, "origin_set", "once")
         elif isinstance(moved, tuple) and max(moved[0], abs(moved[1])) >= ORIGIN_MIN:
-            table.add(time, "origin_moved", "once", distance=rounded(moved[0]), up=rounded(moved[1]))
+            table.add(
+                time, "origin_moved", "once", distance=rounded(moved[0]), up=rounded(moved[1])
+            )
         add_reset(table, position, index, origin_changed=moved is not None)
         if step < -1.0:
             table.add(time, "reboot", "once")
         if step > 3.0:
             table.add(position.time(index - 1), "silent", "begin")
         is_reset = position["xy_reset_counter"][index] != position["xy_reset_counter"][index - 1]
-        if not 0 < step <= JUMP_DT or not position["xy_valid"][index] or is_reset or moved is not None:
+        if (
+            not 0 < step <= JUMP_DT
+            or not position["xy_valid"][index]
+            or is_reset
+            or moved is not None
+        ):
             continue
         if math.hypot(*unexplained_step(position, index)) > JUMP_STEP:
             if slides and (position.us[index] - position.us[slides[-1][1]]) / 1e6 <= JUMP_DT:
@@ -181,8 +197,12 @@ def add_position(table: Table, position: Topic) -> None:
             else:
                 slides.append([index, index])
     for first, last in slides:
-        north, east = np.array([unexplained_step(position, index) for index in range(first, last + 1)]).sum(axis=0)
-        table.add(position.time(first), "jump", "once", distance=rounded(math.hypot(north, east), 3))
+        north, east = np.array(
+            [unexplained_step(position, index) for index in range(first, last + 1)]
+        ).sum(axis=0)
+        table.add(
+            position.time(first), "jump", "once", distance=rounded(math.hypot(north, east), 3)
+        )
 
 
 def add_reset(table: Table, position: Topic, index: int, *, origin_changed: bool) -> None:
@@ -201,7 +221,9 @@ def add_reset(table: Table, position: Topic, index: int, *, origin_changed: bool
         ("heading", {"heading": "delta_heading"}),
     ):
         if quantity in changed and not (origin_changed and quantity in ("xy", "z")):
-            numbers |= dict(zip(names, step_of(position, quantity, [*names.values()], index), strict=True))
+            numbers |= dict(
+                zip(names, step_of(position, quantity, [*names.values()], index), strict=True)
+            )
     if origin_changed:
         numbers["origin"] = True
     if changed:
@@ -210,11 +232,17 @@ def add_reset(table: Table, position: Topic, index: int, *, origin_changed: bool
 
 def step_of(position: Topic, quantity: str, deltas: Sequence[str], index: int) -> list[float]:
     """Return the steps minus motion of a reset, or its deltas if they agree within what the motion leaves unknown."""
-    seconds, values = position.step(index), {"xy": ("x", "y"), "vxy": ("vx", "vy")}.get(quantity, (quantity,))
+    seconds, values = (
+        position.step(index),
+        {"xy": ("x", "y"), "vxy": ("vx", "vy")}.get(quantity, (quantity,)),
+    )
     margin = 0.003 + 10 * seconds**3
     steps = [position[value][index] - position[value][index - 1] for value in values]
     if quantity != "heading":
-        rates = [(position[RATES[value]][index] + position[RATES[value]][index - 1]) / 2 for value in values]
+        rates = [
+            (position[RATES[value]][index] + position[RATES[value]][index - 1]) / 2
+            for value in values
+        ]
         steps = [step - rate * seconds for step, rate in zip(steps, rates, strict=True)]
     elif "unaided_heading" in position:
         steps[0] -= position["unaided_heading"][index] - position["unaided_heading"][index - 1]
@@ -223,7 +251,9 @@ def step_of(position: Topic, quantity: str, deltas: Sequence[str], index: int) -
     if quantity == "heading":
         steps = [(steps[0] + math.pi) % math.tau - math.pi]
     announced = [position[delta][index] for delta in deltas]
-    return [rounded(each) for each in (announced if math.dist(announced, steps) <= margin else steps)]
+    return [
+        rounded(each) for each in (announced if math.dist(announced, steps) <= margin else steps)
+    ]
 
 
 def add_gps(table: Table, gps: Topic) -> None:
@@ -244,13 +274,22 @@ def add_gps(table: Table, gps: Topic) -> None:
     )  # fmt: skip
     spoofing = gps.column("spoofing_state")
     table.add_level(
-        gps, "spoofing", lambda index: spoofing[index] >= 2, lambda index: spoofing[index] <= 1, lambda _: {}
+        gps,
+        "spoofing",
+        lambda index: spoofing[index] >= 2,
+        lambda index: spoofing[index] <= 1,
+        lambda _: {},
     )
 
 
 def add_estimator(table: Table, flags: Topic) -> None:
     table.add_flags(flags, [name for name in FUSED if name in flags], "not_fused", bad=False)
-    table.add_flags(flags, [name for name in flags if name.startswith("reject_")], "innovation_rejected", bad=True)
+    table.add_flags(
+        flags,
+        [name for name in flags if name.startswith("reject_")],
+        "innovation_rejected",
+        bad=True,
+    )
     faults = [
         name
         for name in flags

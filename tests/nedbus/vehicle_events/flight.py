@@ -59,14 +59,18 @@ class Flight:
         return self.send("vehicle_gps_position", **GOOD_GPS | fields)
 
     def status(self, state: int, **fields: Any) -> list[Event]:
-        return self.send("vehicle_status", **{"arming_state": state, "nav_state": 4, "failsafe": False} | fields)
+        return self.send(
+            "vehicle_status", **{"arming_state": state, "nav_state": 4, "failsafe": False} | fields
+        )
 
     def battery(self, warning: int) -> list[Event]:
         return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
 
     def update(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
         """Update the event log with the state of the position stream (None if not observed); return the new events."""
-        self.event_log.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
+        self.event_log.update(
+            self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped
+        )
         return self.new_events()
 
     def reject(self, reason: str = "x is NaN") -> list[Event]:

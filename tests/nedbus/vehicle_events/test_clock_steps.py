@@ -41,13 +41,21 @@ class World:
         patch.setattr("nedbus.clock.utc_ns", lambda: self._utc_ns(self.offset))
         patch.setattr("time.monotonic_ns", lambda: round(self.now * 1e9))
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
-        publisher = SimpleNamespace(publish_encoded=lambda *_: None, close=lambda: None, source="px4-zenoh")
+        publisher = SimpleNamespace(
+            publish_encoded=lambda *_: None, close=lambda: None, source="px4-zenoh"
+        )
         registry = SimpleNamespace(
             reject=lambda *_: None,
-            publisher=lambda address, *_, **__: SimpleNamespace(definition=BY_TOPIC[address.topic], **vars(publisher)),
+            publisher=lambda address, *_, **__: SimpleNamespace(
+                definition=BY_TOPIC[address.topic], **vars(publisher)
+            ),
         )
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.daemon.event_log
+            "px4",
+            "px4-zenoh:",
+            cast("PublisherRegistry", registry),
+            lambda: self.now,
+            self.daemon.event_log,
         )
         bus = SimpleNamespace(
             connected=True,
@@ -88,16 +96,25 @@ class World:
             self.now = tick / RATE
             stamp = round((50 + self.now) * 1e6)
             if tick % RATE == 0:
-                gps = GOOD_GPS | ({"fix_type": 0, "satellites_used": 2} if 5 <= self.now < 9 else {})
+                gps = GOOD_GPS | (
+                    {"fix_type": 0, "satellites_used": 2} if 5 <= self.now < 9 else {}
+                )
                 self.receive(GPS, {"timestamp": stamp, **gps})
             for address in ADDRESSES:
-                fields = VALID | {"xy_valid": not 6 <= self.now < 9, "xy_reset_counter": int(self.now > 25)}
+                fields = VALID | {
+                    "xy_valid": not 6 <= self.now < 9,
+                    "xy_reset_counter": int(self.now > 25),
+                }
                 if address.vehicle == "2" and 12 <= self.now < 20:
                     continue
-                self.receive(address, message(stamp, **fields).__dict__, lost=3 * (tick == 30 * RATE))
+                self.receive(
+                    address, message(stamp, **fields).__dict__, lost=3 * (tick == 30 * RATE)
+                )
             if tick == 20 * RATE:  # retained message of a vehicle switched off ten minutes ago
                 sent = round((START + self.now - 600) * 1e9)
-                self.reader.add(Sample(message(stamp, **VALID), Address("3", VLP), self.arrival, _sent=sent))
+                self.reader.add(
+                    Sample(message(stamp, **VALID), Address("3", VLP), self.arrival, _sent=sent)
+                )
             if tick == 22 * RATE:
                 self.output.reject(Rejection("port", "not a message", address=ADDRESSES[0]))
             if tick % (RATE // 2) == 0:
@@ -129,14 +146,21 @@ def test_service_and_reader_detect_the_expected_events() -> None:
     """Both logs contain the events of the reference flight: an invalid position with evidence, silence, reset, loss."""
     for events in cast("list[list[dict[str, Any]]]", EXPECTED):
         kinds = {(each["vehicle"], each["kind"], each["change"]) for each in events}
-        assert {("1", "xy_invalid", "begin"), ("2", "silent", "begin"), ("2", "silent", "end")} <= kinds
+        assert {
+            ("1", "xy_invalid", "begin"),
+            ("2", "silent", "begin"),
+            ("2", "silent", "end"),
+        } <= kinds
         assert {("1", "reset", "once"), ("1", "lost", "once")} <= kinds
         assert not any(each["kind"] == "overload" for each in events)
-        invalid = next(each for each in events if (each["vehicle"], each["kind"]) == ("1", "xy_invalid"))
+        invalid = next(
+            each for each in events if (each["vehicle"], each["kind"]) == ("1", "xy_invalid")
+        )
         assert {each["kind"] for each in invalid["evidence"]} >= {"gps_fix_lost"}
 
 
-@example(step=10.0, at=20.0)  # at the end of a silence, between the arrival of a sample and its reading
+# at the end of a silence, between the arrival of a sample and its reading
+@example(step=10.0, at=20.0)
 @given(step=st.sampled_from([-3600.0, -1.0, 10.0, 3600.0]), at=st.floats(0.0, LENGTH))
 def test_clock_step_does_not_change_events(step: float, at: float) -> None:
     """A step of the host's clock at any time shifts only the times in reports; events and durations stay the same."""

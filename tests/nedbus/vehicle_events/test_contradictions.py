@@ -14,7 +14,14 @@ ORIGIN: Final[dict[str, Any]] = {
     "xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 500.0, "z": -20.0,
 }  # fmt: skip
 METRE: Final = 1 / 111_194.9266  # deg of latitude
-GPS: Final = {**GOOD_GPS, "latitude_deg": 47.0, "longitude_deg": 8.0, "altitude_msl_m": 520.0, "eph": 1.0, "epv": 1.0}
+GPS: Final = {
+    **GOOD_GPS,
+    "latitude_deg": 47.0,
+    "longitude_deg": 8.0,
+    "altitude_msl_m": 520.0,
+    "eph": 1.0,
+    "epv": 1.0,
+}
 TRUTH: Final = "vehicle_local_position_groundtruth"
 
 
@@ -25,12 +32,18 @@ def fly(
     """Fly with an estimate that is off by `up` and `north` from GNSS, by `baro` and `truth` from other sources [m]."""
     reported: list[Event] = []
     for _ in range(round(seconds * 10)):
-        reported += flight.wait(0.1).send(missing=missing, **{**ORIGIN, "z": -20.0 - up, "x": north, **fields})
+        reported += flight.wait(0.1).send(
+            missing=missing, **{**ORIGIN, "z": -20.0 - up, "x": north, **fields}
+        )
         reported += flight.send("vehicle_gps_position", **(GPS if gps is None else {**GPS, **gps}))
         if baro is not None:
-            reported += flight.send("vehicle_air_data", baro_alt_meter=1000.0 + up - baro, baro_device_id=1)
+            reported += flight.send(
+                "vehicle_air_data", baro_alt_meter=1000.0 + up - baro, baro_device_id=1
+            )
         if truth is not None:
-            reported += flight.send(TRUTH, **{**ORIGIN, "ref_alt": 0.0, "z": truth - up, "x": north - truth, "y": 0.0})
+            reported += flight.send(
+                TRUTH, **{**ORIGIN, "ref_alt": 0.0, "z": truth - up, "x": north - truth, "y": 0.0}
+            )
     return [each for each in reported if each.kind != "jump"]
 
 
@@ -48,12 +61,19 @@ def test_height_is_contradicted_when_all_references_disagree(flight: Flight) -> 
     since = flight.now
     begun = fly(flight, 4.0, up=36.0, baro=36.0)
     assert [(each.kind, each.change, each.severity, each.text) for each in begun] == [
-        ("height_contradicted", "begin", "bad", "height 36 m above GNSS and barometer while z_valid is true")
+        (
+            "height_contradicted",
+            "begin",
+            "bad",
+            "height 36 m above GNSS and barometer while z_valid is true",
+        )
     ]
     assert begun[0].time == pytest.approx(since, abs=0.5)
     assert (flight.severity, flight.kinds) == ("bad", ["height_contradicted"])
     ended = fly(flight, 1.0, baro=0.0)
-    assert [(each.kind, each.change, each.severity) for each in ended] == [("height_contradicted", "end", "info")]
+    assert [(each.kind, each.change, each.severity) for each in ended] == [
+        ("height_contradicted", "end", "info")
+    ]
     assert ended[0].text.startswith("height no longer contradicted after ")
     assert ended[0].lasted == pytest.approx(4.0, abs=0.4)  # comparison interval
     assert flight.kinds == []
@@ -86,7 +106,9 @@ def test_position_is_contradicted_beyond_its_limit(flight: Flight) -> None:
          "ref_alt": float("nan")},
     ],
 )  # fmt: skip
-def test_height_is_not_contradicted_without_sufficient_evidence(flight: Flight, how: dict[str, Any]) -> None:
+def test_height_is_not_contradicted_without_sufficient_evidence(
+    flight: Flight, how: dict[str, Any]
+) -> None:
     """A height is not contradicted if a reference agrees, the estimate is invalid, or the limit is not exceeded."""
     fly(flight, 2.0)
     reported = fly(flight, 10.0, **{"up": 30.0, **how})
@@ -95,7 +117,12 @@ def test_height_is_not_contradicted_without_sufficient_evidence(flight: Flight, 
 
 def test_short_contradiction_is_ignored(flight: Flight) -> None:
     """Contradictions of a height for less than 1.5 s, or a position for less than 3 s, are ignored."""
-    assert fly(flight, 1.2, up=100.0, baro=100.0) == fly(flight, 2.0) == fly(flight, 2.5, north=9.0) == []
+    assert (
+        fly(flight, 1.2, up=100.0, baro=100.0)
+        == fly(flight, 2.0)
+        == fly(flight, 2.5, north=9.0)
+        == []
+    )
 
 
 def test_barometer_is_compared_relative_to_its_first_height(flight: Flight) -> None:
@@ -109,7 +136,11 @@ def test_barometer_is_compared_relative_to_its_first_height(flight: Flight) -> N
     fast = Flight()
     fast.status(ARMED)
     fly(fast, 5.0, gps=none, baro=0.0)
-    assert not [each for each in fly(fast, 5.0, gps=none, baro=50.0, vx=25.0, x=0.0) if "contra" in each.kind]
+    assert not [
+        each
+        for each in fly(fast, 5.0, gps=none, baro=50.0, vx=25.0, x=0.0)
+        if "contra" in each.kind
+    ]
 
 
 def test_ground_truth_contradicts_height_and_position(flight: Flight) -> None:
@@ -176,16 +207,24 @@ def test_wrong_origin_is_one_statement_during_climbs(up: float) -> None:
 
 def test_barometer_alone_is_compared_as_a_standard_atmosphere_allows() -> None:
     """A barometer is not compared above 11 km, and below it differs by up to 15 % of the climb."""
-    for height, error, is_contradicted in ((23_000.0, 3000.0, False), (3000.0, 300.0, False), (3000.0, 2000.0, True)):
+    for height, error, is_contradicted in (
+        (23_000.0, 3000.0, False),
+        (3000.0, 300.0, False),
+        (3000.0, 2000.0, True),
+    ):
         flight = Flight()
         flight.status(ARMED)
         none = {"fix_type": 0, "satellites_used": 0}
         fly(flight, 2.0, gps=none, baro=1000.0 - 100.0)
         reported = fly(flight, 5.0, gps=none, up=height, baro=error + 900.0)
-        assert any(event.kind == "height_contradicted" for event in reported) == is_contradicted, height
+        assert any(event.kind == "height_contradicted" for event in reported) == is_contradicted, (
+            height
+        )
 
 
-def test_ground_truth_is_compared_in_the_local_frame_without_a_global_origin(flight: Flight) -> None:
+def test_ground_truth_is_compared_in_the_local_frame_without_a_global_origin(
+    flight: Flight,
+) -> None:
     """Without a global origin, the motion since the first comparison is compared with the ground truth's."""
     nowhere: dict[str, Any] = dict.fromkeys(("ref_lat", "ref_lon", "ref_alt"), float("nan"))
     nowhere |= {"xy_global": False, "z_global": False}
@@ -212,7 +251,9 @@ def test_order_of_topics_does_not_matter() -> None:
             up = 36.0 if 100 <= step < 120 else 0.0
             flight.wait(0.1).send(**{**ORIGIN, "z": -20.0 - up})
             late.append((flight.now, "vehicle_gps_position", GPS))
-            late.append((flight.now, "vehicle_air_data", {"baro_alt_meter": 1000.0, "baro_device_id": 1}))
+            late.append(
+                (flight.now, "vehicle_air_data", {"baro_alt_meter": 1000.0, "baro_device_id": 1})
+            )
             now = flight.now
             while late and late[0][0] <= now - 0.1 * delay + 1e-9:
                 flight.now, topic, fields = late.pop(0)

@@ -16,7 +16,9 @@ def test_detection_runs_only_when_a_compared_field_or_missing_changes() -> None:
         return iter(())
 
     detector = ChangeDetector(["a"], ["b"], detect)
-    for time, (a, b, missing) in enumerate([(1, 2, ""), (1, 3, ""), (4, 3, ""), (4, 3, "a"), (4, 5, "a")]):
+    for time, (a, b, missing) in enumerate(
+        [(1, 2, ""), (1, 3, ""), (4, 3, ""), (4, 3, "a"), (4, 5, "a")]
+    ):
         detector.add({"timestamp": time, "a": a, "b": b}, frozenset(missing))
     first, second = {"timestamp": 0, "a": 1, "b": 2}, {"timestamp": 2, "a": 4, "b": 3}
     unknown = {"timestamp": 3, "a": None, "b": 3}

@@ -89,7 +89,11 @@ def test_reboot_is_reported_once(flight: Flight) -> None:
 
 def test_stream_resuming_long_after_reboot_is_not_another_reboot(flight: Flight) -> None:
     """Streams that step back later, in any order, belong to the same reboot, and the vehicle stays armed."""
-    streams: list[Callable[[], list[Event]]] = [flight.send, flight.gps, lambda: flight.status(ARMED)]
+    streams: list[Callable[[], list[Event]]] = [
+        flight.send,
+        flight.gps,
+        lambda: flight.status(ARMED),
+    ]
     for first in range(3):
         flight.wait(1000.0)
         for send in streams:
@@ -108,7 +112,9 @@ def test_delayed_message_from_before_reboot_is_not_a_reboot(flight: Flight) -> N
     """A delayed message of another stream, from before a reboot, is not a reboot: streams have no common order."""
     flight.gps()
     flight.booted, before = flight.now, flight.booted
-    assert brief([*flight.wait(0.1).send(), *flight.wait(0.1).send()]) == [("reboot", "once", "bad")]
+    assert brief([*flight.wait(0.1).send(), *flight.wait(0.1).send()]) == [
+        ("reboot", "once", "bad")
+    ]
     flight.booted, after = before, flight.booted
     assert flight.wait(0.1).gps() == []
     flight.booted = after
@@ -242,7 +248,9 @@ def test_overload_ends_after_5_s_without_drops(flight: Flight) -> None:
     """The first drop begins an overload, and 5 s without a drop end it; the end event has the number of drops."""
     assert flight.update(dropped=0) == []
     begun = flight.update(dropped=10)
-    assert [(event.vehicle, event.kind, event.change) for event in begun] == [(ALL, "overload", "begin")]
+    assert [(event.vehicle, event.kind, event.change) for event in begun] == [
+        (ALL, "overload", "begin")
+    ]
     flight.fly(2)
     assert flight.update(dropped=25) == []
     flight.fly(4.9)
@@ -316,15 +324,27 @@ def test_no_fix_in_the_first_message_is_info(flight: Flight) -> None:
     """A missing fix in the first message has severity "info" and causes no event; the first fix is an event."""
     assert flight.gps(fix_type=0, satellites_used=0) == []
     assert flight.severity == "info"
-    assert brief(flight.gps()) == [("gps_fix_lost", "end", "info"), ("few_satellites", "end", "info")]
+    assert brief(flight.gps()) == [
+        ("gps_fix_lost", "end", "info"),
+        ("few_satellites", "end", "info"),
+    ]
 
 
 def test_flags_of_a_kind_set_in_one_message_are_one_event(flight: Flight) -> None:
     """Flags of one kind that are set in one message are one event that names them; each flag ends separately."""
-    names = ["reject_hor_pos", "reject_hor_vel", "fs_bad_hdg", "cs_baro_fault", "cs_gnss_pos", "cs_baro_hgt"]
+    names = [
+        "reject_hor_pos",
+        "reject_hor_vel",
+        "fs_bad_hdg",
+        "cs_baro_fault",
+        "cs_gnss_pos",
+        "cs_baro_hgt",
+    ]
 
     def send(**changed: Any) -> list[Event]:
-        return flight.wait(0.1).send("estimator_status_flags", **dict.fromkeys(names, False) | changed)
+        return flight.wait(0.1).send(
+            "estimator_status_flags", **dict.fromkeys(names, False) | changed
+        )
 
     assert send() == []
     begun = send(reject_hor_pos=True, reject_hor_vel=True)
@@ -338,9 +358,12 @@ def test_flags_of_a_kind_set_in_one_message_are_one_event(flight: Flight) -> Non
     assert flight.severity == "watch"
     assert brief(send()) == [("innovation_rejected", "end", "info")]
     assert flight.severity == "info"
-    assert brief(send(fs_bad_hdg=True, cs_baro_fault=True)) == [("estimator_fault", "begin", "watch")]
+    assert brief(send(fs_bad_hdg=True, cs_baro_fault=True)) == [
+        ("estimator_fault", "begin", "watch")
+    ]
     assert brief(send(cs_gnss_pos=True, cs_baro_hgt=True))[0] == ("estimator_fault", "end", "info")
-    assert brief(send(cs_gnss_pos=True)) == [("not_fused", "begin", "info")]  # another height source is fused
+    # another height source is fused
+    assert brief(send(cs_gnss_pos=True)) == [("not_fused", "begin", "info")]
     assert brief(send()) == [("not_fused", "begin", "watch")]
 
 
@@ -349,7 +372,8 @@ def test_missing_fix_and_reference_of_a_whole_flight_are_no_conditions() -> None
     flight, since = Flight(), 100.0
     assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
     assert flight.wait(1.0).status(DISARMED) == []
-    assert (flight.severity, flight.event_log.vehicles["1"].initial[1:]) == ("info", [])  # initial[0]: few_satellites
+    # the first initial finding is few_satellites
+    assert (flight.severity, flight.event_log.vehicles["1"].initial[1:]) == ("info", [])
     assert brief(flight.wait(1.0).status(ARMED)) == [("armed", "once", "info")]
     assert flight.wait(PAUSE + 0.1).update() == []
     assert flight.kinds == []
@@ -395,10 +419,16 @@ def test_flag_labels_are_words_not_field_names() -> None:
 def test_gcs_loss_is_info_while_disarmed(flight: Flight) -> None:
     """A lost GCS connection has severity "info" while the vehicle is disarmed, and "watch" while it is armed."""
     flight.status(DISARMED, gcs_connection_lost=False)
-    assert brief(flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)) == [("gcs_lost", "begin", "info")]
-    assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [("armed", "once", "info")]
+    assert brief(flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)) == [
+        ("gcs_lost", "begin", "info")
+    ]
+    assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [
+        ("armed", "once", "info")
+    ]
     flight.wait(0.1).status(ARMED, gcs_connection_lost=False)
-    assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [("gcs_lost", "begin", "watch")]
+    assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [
+        ("gcs_lost", "begin", "watch")
+    ]
     assert flight.severity == "watch"
     flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)
     assert flight.severity == "info"
@@ -407,11 +437,19 @@ def test_gcs_loss_is_info_while_disarmed(flight: Flight) -> None:
 def test_flag_not_provided_is_not_an_event() -> None:
     """A field that the source does not provide is neither valid nor invalid, whatever its value."""
     flight = Flight()
-    missing = ("z_valid", "v_z_valid", "heading_good_for_control", "dist_bottom_valid", "dead_reckoning")
+    missing = (
+        "z_valid",
+        "v_z_valid",
+        "heading_good_for_control",
+        "dist_bottom_valid",
+        "dead_reckoning",
+    )
     flight.send(missing=missing, z_valid=False, v_z_valid=False, dead_reckoning=True)
     assert flight.kinds == []
     assert flight.wait(0.1).send(missing=missing, heading_good_for_control=True) == []
-    reported = flight.wait(0.1).send(missing=missing, xy_valid=False, z_valid=False, v_z_valid=False)
+    reported = flight.wait(0.1).send(
+        missing=missing, xy_valid=False, z_valid=False, v_z_valid=False
+    )
     assert brief(reported) == [("xy_invalid", "begin", "bad")]
 
 
@@ -423,7 +461,11 @@ def test_flag_not_provided_is_not_an_event() -> None:
 )  # fmt: skip
 def test_other_estimates_are_ignored(flight: Flight, topic: str, instance: int | None) -> None:
     """Other EKFs and the ground truth neither cause events nor change the state."""
-    fields = message(1, **VALID).model_dump() | {"xy_valid": False, "dead_reckoning": True, "x": 500.0}
+    fields = message(1, **VALID).model_dump() | {
+        "xy_valid": False,
+        "dead_reckoning": True,
+        "x": 500.0,
+    }
     for step in range(5):
         fields["timestamp"] = 100 - step
         assert flight.wait(0.1).send(topic, instance=instance, **fields) == []
@@ -461,7 +503,12 @@ def test_origin_beyond_the_antimeridian_is_wrapped(direction: int) -> None:
     """An origin that PX4 up to 1.15 sets beyond 180 degrees is wrapped, and has not moved if it is sent wrapped."""
     flight = Flight()
     flight.send(xy_global=False, z_global=False)
-    origin: dict[str, Any] = {"xy_global": True, "z_global": True, "ref_lat": -17.0, "ref_alt": 488.0}
+    origin: dict[str, Any] = {
+        "xy_global": True,
+        "z_global": True,
+        "ref_lat": -17.0,
+        "ref_alt": 488.0,
+    }
     reported = flight.wait(0.1).send(**origin, ref_lon=direction * 180.5)
     [event] = [event for event in reported if event.kind == "origin_set"]
     assert event.text == f"origin set at -17.000000, {direction * -179.5:.6f}"
@@ -507,7 +554,9 @@ def test_motion_unexplained_by_velocity_is_a_jump(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize(("before", "after"), [(12.0, 0.0), (0.0, 12.0)])
-def test_motion_at_the_mean_velocity_is_not_a_jump(flight: Flight, before: float, after: float) -> None:
+def test_motion_at_the_mean_velocity_is_not_a_jump(
+    flight: Flight, before: float, after: float
+) -> None:
     """A vehicle that brakes or accelerates hard between two messages moves at the mean of both velocities."""
     flight.wait(0.1).send(vx=before, vy=-before)
     assert flight.wait(0.5).send(x=3.0, y=-3.0, vx=after, vy=-after) == []
@@ -522,7 +571,12 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
     assert brief(reported) == [("reset", "once", "watch")]
     assert reported[0].names == ("xy", "z")
     assert reported[0].numbers == pytest.approx({"north": 30.0, "east": 0.0, "up": 4.0}, abs=1e-3)
-    assert flight.wait(0.1).send(x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)) == []
+    assert (
+        flight.wait(0.1).send(
+            x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)
+        )
+        == []
+    )
 
 
 def test_single_wild_position_is_no_jump(flight: Flight) -> None:
@@ -542,27 +596,54 @@ def test_single_wild_position_is_no_jump(flight: Flight) -> None:
             {"z": -10.0, "z_reset_counter": 1, "delta_z": -6.0},
             "height by 10.0 m",
         ),  # the data contradicts the delta
-        (0.1, {"z": 0.0, "z_reset_counter": 1, "delta_z": -489.6}, "height by 0.0 m"),  # an origin is set
+        # an origin is set
+        (0.1, {"z": 0.0, "z_reset_counter": 1, "delta_z": -489.6}, "height by 0.0 m"),
         (
             0.1,
             {"z": -12.0, "vz": -20.0, "z_reset_counter": 1, "delta_z": -10.2},
             "height by 11.0 m",
         ),  # minus the motion at the mean velocity
         (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
-        (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
-        (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
-        (2.0, {"x": 7.0, "vx": 2.0, "xy_reset_counter": 2}, "xy by 5.0 m (5.0 north, 0.0 east)"),  # minus the motion
-        (3.5, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
-        (2.0, {"heading": 3.0, "heading_reset_counter": 2}, "heading by an unknown amount"),  # its rate is unknown
-        (2.0, {"x": 6.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
-        (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 8.0 m (8.0 north, 0.0 east)"),
+        (
+            0.1,
+            {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)},
+            "xy by 5.0 m (3.0 north, 4.0 east)",
+        ),
+        (
+            2.0,
+            {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)},
+            "xy by 5.0 m (3.0 north, 4.0 east)",
+        ),
+        # minus the motion
+        (2.0, {"x": 7.0, "vx": 2.0, "xy_reset_counter": 2}, "xy by 5.0 m (5.0 north, 0.0 east)"),
+        (
+            3.5,
+            {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)},
+            "xy by an unknown amount",
+        ),
+        # its rate is unknown
+        (2.0, {"heading": 3.0, "heading_reset_counter": 2}, "heading by an unknown amount"),
+        (
+            2.0,
+            {"x": 6.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)},
+            "xy by 3.0 m (3.0 north, 0.0 east)",
+        ),
+        (
+            2.0,
+            {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)},
+            "xy by 8.0 m (8.0 north, 0.0 east)",
+        ),
         (
             0.5,
             {"x": 9.0, "vx": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)},
             "xy by 3.0 m (3.0 north, 0.0 east)",
         ),
         (0.1, {"vz": -3.0, "vz_reset_counter": 1, "delta_vz": -3.0}, "vz by 3.0 m/s"),
-        (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
+        (
+            0.1,
+            {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0},
+            "heading by 172 deg",
+        ),
         (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
     ],
 )
@@ -590,7 +671,9 @@ def test_missing_fields_are_neither_a_reset_nor_an_origin(flight: Flight) -> Non
     flight.send(**counters)
     reported = []
     for _ in range(3):
-        reported += flight.wait(0.1).send(missing=[*counters, "xy_global", "z_global", "ref_lat", "ref_lon"])
+        reported += flight.wait(0.1).send(
+            missing=[*counters, "xy_global", "z_global", "ref_lat", "ref_lon"]
+        )
         reported += flight.wait(0.1).send(**counters)
     assert reported == []
 
@@ -755,7 +838,10 @@ def test_gone_vehicle_is_forgotten_after_an_hour() -> None:
     assert update(event_log, start + 2 * TIMINGS.forgotten, "here") == {"here", "gone"}
     assert update(event_log, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
     assert {name for name, _ in event_log.counts} == {ALL, "here"}
-    assert [each.vehicle for each in event_log.events if each.kind == "xy_invalid"] == ["here", "gone"]
+    assert [each.vehicle for each in event_log.events if each.kind == "xy_invalid"] == [
+        "here",
+        "gone",
+    ]
     event_log.update(start + 9 * TIMINGS.forgotten, {})  # without vehicles, as for a file
     assert set(event_log.vehicles) == {"here"}
 
@@ -798,16 +884,28 @@ def test_active_condition_precedes_single_events(flight: Flight) -> None:
     assert flight.event_log.state("1", flight.now).text == "dead reckoning"
 
 
-FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning", "heading_good_for_control", "xy_global")
+FLAGS = (
+    "xy_valid",
+    "z_valid",
+    "v_xy_valid",
+    "v_z_valid",
+    "dead_reckoning",
+    "heading_good_for_control",
+    "xy_global",
+)
 ACTIONS: dict[str, tuple[Callable[[Flight, Any], object], st.SearchStrategy[Any]]] = {
     "send": (
         lambda flight, flags: flight.send(
-            **dict[str, Any]({name: name in flags for name in FLAGS} | {"ref_lat": 1.0, "ref_lon": 1.0})
+            **dict[str, Any](
+                {name: name in flags for name in FLAGS} | {"ref_lat": 1.0, "ref_lon": 1.0}
+            )
         ),
         st.sets(st.sampled_from(FLAGS)),
     ),
     "gps": (
-        lambda flight, seen: flight.gps(fix_type=seen[0], satellites_used=seen[1], jamming_indicator=seen[2]),
+        lambda flight, seen: flight.gps(
+            fix_type=seen[0], satellites_used=seen[1], jamming_indicator=seen[2]
+        ),
         st.tuples(st.integers(0, 6), st.integers(0, 12), st.integers(0, 120)),
     ),
     "status": (
@@ -830,7 +928,14 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 
 @given(STEPS)
-@example([("send", {"xy_valid"}), ("send", set()), ("lose", 1), *[("send", set()), ("send", {"xy_valid"})] * 2])
+@example(
+    [
+        ("send", {"xy_valid"}),
+        ("send", set()),
+        ("lose", 1),
+        *[("send", set()), ("send", {"xy_valid"})] * 2,
+    ]
+)
 def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
     """For any messages, each end event follows a begin event or, at most once since boot, an initial condition.
 
@@ -862,11 +967,17 @@ def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
                 known = begun.pop(key, None)
                 suppressed = re.search(r"the last of (\d+) suppressed changes$", event.text)
                 is_repeated = suppressed is not None and int(suppressed[1]) % 2 == 0
-                assert known is not None or is_repeated or (key not in initial and event.lasted is None)
+                assert (
+                    known is not None
+                    or is_repeated
+                    or (key not in initial and event.lasted is None)
+                )
                 initial |= {key} if known is None else set()
 
 
-def fly_with_gps(flight: Flight, seconds: float, *, rate: float = 5.0, topic: str = "vehicle_gps_position") -> None:
+def fly_with_gps(
+    flight: Flight, seconds: float, *, rate: float = 5.0, topic: str = "vehicle_gps_position"
+) -> None:
     """Send positions at 10 Hz, and GPS messages at `rate` Hz, 0 for none; update twice a second."""
     for index in range(round(10 * seconds)):
         flight.wait(0.1).send()
@@ -914,7 +1025,9 @@ def test_other_gps_topic_replaces_a_silent_one(flight: Flight) -> None:
     assert flight.kinds == []
     flight.new_events()
     flight.send("sensor_gps", instance=0, **GOOD_GPS | {"fix_type": 0})
-    assert brief(flight.new_events() or flight.event_log.events[-1:]) == [("gps_fix_lost", "begin", "watch")]
+    assert brief(flight.new_events() or flight.event_log.events[-1:]) == [
+        ("gps_fix_lost", "begin", "watch")
+    ]
     flight.gps()
     flight.send("sensor_gps", instance=0, **GOOD_GPS | {"fix_type": 0})
     assert flight.kinds == []
@@ -950,7 +1063,9 @@ def test_equal_single_events_are_suppressed_after_ten() -> None:
     texts, resets = list[Event](), list[Event]()
     for number in range(1, 60):
         flight.wait(0.1)
-        texts += flight.send("log_message", severity=2, text="ODOMETRY: unsupported estimator_type 8")
+        texts += flight.send(
+            "log_message", severity=2, text="ODOMETRY: unsupported estimator_type 8"
+        )
         resets += flight.send(xy_reset_counter=number)
     assert [len(texts), len(resets)] == [10, 10]
     other = flight.send("log_message", severity=2, text="Engine on fire")
@@ -993,11 +1108,15 @@ def test_transition_of_a_vtol_is_an_event_and_evidence() -> None:
     flight.send()
 
     def status(**fields: Any) -> list[Event]:
-        return flight.wait(1.0).status(ARMED, **{"in_transition_mode": False, "vehicle_type": 1} | fields)
+        return flight.wait(1.0).status(
+            ARMED, **{"in_transition_mode": False, "vehicle_type": 1} | fields
+        )
 
     status()
     begun = status(in_transition_mode=True, in_transition_to_fw=True)
-    assert [(event.severity, event.text) for event in begun] == [("info", "VTOL transition to fixed wing")]
+    assert [(event.severity, event.text) for event in begun] == [
+        ("info", "VTOL transition to fixed wing")
+    ]
     [lost] = flight.wait(1.0).send(xy_valid=False)
     assert [event.text for event in lost.evidence] == ["VTOL transition to fixed wing"]
     ended = status(vehicle_type=2)
@@ -1020,20 +1139,28 @@ def test_rejected_and_unused_measurements_are_conditions() -> None:
         reported: list[Event] = []
         for _ in range(round(seconds * 10)):
             flight.wait(0.1).send()
-            reported += flight.send(AID, instance=0, fused=fused, innovation_rejected=rejected, estimator_instance=0)
+            reported += flight.send(
+                AID, instance=0, fused=fused, innovation_rejected=rejected, estimator_instance=0
+            )
         return [(event.change, event.severity, event.text) for event in reported]
 
     assert send(3, fused=True) == send(0.3, fused=False, rejected=True) == send(3, fused=True) == []
-    assert send(2, fused=False, rejected=True) == [("begin", "watch", "EKF rejects vision position")]
+    assert send(2, fused=False, rejected=True) == [
+        ("begin", "watch", "EKF rejects vision position")
+    ]
     assert flight.kinds == ["aid_rejected"]
     [ended] = send(2, fused=True)
     assert ended == ("end", "info", "EKF accepts vision position again after 2.0 s")
-    assert send(2, fused=False) == [("begin", "info", "EKF receives vision position, but does not fuse it")]
+    assert send(2, fused=False) == [
+        ("begin", "info", "EKF receives vision position, but does not fuse it")
+    ]
     reported: list[Event] = []
     for _ in range(20):
         flight.wait(0.1).send()
         reported += flight.update()
-    assert [event.text for event in reported] == ["EKF no longer receives vision position after 1.9 s"]
+    assert [event.text for event in reported] == [
+        "EKF no longer receives vision position after 1.9 s"
+    ]
 
 
 @pytest.mark.parametrize(("state", "severity"), [(ARMED, "watch"), (DISARMED, "info")])
@@ -1049,9 +1176,13 @@ def test_vision_that_stops_is_a_condition_until_it_resumes(state: int, severity:
             if with_vision:
                 reported += flight.send("vehicle_visual_odometry")
             reported += flight.update()
-        return [(event.text, event.severity, round(flight.now - event.time, 1)) for event in reported]
+        return [
+            (event.text, event.severity, round(flight.now - event.time, 1)) for event in reported
+        ]
 
-    assert fly(3, with_vision=False) == fly(3, with_vision=True) == fly(0.9, with_vision=False) == []
+    assert (
+        fly(3, with_vision=False) == fly(3, with_vision=True) == fly(0.9, with_vision=False) == []
+    )
     assert fly(0.5, with_vision=False) == [("no vision message", severity, 1.4)]
     [resumed] = fly(0.1, with_vision=True)
     assert resumed[:2] == ("vision messages resumed after 1.5 s", "info")

@@ -34,7 +34,9 @@ class World:
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
         registry = SimpleNamespace(publisher=self._publisher, shared_vehicles=set, publishers=())
         self.daemon._registry = cast("PublisherRegistry", registry)
-        self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.event_log)
+        self.output = SourceOutput(
+            "px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.event_log
+        )
         bus = SimpleNamespace(
             connected=True,
             subscribe=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
@@ -91,7 +93,9 @@ def test_state_of_vehicles_that_come_and_go_is_bounded(monkeypatch: pytest.Monke
     sizes = []
     for number in range(240):
         world.now += 2.0
-        there = [Address(f"v{each}", VLP) for each in range(max(0, number - AT_A_TIME + 1), number + 1)]
+        there = [
+            Address(f"v{each}", VLP) for each in range(max(0, number - AT_A_TIME + 1), number + 1)
+        ]
         for address in there:
             world.receive(address)
         world.poll(*there)
@@ -105,12 +109,20 @@ def test_state_of_vehicles_that_come_and_go_is_bounded(monkeypatch: pytest.Monke
         world.now += 1.0
         world.receive(there[-1])
         world.poll(there[-1])
-    assert {name: number for name, number in world.sizes().items() if number != 1}.keys() == {"counts"}
+    assert {name: number for name, number in world.sizes().items() if number != 1}.keys() == {
+        "counts"
+    }
 
 
-def test_unpublished_stream_of_present_vehicle_is_forgotten_after_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unpublished_stream_of_present_vehicle_is_forgotten_after_an_hour(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A topic that a vehicle no longer publishes is stale for an hour, then forgotten."""
-    world, position, attitude = World(monkeypatch), Address("1", VLP), Address("1", "estimator_local_position", 0)
+    world, position, attitude = (
+        World(monkeypatch),
+        Address("1", VLP),
+        Address("1", "estimator_local_position", 0),
+    )
     for second in range(3):
         world.now = float(second)
         world.receive(position)

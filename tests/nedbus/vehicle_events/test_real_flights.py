@@ -54,11 +54,14 @@ TABLE: Final = json.loads(events_table.TABLE.read_text())
 TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
 ALL: Final = sorted(LOGS.parent.rglob("*.ulg"))
 NAMES: Final = [name for name in TABLE if name != "from"]
-FREQUENT: Final = "ev_refused"  # a script counted messages in reset_counter: hundreds of resets, mostly suppressed
+# a script counted messages in reset_counter: hundreds of resets, mostly suppressed
+FREQUENT: Final = "ev_refused"
 STEADY: Final = [name for name in NAMES if name != FREQUENT]
-TOPICS_APART: Final = 10.0  # s of the vehicle's time by which topics arrive apart, of a replay at full speed
+# s of the vehicle's time by which topics arrive apart, of a replay at full speed
+TOPICS_APART: Final = 10.0
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
-FLAPPING: Final = 4, 10.0, 5.0  # changes per window, window [s], pause until the last one is reported [s]
+# changes per window, window [s], pause until the last one is reported [s]
+FLAPPING: Final = 4, 10.0, 5.0
 TRACKED: Final = {
     "x": "north", "y": "east", "z": "up", "vx": "v_north", "vy": "v_east", "vz": "v_up", "heading": "heading",
 }  # fmt: skip
@@ -68,7 +71,10 @@ NOT_IN_TABLE: Final = (
 )  # fmt: skip
 RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # PX4 1.15 name: current name
 
-pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} does not exist")]
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} does not exist"),
+]
 
 
 def path_of(name: str) -> Path:
@@ -100,7 +106,9 @@ def without_flapping(rows: Sequence[Row]) -> Iterator[tuple[Row, int]]:
         if key in suppressed and row["t"] - suppressed[key][-1]["t"] > pause:
             yield suppressed[key][-1], len(suppressed.pop(key))
         before = times.setdefault(key, [])
-        is_fast = row["change"] != "once" and len(before) >= limit and row["t"] - before[-limit] < window
+        is_fast = (
+            row["change"] != "once" and len(before) >= limit and row["t"] - before[-limit] < window
+        )
         before.append(row["t"])
         if is_fast:
             suppressed.setdefault(key, []).append(row)
@@ -118,13 +126,20 @@ def is_same(row: Row, event: Event) -> bool:
     return (
         (row["kind"], row["change"]) == (event.kind, event.change)
         and abs(row["t"] - time_of(event)) <= tolerance
-        and (names is None or sorted(RENAMED.get(name, name) for name in names) == sorted(event.names))
+        and (
+            names is None
+            or sorted(RENAMED.get(name, name) for name in names) == sorted(event.names)
+        )
     )
 
 
 def sizes_of(event: Event) -> Mapping[str, float]:
     """Return the numbers with the table's sign: down is positive."""
-    down = {f"{name.removesuffix('up')}down": -value for name, value in event.numbers.items() if name[-2:] == "up"}
+    down = {
+        f"{name.removesuffix('up')}down": -value
+        for name, value in event.numbers.items()
+        if name[-2:] == "up"
+    }
     return {**event.numbers, **(down if event.kind == "reset" else {})}
 
 
@@ -134,7 +149,8 @@ def test_events_equal_the_independent_table(name: str) -> None:
 
     Intended differences: flapping flags are suppressed, and old PX4 field names are mapped to current ones.
     """
-    dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]  # not in the table
+    # not in the table
+    dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]
     left = [each for each in events_in(name) if each.kind not in NOT_IN_TABLE]
     durations = [each.numbers["duration"] for each in events_in(name) if each.kind == "dropout"]
     assert sum(durations) == pytest.approx(sum(dropouts))
@@ -148,9 +164,11 @@ def test_events_equal_the_independent_table(name: str) -> None:
         for number, value in row["numbers"].items():
             if number == "distance" and row["kind"] == "jump":
                 assert sizes[number] == pytest.approx(value, rel=0.01)
-            elif number not in ("flags", "quantities", "origin"):  # without sizes if the origin changed
+            elif number not in ("flags", "quantities", "origin"):
+                # without sizes if the origin changed
                 assert sizes[number] == pytest.approx(value, abs=2e-4), (number, row)
-    left = [event for event in left if "superseded" not in event.text]  # by the flags of another EKF
+    # by the flags of another EKF
+    left = [event for event in left if "superseded" not in event.text]
     assert [(time_of(event), event.kind, event.text) for event in left] == []
 
 
@@ -168,7 +186,10 @@ def test_events_and_track_agree_in_every_reset(name: str, thinned: bool) -> None
         last = message.timestamp
         track = tracker.add(message)
         event_log.add(sent.address, message, last / 1e6)
-        before, offsets = offsets, {name: getattr(message, name) - getattr(track, name) for name in TRACKED}
+        before, offsets = (
+            offsets,
+            {name: getattr(message, name) - getattr(track, name) for name in TRACKED},
+        )
         if track.reset - {"dist_bottom"}:
             assert not track.discontinued
             removed[last] = {TRACKED[name]: offsets[name] - before[name] for name in TRACKED}
@@ -179,7 +200,10 @@ def test_events_and_track_agree_in_every_reset(name: str, thinned: bool) -> None
     for time, sizes in found.items():
         for number, size in sizes.items():
             sign = -1 if number in ("up", "v_up") else 1
-            assert wrap(sign * size - removed[time][number]) == pytest.approx(0.0, abs=1e-4), (time, number)
+            assert wrap(sign * size - removed[time][number]) == pytest.approx(0.0, abs=1e-4), (
+                time,
+                number,
+            )
 
 
 def test_table_is_generated_by_its_script() -> None:
@@ -204,15 +228,27 @@ def test_evidence_precedes_the_event(name: str) -> None:
     for index, event in enumerate(events):
         for each in event.evidence:
             assert each.time <= event.time
-            earlier = [other for other in events[:index] if (other.kind, other.text) == (each.kind, each.text)]
+            earlier = [
+                other
+                for other in events[:index]
+                if (other.kind, other.text) == (each.kind, each.text)
+            ]
             since = [
-                other for other in events[:index] if other.kind == each.kind and each.time < other.time < event.time
+                other
+                for other in events[:index]
+                if other.kind == each.kind and each.time < other.time < event.time
             ]
             ended = {name for other in since if other.change == "end" for name in other.names}
             is_on = not ended.issuperset(each.names)
             assert event.time - each.time <= 10.0 or is_on
-            begun = [other for other in events[:index] if other.kind == each.kind and other.change == "begin"]
-            assert earlier or (each.change == "begin" and not begun), f"{each.text} was never reported"
+            begun = [
+                other
+                for other in events[:index]
+                if other.kind == each.kind and other.change == "begin"
+            ]
+            assert earlier or (each.change == "begin" and not begun), (
+                f"{each.text} was never reported"
+            )
 
 
 def why(name: str, *, at: float | None = None) -> list[Story]:
@@ -245,7 +281,9 @@ def test_healthy_flight_has_no_story() -> None:
 def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...]) -> None:
     """An estimate that is never valid has one story, which names the missing topics."""
     only = why(name)
-    assert [(each.what, each.begin, each.until) for each in only] == [("xy and vxy not valid", None, None)]
+    assert [(each.what, each.begin, each.until) for each in only] == [
+        ("xy and vxy not valid", None, None)
+    ]
     assert only[0].since < 1.0
     assert (only[0].before, only[0].lacking) == ((), lacking)
 
@@ -288,7 +326,11 @@ def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
     story = only[0]
     assert story.until is not None
     assert story.until - story.since == pytest.approx(48.324 - 32.444, abs=1e-3)
-    assert short(story.before) == [("gps_fix_lost", 27.392), ("few_satellites", 27.392), ("dead_reckoning", 28.444)]
+    assert short(story.before) == [
+        ("gps_fix_lost", 27.392),
+        ("few_satellites", 27.392),
+        ("dead_reckoning", 28.444),
+    ]
     assert short(story.meanwhile) == [
         ("failsafe_flag", 32.468), ("failsafe", 32.48), ("mode", 32.48), ("not_fused", 34.564),
     ]  # fmt: skip
@@ -312,10 +354,16 @@ def test_primary_ekf_changes_are_events() -> None:
     primary = selector["primary_instance"]
     changes = [index for index in range(1, len(primary)) if primary[index] != primary[index - 1]]
     events = [each for each in events_in(path.stem) if each.kind == "ekf_changed"]
-    assert [each.boot for each in events] == [pytest.approx(selector["timestamp"][index] / 1e6) for index in changes]
+    assert [each.boot for each in events] == [
+        pytest.approx(selector["timestamp"][index] / 1e6) for index in changes
+    ]
     assert [each.numbers["to"] for each in events] == [primary[index] for index in changes]
     assert len(events) == 15  # PX4 counts 16, including the first selection
-    resets = [each for each in events_in(path.stem) if each.kind == "reset" and "xy" in each.names and each.evidence]
+    resets = [
+        each
+        for each in events_in(path.stem)
+        if each.kind == "reset" and "xy" in each.names and each.evidence
+    ]
     assert sum("ekf_changed" in [cause.kind for cause in each.evidence] for each in resets) >= 15
 
 
@@ -326,24 +374,40 @@ def test_only_one_log_has_a_contradicted_estimate(path: Path) -> None:
     In the other logs no valid estimate exceeds the limit for long enough: it is off by 92 m for half a second in
     twelve_messages, by 3 m in gps_loss, and from the barometer alone by 16 m in fast flight and 6 m at takeoff.
     """
-    events = [event for event in ulogs.cached_events(path).event_log.events if event.kind.endswith("_contradicted")]
+    events = [
+        event
+        for event in ulogs.cached_events(path).event_log.events
+        if event.kind.endswith("_contradicted")
+    ]
     right = [
-        ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z_valid is true"),
+        (
+            "height_contradicted",
+            "begin",
+            116.9,
+            "height 27 m below GNSS and barometer while z_valid is true",
+        ),
         ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy_valid is true"),
         ("height_contradicted", "end", 118.9, "height no longer contradicted after 2.0 s"),
     ]
     found = [(each.kind, each.change, round(each.boot or 0.0, 1), each.text) for each in events]
-    assert sorted(found, key=lambda each: each[2]) == (right if path.stem == "nxp_v0_ekf_failure" else [])
+    assert sorted(found, key=lambda each: each[2]) == (
+        right if path.stem == "nxp_v0_ekf_failure" else []
+    )
 
 
 def test_contradicted_height_has_evidence_and_reset() -> None:
     """The story of a diverged height contains its evidence, the contradicted position, and the reset that ended it."""
-    height = next(each for each in why("nxp_v0_ekf_failure") if each.begin and each.begin.kind == "height_contradicted")
+    height = next(
+        each
+        for each in why("nxp_v0_ekf_failure")
+        if each.begin and each.begin.kind == "height_contradicted"
+    )
     assert [each for each in short(height.before) if each[0] != "text"] == [
         ("aid_unused", 115.36), ("dead_reckoning", 116.238), ("estimator_fault", 116.609),
     ]  # fmt: skip
     assert "position_contradicted" in [each.kind for each in height.meanwhile]
-    assert "reset of height by 24.3 m, vz by 4.8 m/s" in [each.text for each in height.after]  # delta_z: -19.2
+    # with a delta_z of -19.2
+    assert "reset of height by 24.3 m, vz by 4.8 m/s" in [each.text for each in height.after]
     assert height.lacking == ()
 
 
@@ -358,7 +422,9 @@ def test_px4_texts_are_events(name: str) -> None:
     checks: set[str] = set()
     for time, _, _, group, has_twin, text in TABLES[name]["texts"]:
         near = [each for each in events if abs(each[0] - time) < 0.002]
-        same = [each for each in near if text.strip() in each[1] or each[1].rpartition("] ")[2] in text]
+        same = [
+            each for each in near if text.strip() in each[1] or each[1].rpartition("] ")[2] in text
+        ]
         if same:
             events.remove(same[0])
         else:
@@ -372,8 +438,14 @@ def verdict(path: Path) -> Verdict:
     read = ulogs.cached_events(path)
     events, (followed,) = read.event_log.events_since(0)[0], read.event_log.vehicles.values()
     events = sorted(events, key=lambda event: event.time)
-    held = [each for each in [*followed.conditions.values(), *followed.usual.values()] if each.severity != "info"]
-    return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)
+    held = [
+        each
+        for each in [*followed.conditions.values(), *followed.usual.values()]
+        if each.severity != "info"
+    ]
+    return verdict_of(
+        followed.name, events, held, topics=followed.topics, times=read.times, end=read.end
+    )
 
 
 @pytest.mark.parametrize(
@@ -396,7 +468,11 @@ def test_verdict_names_cause_and_times(
     assert (found.usable, found.begin.boot, found.end.boot) == (False, begin, end)
     assert [each for each in short(found.cause) if each in cause] == cause
     times = cached_events(name).times
-    moments = [times.text(each) for each in (found.begin, found.end, *found.cause) if (each.kind, each.boot) in cause]
+    moments = [
+        times.text(each)
+        for each in (found.begin, found.end, *found.cause)
+        if (each.kind, each.boot) in cause
+    ]
     assert all(moment in found.text for moment in moments)
     assert f"({end - begin:.1f} s)" in found.text
     assert quoted in found.text
@@ -412,8 +488,13 @@ def test_verdict_names_contradicted_height() -> None:
     assert 115.4 < (found.begin.boot or 0.0) < 117.5
     assert found.end.boot == pytest.approx(118.8, abs=0.2)
     assert "height 27 m below GNSS" in found.text
-    assert 'PX4: "Attitude failure detected"; 13:57:38.9 EKF fault: vertical accelerometer.' in found.text
-    assert [short([each]) for each in found.cause if each.kind == "dead_reckoning"] == [[("dead_reckoning", 116.238)]]
+    assert (
+        'PX4: "Attitude failure detected"; 13:57:38.9 EKF fault: vertical accelerometer.'
+        in found.text
+    )
+    assert [short([each]) for each in found.cause if each.kind == "dead_reckoning"] == [
+        [("dead_reckoning", 116.238)]
+    ]
     assert "position 9 m off GNSS while xy_valid is true" in found.text
 
 
@@ -435,12 +516,18 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
         if state.severity == "bad":
             before = [event for event in events if event.time <= now]
             found = verdict_of(
-                followed.name, before, state.conditions, topics=followed.topics, times=Times(is_live=True), end=now
+                followed.name,
+                before,
+                state.conditions,
+                topics=followed.topics,
+                times=Times(is_live=True),
+                end=now,
             )
             alike = [each for each in found.stories if each.spans[0].text == state.text]
             worst = next(each for each in alike if each.begin is found.begin)
             assert found.usable is False, now
-            if worst.kind not in ("failsafe", "reset"):  # the text omits the small part of a large reset
+            # the text omits the small part of a large reset
+            if worst.kind not in ("failsafe", "reset"):
                 assert found.text.startswith(f"not usable: {worst.what} "), now
             states += 1
     assert bool(states) == (name != "cuav_1.16_gps_interference")
@@ -514,7 +601,11 @@ def test_failing_sensor_is_one_fault(name: str, number: int) -> None:
 
 def test_failed_checks_from_before_arming_explain_no_change_in_flight() -> None:
     """A change of the EKF 6 s after arming is not explained by what PX4 reported on the ground before."""
-    switch = next(story for story in verdict(path_of("multi_ekf_switch")).stories if story.kind == "ekf_changed")
+    switch = next(
+        story
+        for story in verdict(path_of("multi_ekf_switch")).stories
+        if story.kind == "ekf_changed"
+    )
     assert [event.kind for event in switch.before] == ["origin_set"]
 
 
@@ -528,10 +619,16 @@ def test_vision_that_is_not_fused_is_an_event() -> None:
         "bit 1 of EKF2_EV_CTRL is not set, or quality 100 is below EKF2_EV_QMIN", "less than 5 messages per second",
         "time_usec is 0.3 s old", "a message was stamped 3600 s ahead",
     ]  # fmt: skip
-    [rejected] = [each for each in events_in("ev_right") if each.kind == "aid_rejected" and each.change == "begin"]
+    [rejected] = [
+        each
+        for each in events_in("ev_right")
+        if each.kind == "aid_rejected" and each.change == "begin"
+    ]
     cause = "the position jumped without a new reset_counter, or is noisier than its variance"
     assert (rejected.text, rejected.severity) == (f"EKF rejects vision position: {cause}", "watch")
-    resets = [each for each in events_in("ev_right") if each.kind == "reset" and each.severity == "watch"]
+    resets = [
+        each for each in events_in("ev_right") if each.kind == "reset" and each.severity == "watch"
+    ]
     assert "aid_rejected" in [each.kind for each in resets[-1].evidence]
 
 
@@ -562,7 +659,9 @@ def convert_whole(path: Path, folder: Path) -> Path:
 def test_conversion_has_the_same_events_and_verdict(path: Path, tmp_path: Path) -> None:
     """A log and its conversion, which hold the messages in different orders, have the same events and verdict."""
     converted = convert_whole(path, tmp_path)
-    assert same_events(ulogs.cached_events(converted).event_log) == same_events(ulogs.cached_events(path).event_log)
+    assert same_events(ulogs.cached_events(converted).event_log) == same_events(
+        ulogs.cached_events(path).event_log
+    )
     assert verdict(converted).text == verdict(path).text
 
 
@@ -635,9 +734,13 @@ def test_replay_and_its_recording_have_the_same_events(
     logged = same_events(ulogs.cached_events(path).event_log)
     again = same_events(ulogs.cached_events(recorded).event_log)
     assert [event[:4] for event in again] == [event[:4] for event in logged]
-    assert [float(event[4]) for event in again] == pytest.approx([float(event[4]) for event in logged], abs=0.5)
+    assert [float(event[4]) for event in again] == pytest.approx(
+        [float(event[4]) for event in logged], abs=0.5
+    )
     live = same_events(observer.event_log)
-    assert [event[:4] for event in live] == [event[:4] for event in logged if event[0] != "no_messages"]
+    assert [event[:4] for event in live] == [
+        event[:4] for event in logged if event[0] != "no_messages"
+    ]
     faults = [[story.what for story in verdict(file).stories] for file in (recorded, path)]
     assert faults[0] == faults[1]
 
@@ -660,7 +763,8 @@ TURN6: Final = LOGS.parents[1] / "cases" / "turn6"
 
 
 @pytest.mark.parametrize(
-    "name", ["21_origin_altitude_baro_later", "21b_origin_altitude_baro", "21c_origin_altitude_no_baro"]
+    "name",
+    ["21_origin_altitude_baro_later", "21b_origin_altitude_baro", "21c_origin_altitude_no_baro"],
 )
 def test_wrong_origin_altitude_is_one_statement(name: str) -> None:
     """With or without a barometer: the origin's altitude is wrong during the whole flight, and z is right."""

@@ -40,7 +40,9 @@ NOTHING = Expectation()
 SCRIPT = AccountReport("", "h", 0.0, {"7": VehicleReport("info", "ok", has_position=True)})
 
 
-def report(flight: Flight, *, service: str = "s", host: str = "h", within: float = 1e9) -> AccountReport:
+def report(
+    flight: Flight, *, service: str = "s", host: str = "h", within: float = 1e9
+) -> AccountReport:
     return report_of(flight.event_log, service, host, flight.now, within=within)
 
 
@@ -84,7 +86,9 @@ def test_story_from_report_equals_story_of_service() -> None:
     for within in (1e9, 0.0):
         read = through_json(report(flight, within=within))
         stories = stories_of(read.events, read.vehicles["1"].held, topics=read.vehicles["1"].topics)
-        assert [(each.what, each.since, each.until) for each in stories] == [("xy not valid", flight.now, None)]
+        assert [(each.what, each.since, each.until) for each in stories] == [
+            ("xy not valid", flight.now, None)
+        ]
 
 
 def test_report_has_all_events_of_its_period() -> None:
@@ -106,7 +110,9 @@ def test_evidence_has_the_clock_of_its_event() -> None:
     invalid = through_json(sent).events[-1]
     [cause] = invalid.evidence
     assert (invalid.kind, cause.kind) == ("xy_invalid", "dead_reckoning")
-    assert (invalid.time, cause.time) == pytest.approx((1.7e9 + flight.now, 1.7e9 + flight.now - 3.0))
+    assert (invalid.time, cause.time) == pytest.approx(
+        (1.7e9 + flight.now, 1.7e9 + flight.now - 3.0)
+    )
 
 
 def test_topics_of_a_vehicle_are_limited_to_those_of_a_verdict() -> None:
@@ -126,7 +132,11 @@ def test_topics_of_a_vehicle_are_limited_to_those_of_a_verdict() -> None:
 def test_large_report_is_sent_in_parts() -> None:
     """A report of 1,000 vehicles is split into parts below the size limit, which join to the same report."""
     flight = Flight()
-    steps: list[dict[str, Any]] = [{}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False, "v_xy_valid": False}]
+    steps: list[dict[str, Any]] = [
+        {},
+        {"xy_valid": False},
+        {"xy_valid": False, "z_valid": False, "v_xy_valid": False},
+    ]
     for faults in steps:
         for number in range(MAX_VEHICLES):
             flight.send(vehicle=f"vehicle-{number}", **faults)
@@ -142,17 +152,25 @@ def test_large_status_is_split_by_source() -> None:
     """A large status is split between sources; a single source that is too large omits the health of its streams."""
     address = f"{'v' * 60}/{VLP}"
     stream = StreamStatus(address, StreamHealth(VLP).snapshot(0))
-    sources = tuple(SourceStatus(f"ulog:{number}", addresses=(address,) * 100) for number in range(100))
+    sources = tuple(
+        SourceStatus(f"ulog:{number}", addresses=(address,) * 100) for number in range(100)
+    )
     parts = [json.loads(part) for part in reply_parts(ServiceStatus("s", sources=sources))]
     assert len(parts) > 1
-    assert [each["source"] for part in parts for each in part["sources"]] == [each.source for each in sources]
-    [part] = reply_parts(ServiceStatus("s", sources=(replace(sources[0], streams=(stream,) * 1000),)))
+    assert [each["source"] for part in parts for each in part["sources"]] == [
+        each.source for each in sources
+    ]
+    [part] = reply_parts(
+        ServiceStatus("s", sources=(replace(sources[0], streams=(stream,) * 1000),))
+    )
     assert [len(each["streams"]) for each in json.loads(part)["sources"]] == [0]
 
 
 def test_vehicle_with_too_large_report_is_omitted(caplog: pytest.LogCaptureFixture) -> None:
     """A vehicle whose report alone exceeds the size limit is omitted, which is logged."""
-    vehicles = {name: VehicleReport("bad", "x" * size) for name, size in (("1", MAX_REPLY_BYTES), ("2", 9))}
+    vehicles = {
+        name: VehicleReport("bad", "x" * size) for name, size in (("1", MAX_REPLY_BYTES), ("2", 9))
+    }
     [part] = reply_parts(AccountReport("s", "h", 1.0, vehicles))
     assert json.loads(part)["vehicles"].keys() == {"2"}
     assert [each.about.event for each in caplog.records if hasattr(each, "about")] == ["incomplete"]
@@ -180,7 +198,10 @@ def test_deeply_nested_reply_returns_none() -> None:
     }  # fmt: skip
     for _ in range(5000):
         event = event | {"evidence": [event]}
-    assert from_json({"service": "s", "host": "h", "now": 1.0, "vehicles": {}, "events": [event]}) is None
+    assert (
+        from_json({"service": "s", "host": "h", "now": 1.0, "vehicles": {}, "events": [event]})
+        is None
+    )
 
 
 def test_reply_beyond_limits_returns_none() -> None:
@@ -189,14 +210,21 @@ def test_reply_beyond_limits_returns_none() -> None:
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
     assert from_json(content | {"events": [event] * (KEPT + 1)}) is None
     vehicle = {"severity": "info", "text": "ok"}
-    assert from_json(content | {"vehicles": {str(number): vehicle for number in range(1001)}}) is None
-    read = from_json(content | {"events": [event] * KEPT, "vehicles": {str(number): vehicle for number in range(1000)}})
+    assert (
+        from_json(content | {"vehicles": {str(number): vehicle for number in range(1001)}}) is None
+    )
+    read = from_json(
+        content
+        | {"events": [event] * KEPT, "vehicles": {str(number): vehicle for number in range(1000)}}
+    )
     assert read is not None
 
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=10,
 )
 
@@ -207,19 +235,29 @@ def test_any_reply_returns_a_report_or_none(name: str, value: object) -> None:
     content = json.loads(json.dumps(asdict(report(flying(xy_valid=False)))))
     read = from_json(content | {name: value})
     if read is not None:
-        assert isinstance(faults_of([read], Expectation(vehicles=1, valid=("xy",), within=1.0)), list)
+        assert isinstance(
+            faults_of([read], Expectation(vehicles=1, valid=("xy",), within=1.0)), list
+        )
         assert isinstance(stories_of(read.events), list)
 
 
 def test_vehicles_are_listed_worst_first() -> None:
     """Vehicles of a report are listed by state, then in natural order."""
-    known: dict[str, Severity] = {"uav-10": "info", "uav-2": "info", "3": "watch", "b": "bad", "a": "bad"}
+    known: dict[str, Severity] = {
+        "uav-10": "info",
+        "uav-2": "info",
+        "3": "watch",
+        "b": "bad",
+        "a": "bad",
+    }
     vehicles = {name: VehicleReport(severity, f"is {severity}") for name, severity in known.items()}
     given = AccountReport("s", "h", 1.0, vehicles)
     order = sorted(known, key=lambda name: rank_vehicle(name, known[name]))
     assert list(by_vehicle([given])) == order == ["a", "b", "3", "uav-2", "uav-10"]
     assert faults_of([given], Expectation(well=True)) == ["vehicle a: is bad", "vehicle b: is bad"]
-    page = vehicles_page(replace(given, vehicles={name: vehicles[name] for name in known if known[name] != "bad"}))
+    page = vehicles_page(
+        replace(given, vehicles={name: vehicles[name] for name in known if known[name] != "bad"})
+    )
     assert page.content.decode().splitlines() == ["3 is watch", "uav-2 is info", "uav-10 is info"]
 
 
@@ -242,7 +280,9 @@ def test_silent_vehicle_is_a_fault_for_an_hour() -> None:
     flight.wait(2).update("stale")
     assert faults_of([report(flight)], NOTHING) == []
     faults = faults_of([report(flight)], Expectation(("1",)))
-    assert faults == ["vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (60 min)"]
+    assert faults == [
+        "vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (60 min)"
+    ]
 
 
 def test_vehicle_received_by_one_service_is_not_missing() -> None:
@@ -258,12 +298,17 @@ def test_vehicle_received_by_one_service_is_not_missing() -> None:
 def test_missing_vehicles_are_faults() -> None:
     """A missing vehicle is a fault, whether expected by name or by count; one published by a script is present."""
     one = report(flying())
-    assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher; published: 1"]
+    assert faults_of([one], Expectation(("1", "7"))) == [
+        "vehicle 7 is missing: it has no publisher; published: 1"
+    ]
     assert faults_of([], Expectation(("7",))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
-    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["messages arrive from 2 of 3 vehicles: 1, 7"]
+    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == [
+        "messages arrive from 2 of 3 vehicles: 1, 7"
+    ]
     assert faults_of([], Expectation(vehicles=1)) == ["messages arrive from 0 of 1 vehicles"]
-    assert faults_of([one, SCRIPT], Expectation(("7",), valid=("xy",))) == []  # vehicle 1 is not checked
+    # vehicle 1 is not checked
+    assert faults_of([one, SCRIPT], Expectation(("7",), valid=("xy",))) == []
 
 
 def test_other_hosts_are_not_checked() -> None:
@@ -292,7 +337,9 @@ def test_vehicle_without_position_fails_validity_check() -> None:
     """A vehicle that publishes no position fails a validity check."""
     flight = Flight()
     flight.status(ARMED)
-    assert faults_of([report(flight)], Expectation(valid=("xy",))) == ["vehicle 1: publishes no position"]
+    assert faults_of([report(flight)], Expectation(valid=("xy",))) == [
+        "vehicle 1: publishes no position"
+    ]
 
 
 def test_recent_events_are_faults() -> None:
@@ -313,8 +360,12 @@ def test_recent_events_are_faults() -> None:
 
 def test_recent_events_beyond_twenty_are_counted() -> None:
     """The first twenty recent events are listed, the others counted."""
-    events = tuple(Event(ALL, "lost", "once", "watch", f"{number} lost", float(number)) for number in range(30))
-    lines = faults_of([replace(report(flying()), now=30.0, events=events)], Expectation(within=60.0))
+    events = tuple(
+        Event(ALL, "lost", "once", "watch", f"{number} lost", float(number)) for number in range(30)
+    )
+    lines = faults_of(
+        [replace(report(flying()), now=30.0, events=events)], Expectation(within=60.0)
+    )
     assert len(lines) == 21
     assert lines[-1] == "10 more events in the last 60 s"
 
@@ -322,7 +373,10 @@ def test_recent_events_beyond_twenty_are_counted() -> None:
 def test_loss_of_a_link_is_one_fault_of_its_service() -> None:
     """A service reports its link under each of its vehicles; a check lists it once, in chronological order."""
     lost = Event(ALL, "link_down", "begin", "bad", "no link to tcp/a", 50.0)
-    resets = [Event(name, "reset", "once", "watch", "reset of xy", time) for name, time in (("1", 40.0), ("2", 60.0))]
+    resets = [
+        Event(name, "reset", "once", "watch", "reset of xy", time)
+        for name, time in (("1", 40.0), ("2", 60.0))
+    ]
     vehicles = {name: VehicleReport("info", "ok", has_position=True) for name in ("1", "2")}
     whole = AccountReport("gcs", "host", 100.0, vehicles, (resets[0], lost, resets[1]))
     found = faults_of([whole.about("1"), whole.about("2")], Expectation(within=90.0))
@@ -339,7 +393,9 @@ def test_report_about_one_vehicle_replaces_no_event_of_another() -> None:
     vehicles = {name: VehicleReport("info", "ok", has_position=True) for name in ("1", "2")}
     lost = Event(ALL, "link_down", "begin", "bad", "no link to tcp/a", 50.0)
     genuine = AccountReport("gcs", "host", 100.0, vehicles, (lost,)).about("2")
-    forged = AccountReport("gcs", "host", 100.0, vehicles, (replace(lost, severity="info", text="ok"),)).about("1")
+    forged = AccountReport(
+        "gcs", "host", 100.0, vehicles, (replace(lost, severity="info", text="ok"),)
+    ).about("1")
     for reports in ([forged, genuine], [genuine, forged]):
         found = faults_of(reports, Expectation(within=90.0))
         assert [fault.partition(", at")[0] for fault in found] == ["host: no link to tcp/a"]

@@ -30,8 +30,17 @@ def test_flags_invalid_together_are_one_story() -> None:
     flight = Flight()
     lose_gps(flight)
     (story,) = why(flight)
-    assert (story.what, story.until, story.end, story.is_bad) == ("xy and vxy not valid", None, None, True)
-    assert [each.kind for each in story.before] == ["gps_fix_lost", "few_satellites", "dead_reckoning"]
+    assert (story.what, story.until, story.end, story.is_bad) == (
+        "xy and vxy not valid",
+        None,
+        None,
+        True,
+    )
+    assert [each.kind for each in story.before] == [
+        "gps_fix_lost",
+        "few_satellites",
+        "dead_reckoning",
+    ]
     assert [each.kind for each in story.meanwhile] == ["failsafe"]
     assert story.after == ()
     assert story.lacking == ("estimator_status_flags", "failsafe_flags")
@@ -112,7 +121,9 @@ def test_end_of_one_fault_does_not_end_another() -> None:
     flags: dict[str, Any] = {"cs_baro_fault": True, "fs_bad_hdg": False}
     flight.send("estimator_status_flags", **flags)
     flight.wait(1.0).send("estimator_status_flags", **flags | {"fs_bad_hdg": True})
-    flight.wait(1.0).send("estimator_status_flags", **flags | {"fs_bad_hdg": True, "cs_baro_fault": False})
+    flight.wait(1.0).send(
+        "estimator_status_flags", **flags | {"fs_bad_hdg": True, "cs_baro_fault": False}
+    )
     assert [(each.what, each.until) for each in why(flight)] == [("EKF fault: heading", None)]
 
 
@@ -130,7 +141,9 @@ def test_watch_condition_is_a_story_beside_a_bad_one() -> None:
     flight.wait(0.1).send(xy_valid=False)
     assert [each.what for each in why(flight)] == ["GNSS jamming: indicator 100", "xy not valid"]
     assert [each.what for each in why(flight, at=jammed)] == ["GNSS jamming: indicator 100"]
-    assert [each.what for each in why(flight, at=flight.now - 50)] == ["GNSS jamming: indicator 100"]
+    assert [each.what for each in why(flight, at=flight.now - 50)] == [
+        "GNSS jamming: indicator 100"
+    ]
     assert [each.what for each in why(flight, at=flight.now + 50)] == ["xy not valid"]
 
 
@@ -192,7 +205,20 @@ def test_time_is_parsed(text: str, step: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "noon", "24:00", "12:60", "12:30:60", "12:30:61.5", "1:2", "12.30.00", "nan", "inf", "1:00:00:00"]
+    "text",
+    [
+        "",
+        "noon",
+        "24:00",
+        "12:60",
+        "12:30:60",
+        "12:30:61.5",
+        "1:2",
+        "12.30.00",
+        "nan",
+        "inf",
+        "1:00:00:00",
+    ],
 )
 def test_invalid_time_raises(text: str) -> None:
     """Text that is not a time raises ValueError with nedbus's own message."""

@@ -7,14 +7,29 @@ from typing import Any
 
 import pytest
 
-from nedbus.vehicle_events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
+from nedbus.vehicle_events import (
+    Event,
+    EventLog,
+    Times,
+    report_of,
+    spans_of,
+    state_at,
+    stories_of,
+    story_of,
+)
 from nedbus.vehicle_events.rules import PAUSE
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP
 from tests.nedbus.vehicle_events.flight import ARMED, Flight
 
 MAIN = Address("1", VLP)
-GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0}
+GPS = {
+    "fix_type": 3,
+    "satellites_used": 12,
+    "jamming_state": 0,
+    "jamming_indicator": 0,
+    "spoofing_state": 0,
+}
 
 
 class SimpleVehicle:
@@ -23,8 +38,14 @@ class SimpleVehicle:
     def __init__(self) -> None:
         self.event_log = EventLog()
 
-    def send(self, time: float, topic: str = VLP, instance: int | None = None, **fields: Any) -> None:
-        given = {**(VALID if topic.endswith("local_position") else {}), "timestamp": round((10 + time) * 1e6), **fields}
+    def send(
+        self, time: float, topic: str = VLP, instance: int | None = None, **fields: Any
+    ) -> None:
+        given = {
+            **(VALID if topic.endswith("local_position") else {}),
+            "timestamp": round((10 + time) * 1e6),
+            **fields,
+        }
         given = {name: value for name, value in given.items() if value is not None}
         self.event_log.add(Address("1", topic, instance), given, time)
 
@@ -38,7 +59,10 @@ class SimpleVehicle:
     def stories(self, **options: Any) -> list[tuple[str, float | None]]:
         vehicle = self.event_log.vehicles["1"]
         conditions = [*vehicle.initial, *vehicle.conditions.values()]
-        return [(story.what, story.until) for story in stories_of(list(self.event_log.events), conditions, **options)]
+        return [
+            (story.what, story.until)
+            for story in stories_of(list(self.event_log.events), conditions, **options)
+        ]
 
 
 @pytest.fixture
@@ -46,7 +70,9 @@ def vehicle() -> SimpleVehicle:
     return SimpleVehicle()
 
 
-@pytest.mark.parametrize(("interval", "is_wild"), [(0.1, True), (0.3, True), (0.5, False), (2.0, False)])
+@pytest.mark.parametrize(
+    ("interval", "is_wild"), [(0.1, True), (0.3, True), (0.5, False), (2.0, False)]
+)
 @pytest.mark.parametrize("fields", [{"xy_valid": False}, {"ref_lat": 46.0, "ref_timestamp": 9}])
 def test_only_a_value_of_less_than_half_a_second_is_marked_as_that_of_one_message(
     fields: dict[str, Any], interval: float, *, is_wild: bool
@@ -56,7 +82,9 @@ def test_only_a_value_of_less_than_half_a_second_is_marked_as_that_of_one_messag
     flight.status(ARMED)
     for number in range(8):
         flight.wait(interval).send(**fields if number == 5 else {})
-    changes = [event for event in flight.event_log.events if event.kind in ("xy_invalid", "origin_moved")]
+    changes = [
+        event for event in flight.event_log.events if event.kind in ("xy_invalid", "origin_moved")
+    ]
     assert len(changes) == 2
     assert ["one_message" in event.numbers for event in changes] == [False, is_wild]
     assert len(flight_stories(flight)) == (0 if is_wild else 1)
@@ -136,7 +164,11 @@ def test_single_low_timestamp_is_not_a_reboot(vehicle: SimpleVehicle, stamp: int
     vehicle.send(5.0, timestamp=stamp, xy_valid=False, z_valid=False)
     vehicle.send(6.0, timestamp=106 * 10**6, xy_valid=False, z_valid=False)
     vehicle.send(7.0, timestamp=107 * 10**6, xy_valid=False)
-    assert vehicle.reported == [("xy_invalid", "begin"), ("z_invalid", "begin"), ("z_invalid", "end")]
+    assert vehicle.reported == [
+        ("xy_invalid", "begin"),
+        ("z_invalid", "begin"),
+        ("z_invalid", "end"),
+    ]
     assert vehicle.state(7.0) == "bad"
 
 
@@ -155,7 +187,10 @@ def test_event_after_an_old_text_has_its_own_time(vehicle: SimpleVehicle) -> Non
     vehicle.send(0.0)
     vehicle.send(0.5, "log_message", timestamp=1_000_000, severity=6, text="old")
     vehicle.send(1.0, xy_valid=False)
-    assert [(each.kind, each.boot) for each in vehicle.event_log.events] == [("text", 1.0), ("xy_invalid", 11.0)]
+    assert [(each.kind, each.boot) for each in vehicle.event_log.events] == [
+        ("text", 1.0),
+        ("xy_invalid", 11.0),
+    ]
 
 
 def test_wild_first_timestamp_is_not_a_reboot(vehicle: SimpleVehicle) -> None:
@@ -212,7 +247,9 @@ def test_condition_active_throughout_a_recording_is_in_every_state(vehicle: Simp
     """A vehicle whose position is never valid in a recording has state "bad" at any time in it, as in live data."""
     for second in range(5):
         vehicle.send(float(second), xy_valid=False)
-    state = state_at(spans_of(list(vehicle.event_log.events), vehicle.event_log.vehicles["1"].initial), 3.0)
+    state = state_at(
+        spans_of(list(vehicle.event_log.events), vehicle.event_log.vehicles["1"].initial), 3.0
+    )
     assert (state.severity, state.text) == ("bad", "xy not valid")
     assert [each.initial for each in state.conditions] == [True]
 
@@ -252,12 +289,17 @@ def test_noisy_vehicle_does_not_displace_events_of_others() -> None:
     event_log = EventLog(keep=300)
     quiet, noisy = Address("quiet", VLP), Address("noisy", VLP)
     for second, valid in enumerate((True, False, True)):
-        event_log.add(quiet, {**VALID, "timestamp": (second + 1) * 10**6, "xy_valid": valid}, float(second))
+        event_log.add(
+            quiet, {**VALID, "timestamp": (second + 1) * 10**6, "xy_valid": valid}, float(second)
+        )
     for number in range(9000):
         fields = {**VALID, "timestamp": (number + 1) * 10**6, "xy_reset_counter": number % 256}
         event_log.add(noisy, fields, 10.0 + number)
     answered = report_of(event_log, "s", "h", 10_000.0, within=1e9).events
-    assert [event.kind for event in answered if event.vehicle == "quiet"] == ["xy_invalid", "xy_invalid"]
+    assert [event.kind for event in answered if event.vehicle == "quiet"] == [
+        "xy_invalid",
+        "xy_invalid",
+    ]
     assert len(answered) == 300
     assert [event.time for event in answered] == sorted(event.time for event in answered)
 
@@ -337,7 +379,9 @@ def test_primary_ekf_without_selector_is_identified_by_its_estimate(vehicle: Sim
     """Without a selector, the primary EKF is the only one whose estimate equals the vehicle's."""
     for time, other in ((0.0, 0.0), (1.0, 5.0), (2.0, 6.0)):
         for instance, x in ((0, other), (1, time)):
-            vehicle.send(time, "estimator_local_position", instance, timestamp_sample=round(1e6 * time), x=x)
+            vehicle.send(
+                time, "estimator_local_position", instance, timestamp_sample=round(1e6 * time), x=x
+            )
         vehicle.send(time, timestamp_sample=round(1e6 * time), x=time, vx=1.0)
         for instance in (0, 1):
             vehicle.send(time, "estimator_status_flags", instance, cs_mag_fault=False)
@@ -345,7 +389,9 @@ def test_primary_ekf_without_selector_is_identified_by_its_estimate(vehicle: Sim
     vehicle.send(4.0, "estimator_status_flags", 1, cs_mag_fault=True)
     texts = [each.text for each in vehicle.event_log.events]
     assert texts == ["EKF 0 (not primary): fault: magnetometer", "EKF fault: magnetometer"]
-    assert [each.kind for each in vehicle.event_log.vehicles["1"].state(100.0).conditions] == ["estimator_fault"]
+    assert [each.kind for each in vehicle.event_log.vehicles["1"].state(100.0).conditions] == [
+        "estimator_fault"
+    ]
 
 
 def test_late_selector_overrides_comparison_of_estimates(vehicle: SimpleVehicle) -> None:
@@ -353,7 +399,11 @@ def test_late_selector_overrides_comparison_of_estimates(vehicle: SimpleVehicle)
     for time in (0.0, 1.0, 2.0, 3.0):
         for instance in (0, 1):
             vehicle.send(
-                time, "estimator_local_position", instance, timestamp_sample=round(1e6 * time), x=time * instance
+                time,
+                "estimator_local_position",
+                instance,
+                timestamp_sample=round(1e6 * time),
+                x=time * instance,
             )
         vehicle.send(time, timestamp_sample=round(1e6 * time), x=time, vx=1.0)
         vehicle.send(time, "estimator_status_flags", 0, cs_mag_fault=time == 3.0)
@@ -365,15 +415,36 @@ def test_late_selector_overrides_comparison_of_estimates(vehicle: SimpleVehicle)
 @pytest.mark.parametrize("gnss", [False, True])
 def test_end_of_fake_position_fusion_is_evidence(vehicle: SimpleVehicle, gnss: bool) -> None:
     """The end of fake position fusion is evidence for an invalid position unless GNSS replaces it."""
-    vehicle.send(0.0, "estimator_status_flags", 0, cs_fake_pos=True, cs_valid_fake_pos=True, cs_gnss_pos=False)
+    vehicle.send(
+        0.0,
+        "estimator_status_flags",
+        0,
+        cs_fake_pos=True,
+        cs_valid_fake_pos=True,
+        cs_gnss_pos=False,
+    )
     vehicle.send(0.0)
-    vehicle.send(1.0, "estimator_status_flags", 0, cs_fake_pos=True, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
-    vehicle.send(2.0, "estimator_status_flags", 0, cs_fake_pos=False, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
+    vehicle.send(
+        1.0,
+        "estimator_status_flags",
+        0,
+        cs_fake_pos=True,
+        cs_valid_fake_pos=False,
+        cs_gnss_pos=gnss,
+    )
+    vehicle.send(
+        2.0,
+        "estimator_status_flags",
+        0,
+        cs_fake_pos=False,
+        cs_valid_fake_pos=False,
+        cs_gnss_pos=gnss,
+    )
     vehicle.send(2.2, xy_valid=False)
     [invalid] = [each for each in vehicle.event_log.events if each.kind == "xy_invalid"]
-    assert [each.text for each in invalid.evidence] == ["no horizontal aiding: EKF stopped fusing fake position"][
-        : not gnss
-    ]
+    assert [each.text for each in invalid.evidence] == [
+        "no horizontal aiding: EKF stopped fusing fake position"
+    ][: not gnss]
 
 
 def test_number_of_topics_of_a_vehicle_is_limited(vehicle: SimpleVehicle) -> None:

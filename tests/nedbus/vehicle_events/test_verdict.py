@@ -38,7 +38,9 @@ def verdict(flight: Flight, *, times: Times | None = None, at: float | None = No
     followed = flight.event_log.vehicles["1"]
     events = sorted(flight.event_log.events_since(0)[0], key=lambda each: each.time)
     held = [each for each in followed.conditions.values() if each.severity != "info"]
-    return verdict_of("1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at)
+    return verdict_of(
+        "1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at
+    )
 
 
 def has_words(text: str, *words: str) -> bool:
@@ -62,15 +64,36 @@ def test_verdict_on_active_fault_includes_evidence() -> None:
     lose_gps(flight)
     found = verdict(flight)
     assert has_words(
-        found.text, "not usable", "xy", "vxy", "not valid", "16.000 s since boot", "until the end", "1.0 s"
+        found.text,
+        "not usable",
+        "xy",
+        "vxy",
+        "not valid",
+        "16.000 s since boot",
+        "until the end",
+        "1.0 s",
     )
-    assert has_words(found.text, "(1.0 s)", "11.000", "3D to none", "satellites 12 to 0", "12.000", "dead reckoning")
-    assert has_words(found.text, "dead reckoning", "Not in the data", "estimator_status_flags, failsafe_flags")
+    assert has_words(
+        found.text,
+        "(1.0 s)",
+        "11.000",
+        "3D to none",
+        "satellites 12 to 0",
+        "12.000",
+        "dead reckoning",
+    )
+    assert has_words(
+        found.text, "dead reckoning", "Not in the data", "estimator_status_flags, failsafe_flags"
+    )
     assert since_boot(found.begin, *found.cause) == [16.0, 11.0, 11.0, 12.0]
     assert (found.usable, found.end, len(found.stories)) == (False, None, 1)
     assert found.begin is not None
     assert found.begin.kind == "xy_invalid"
-    assert [each.kind for each in found.cause] == ["gps_fix_lost", "few_satellites", "dead_reckoning"]
+    assert [each.kind for each in found.cause] == [
+        "gps_fix_lost",
+        "few_satellites",
+        "dead_reckoning",
+    ]
     assert "UTC, until now (1.0 s)" in verdict(flight, times=LIVE).text
 
 
@@ -89,7 +112,9 @@ def test_verdict_names_the_latest_evidence() -> None:
     assert [each.kind for each in found.cause] == [
         "estimator_fault", "innovation_rejected", "not_fused", "dead_reckoning",
     ]  # fmt: skip
-    assert "Evidence: 13.000 EKF rejects horizontal position; 14.000 EKF stopped fusing" in found.text
+    assert (
+        "Evidence: 13.000 EKF rejects horizontal position; 14.000 EKF stopped fusing" in found.text
+    )
     assert "15.000 dead reckoning" in found.text
 
 
@@ -99,7 +124,9 @@ def test_verdict_on_ended_fault_includes_start_and_end() -> None:
     lose_gps(flight)
     flight.wait(1.0).send()
     found = verdict(flight)
-    assert has_words(found.text, "not usable", "xy and vxy", "16.000", "18.000 s since boot", "2.0 s", "Evidence")
+    assert has_words(
+        found.text, "not usable", "xy and vxy", "16.000", "18.000 s since boot", "2.0 s", "Evidence"
+    )
     assert found.begin is not None
     assert found.end is not None
     assert (found.usable, found.begin.time, found.end.time) == (False, flight.now - 2.0, flight.now)
@@ -123,7 +150,8 @@ def test_live_verdict_begins_with_what_is_wrong_now() -> None:
     assert found.text.startswith("position valid now, but failsafe flags: motor failure from ")
     assert "Also" in found.text
     assert "xy and vxy not valid" in found.text
-    assert verdict(flight).text.startswith("not usable: xy and vxy not valid")  # in a file, the worst one
+    # in a file, the worst one
+    assert verdict(flight).text.startswith("not usable: xy and vxy not valid")
 
 
 @pytest.mark.parametrize(
@@ -147,7 +175,10 @@ def test_sensor_failures_and_critical_texts_in_flight_are_faults(
         found = verdict(flight, times=times)
         assert found.usable
         assert found.text.startswith(f'position valid {since}, but PX4: "{text}" at ') == is_fault
-        assert ("Evidence" in found.text, found.text.startswith("no faults")) == (False, not is_fault)
+        assert ("Evidence" in found.text, found.text.startswith("no faults")) == (
+            False,
+            not is_fault,
+        )
 
 
 def test_silence_lasts_from_the_last_message() -> None:
@@ -167,7 +198,9 @@ def test_verdict_reports_absence_of_faults() -> None:
     assert (found.usable, found.stories) == (True, ())
     assert has_words(found.text, "no faults", "105 s")
     assert has_words(verdict(flight, times=LIVE).text, "no faults", "history")
-    assert all("position validity" not in verdict(flight, times=times).text for times in (Times(), LIVE))
+    assert all(
+        "position validity" not in verdict(flight, times=times).text for times in (Times(), LIVE)
+    )
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
     assert (unknown.usable, "the data has no position validity" in unknown.text) == (None, True)
     assert "satellite" not in unknown.text
@@ -240,11 +273,22 @@ def test_verdict_quotes_px4() -> None:
     flight.wait(5.0).send(xy_valid=False)
     found = verdict(flight)
     assert has_words(
-        found.text, "not usable", "xy not valid", "30.000 s since boot", "until the end", "5.2 s", "Evidence"
+        found.text,
+        "not usable",
+        "xy not valid",
+        "30.000 s since boot",
+        "until the end",
+        "5.2 s",
+        "Evidence",
     )
     evidence = found.text.partition("Evidence")[2]
     assert has_words(
-        evidence, "29.000", 'PX4: "GNSS fix too low"', "dead reckoning", "30.200", 'PX4: "Failsafe activated"'
+        evidence,
+        "29.000",
+        'PX4: "GNSS fix too low"',
+        "dead reckoning",
+        "30.200",
+        'PX4: "Failsafe activated"',
     )
     assert has_words(evidence, "Failsafe activated", "Not in the data", "vehicle_gps_position")
     assert "No manual control input" not in found.text
@@ -283,7 +327,9 @@ def test_missing_global_reference_of_a_whole_flight_is_no_fault() -> None:
     assert (found.usable, found.stories, found.begin, found.end) == (True, (), None, None)
     invalid = replace(condition_of("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
-    assert has_words(found.text, "not usable", "xy not valid", "first message", "until the end", "62.0 s")
+    assert has_words(
+        found.text, "not usable", "xy not valid", "first message", "until the end", "62.0 s"
+    )
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
     assert (found.usable, len(found.stories)) == (False, 1)
 
@@ -301,7 +347,9 @@ def test_missing_global_reference_of_a_whole_flight_is_no_fault() -> None:
         ([lambda f: f.send(dead_reckoning=True), lambda f: f.battery(2)], "battery "),
     ],
 )  # fmt: skip
-def test_state_and_verdict_name_the_same_cause(steps: list[Callable[[Flight], object]], cause: str) -> None:
+def test_state_and_verdict_name_the_same_cause(
+    steps: list[Callable[[Flight], object]], cause: str
+) -> None:
     """An active invalid position is named before the failsafe, and a gone vehicle before both."""
     flight = Flight()
     flight.send()
@@ -323,11 +371,15 @@ def test_verdict_is_limited_to_vehicle_and_time() -> None:
     other: list[Any] = [replace(each, vehicle="2") for each in events]
     topics = ["vehicle_local_position"]
     assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).stories == ()
-    assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).stories
+    assert verdict_of(
+        "1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now
+    ).stories
     assert has_words(verdict(flight, at=flight.now - 30).text, "no fault at that time", "nearest")
     assert verdict(flight, at=flight.now - 30).usable is True
     found = verdict(flight, at=107.0)
-    assert has_words(found.text, "not usable", "xy and vxy not valid", "16.000", "18.000 s since boot")
+    assert has_words(
+        found.text, "not usable", "xy and vxy not valid", "16.000", "18.000 s since boot"
+    )
     assert since_boot(found.begin, found.end) == [16.0, 18.0]
 
 
@@ -339,8 +391,16 @@ def test_verdict_on_never_valid_vehicle_quotes_px4() -> None:
     flight.wait(30.0).send(xy_valid=False)
     px4_text(flight, "Preflight Fail: ekf2 missing data", 2)
     found = verdict(flight)
-    assert has_words(found.text, "not usable", "xy not valid", "first message", "until the end", "30.0 s")
-    assert has_words(found.text, "Evidence", "40.000", 'PX4: "Preflight Fail: ekf2 missing data"', "Not in the data")
+    assert has_words(
+        found.text, "not usable", "xy not valid", "first message", "until the end", "30.0 s"
+    )
+    assert has_words(
+        found.text,
+        "Evidence",
+        "40.000",
+        'PX4: "Preflight Fail: ekf2 missing data"',
+        "Not in the data",
+    )
     assert "GPS Vertical Pos Drift" not in found.text
     assert (found.usable, found.begin, since_boot(*found.cause)[-1]) == (False, None, 40.0)
 
@@ -353,7 +413,15 @@ def test_verdict_counts_equal_faults() -> None:
         flight.wait(20.0).send(xy_valid=False)
         flight.wait(seconds).send()
     found = verdict(flight)
-    assert has_words(found.text, "not usable", "xy not valid", "one of 3", "51.000", "54.000 s since boot", "3.0 s")
+    assert has_words(
+        found.text,
+        "not usable",
+        "xy not valid",
+        "one of 3",
+        "51.000",
+        "54.000 s since boot",
+        "3.0 s",
+    )
     assert since_boot(found.begin, found.end) == [51.0, 54.0]
     assert [each.spans[0].kind for each in found.stories] == ["xy_invalid"] * 3
 
@@ -400,12 +468,17 @@ def test_simultaneous_px4_texts_are_separate_events() -> None:
     ]  # fmt: skip
     assert len({each.identity for each in read.events}) == len(read.events) == 3
     held = list(read.vehicles["1"].held)
-    found = verdict_of("1", read.events, held, topics=read.vehicles["1"].topics, times=LIVE, end=read.now)
+    found = verdict_of(
+        "1", read.events, held, topics=read.vehicles["1"].topics, times=LIVE, end=read.now
+    )
     assert 'PX4: "invalid setpoints", PX4: "Failsafe: blind land"' in found.text
 
 
 WILD: list[tuple[str, dict[str, Any]]] = [
-    *((VLP, {flag: False}) for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "xy_global", "z_global")),
+    *(
+        (VLP, {flag: False})
+        for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "xy_global", "z_global")
+    ),
     (VLP, {"dead_reckoning": True}),
     (VLP, {"xy_valid": False, "z_valid": False, "dead_reckoning": True}),
     (VLP, {"ref_lat": -33.0, "ref_lon": 151.0, "ref_timestamp": 9}),
@@ -460,7 +533,9 @@ def test_two_wrong_messages_are_a_fault(topic: str, wild: dict[str, Any]) -> Non
             if number == 10:
                 began = flight.now
             for name, fields in SOUND.items():
-                flight.send(name, **fields | (wild if name == topic and 10 <= number < 10 + count else {}))
+                flight.send(
+                    name, **fields | (wild if name == topic and 10 <= number < 10 + count else {})
+                )
             flight.wait(pause)
         found = verdict(flight)
         assert found.begin is not None, found.text
@@ -480,7 +555,9 @@ def test_wild_message_is_no_evidence() -> None:
     assert found.cause == ()
 
 
-@pytest.mark.parametrize("wild", [{"xy_valid": False}, {"ref_lat": -33.0, "ref_timestamp": 9}, {"z_valid": False}])
+@pytest.mark.parametrize(
+    "wild", [{"xy_valid": False}, {"ref_lat": -33.0, "ref_timestamp": 9}, {"z_valid": False}]
+)
 def test_one_wild_message_of_a_log_is_no_fault(tmp_path: Path, wild: dict[str, Any]) -> None:
     """In a log at 50 Hz, one wild message is no fault, unlike two of them."""
     for count in (1, 2):
@@ -491,7 +568,9 @@ def test_one_wild_message_of_a_log_is_no_fault(tmp_path: Path, wild: dict[str, A
             writer.add(VLP, message(1_000_000 + 20_000 * number, **fields))
         read = read_file_events(writer.write(tmp_path / f"{count}.ulg"))
         topics = read.event_log.vehicles["1"].topics
-        found = verdict_of("1", read.event_log.events, topics=topics, times=read.times, end=read.end)
+        found = verdict_of(
+            "1", read.event_log.events, topics=topics, times=read.times, end=read.end
+        )
         assert len(read.event_log.events) == 2
         assert found.text.startswith("no faults") == (count == 1)
 
@@ -501,7 +580,16 @@ def reset_and_switch(*before: Event) -> list[Event]:
     return [
         *before,
         Event("1", "ekf_changed", "once", "watch", "primary EKF changed from 0 to 1", 100.0),
-        Event("1", "reset", "once", "watch", "reset of xy by 31.9 m", 101.0, names=("xy",), numbers={"north": 31.9}),
+        Event(
+            "1",
+            "reset",
+            "once",
+            "watch",
+            "reset of xy by 31.9 m",
+            101.0,
+            names=("xy",),
+            numbers={"north": 31.9},
+        ),
     ]
 
 
@@ -509,10 +597,22 @@ OVERLOAD = [
     Event(ALL, "overload", "begin", "watch", "reader overloaded", 50.0),
     Event(ALL, "overload", "end", "info", "reader caught up", 55.0),
 ]
-NO_ORIGIN = [Event("1", "xy_not_global", "begin", "watch", "xy has no global reference", 20.0, names=("xy_global",))]
+NO_ORIGIN = [
+    Event(
+        "1",
+        "xy_not_global",
+        "begin",
+        "watch",
+        "xy has no global reference",
+        20.0,
+        names=("xy_global",),
+    )
+]
 
 
-@pytest.mark.parametrize("before", [[], OVERLOAD, NO_ORIGIN], ids=["alone", "overload", "no_origin"])
+@pytest.mark.parametrize(
+    "before", [[], OVERLOAD, NO_ORIGIN], ids=["alone", "overload", "no_origin"]
+)
 @pytest.mark.parametrize("times", [Times(), LIVE], ids=["file", "live"])
 def test_what_changed_the_estimate_leads(before: list[Event], times: Times) -> None:
     """A reset leads, with the change of the EKF as evidence, beside an ended fault and a lasting minor condition."""
@@ -529,7 +629,11 @@ def test_large_reset_in_flight_makes_the_vehicle_unusable() -> None:
 
     The text names only the quantities that moved that far.
     """
-    for state, invalid, usable in ((ARMED, False, False), (DISARMED, False, True), (ARMED, True, False)):
+    for state, invalid, usable in (
+        (ARMED, False, False),
+        (DISARMED, False, True),
+        (ARMED, True, False),
+    ):
         flight = Flight()
         flight.status(state)
         flight.fly(2)
@@ -543,11 +647,17 @@ def test_large_reset_in_flight_makes_the_vehicle_unusable() -> None:
         found = verdict(flight)
         assert found.usable is usable
         if state == ARMED and not invalid:
-            assert found.text.startswith("not usable: reset of xy by 20.0 m (20.0 north, 0.0 east) at ")
+            assert found.text.startswith(
+                "not usable: reset of xy by 20.0 m (20.0 north, 0.0 east) at "
+            )
 
 
-@pytest.mark.parametrize(("tenths", "severity"), [(5, "watch"), (9, "watch"), (12, "bad"), (25, "bad")])
-def test_large_reset_is_a_recovery_for_a_second_after_an_invalid_estimate(tenths: int, severity: str) -> None:
+@pytest.mark.parametrize(
+    ("tenths", "severity"), [(5, "watch"), (9, "watch"), (12, "bad"), (25, "bad")]
+)
+def test_large_reset_is_a_recovery_for_a_second_after_an_invalid_estimate(
+    tenths: int, severity: str
+) -> None:
     """A reset of 10 m that follows the end of an invalid estimate within a second recovers it; a later one is bad."""
     flight = Flight()
     flight.status(ARMED)
@@ -563,7 +673,9 @@ def test_large_reset_is_a_recovery_for_a_second_after_an_invalid_estimate(tenths
 
 
 @pytest.mark.parametrize(("distance", "is_named"), [(20.0, True), (9.0, False)])
-def test_large_correction_at_the_end_of_a_fault_is_named(distance: float, *, is_named: bool) -> None:
+def test_large_correction_at_the_end_of_a_fault_is_named(
+    distance: float, *, is_named: bool
+) -> None:
     """A reset of 10 m or more that recovers an invalid estimate is no fault, but in the verdict, by its size."""
     flight = Flight()
     flight.status(ARMED)
@@ -653,15 +765,23 @@ def test_evidence_is_nearest_in_kind_before_nearest_in_time() -> None:
     flight.send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_baro_fault=False)
     flight.fly(1)
     flight.send("estimator_status_flags", instance=0, reject_hor_pos=True, cs_baro_fault=False)
-    flight.wait(1.0).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_baro_fault=False)
+    flight.wait(1.0).send(
+        "estimator_status_flags", instance=0, reject_hor_pos=False, cs_baro_fault=False
+    )
     flight.wait(1.0)
     px4_text(flight, "Compass 0 inconsistent")
     for words in ("GPS 0 lost", "Airspeed low", "Battery hot", "Wind high"):
         flight.wait(1.0)
         px4_text(flight, words)
-    flight.wait(1.0).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True)
-    flight.wait(0.1).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=False)
-    flight.wait(0.1).send("estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True)
+    flight.wait(1.0).send(
+        "estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True
+    )
+    flight.wait(0.1).send(
+        "estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=False
+    )
+    flight.wait(0.1).send(
+        "estimator_status_flags", instance=0, reject_hor_pos=False, cs_mag_fault=True
+    )
     found = verdict(flight, times=LIVE)
     assert found.text.startswith("position valid now, but EKF fault: magnetometer")
     evidence = found.text.partition("Evidence")[2].partition("Also")[0]
@@ -678,7 +798,9 @@ def test_live_verdict_tells_since_when() -> None:
     assert known.first == pytest.approx(100.1)
     sound = verdict_of("1", [], topics=known.topics, times=LIVE, end=flight.now, since=known.first)
     assert sound.text == "no faults since 00:01:40.1 UTC (29.9 s)"
-    found = verdict_of("1", reset_and_switch(), topics=known.topics, times=LIVE, end=flight.now, since=known.first)
+    found = verdict_of(
+        "1", reset_and_switch(), topics=known.topics, times=LIVE, end=flight.now, since=known.first
+    )
     assert found.text.startswith("position valid since 00:01:40.1 UTC, but reset of xy by 31.9 m ")
 
 
@@ -694,5 +816,9 @@ def test_live_verdict_excludes_the_time_without_a_position() -> None:
     (known,) = report_of(flight.event_log, "s", "h", flight.now, within=60).vehicles.values()
     assert known.first == 110.0
     events = flight.event_log.events
-    found = verdict_of("1", events, topics=known.topics, times=LIVE, end=flight.now, since=known.first)
-    assert found.text.startswith('position valid since 00:01:55.0 UTC, but PX4: "Baro sensor #0 failure: Timeout" at ')
+    found = verdict_of(
+        "1", events, topics=known.topics, times=LIVE, end=flight.now, since=known.first
+    )
+    assert found.text.startswith(
+        'position valid since 00:01:55.0 UTC, but PX4: "Baro sensor #0 failure: Timeout" at '
+    )

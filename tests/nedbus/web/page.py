@@ -57,10 +57,14 @@ class SimulatedFleet:
         stamp = round((self.time - NOON) * 1e6) + 1_000_000
         other = BY_TOPIC[address.topic]
         if other is DEFAULT:
-            given = {name: value for name, value in {**VALID, **fields}.items() if value is not None}
+            given = {
+                name: value for name, value in {**VALID, **fields}.items() if value is not None
+            }
             received = message(stamp, **given)
         else:
-            known = {name: value for name, value in fields.items() if name in other.model.model_fields}
+            known = {
+                name: value for name, value in fields.items() if name in other.model.model_fields
+            }
             received = other.model.model_validate({"timestamp": stamp, **known})
         sample = Sample(received, address, round(self.time * 1e9))
         self.monitor.add(sample, received=sample.received)
@@ -89,13 +93,17 @@ class SimulatedFleet:
         publishers = None if alive is None else Counter(alive)
         arrival = {
             address: stream_state(
-                health, publishers=None if publishers is None else publishers[address], connected=not link
+                health,
+                publishers=None if publishers is None else publishers[address],
+                connected=not link,
             ).name
             for address, health in healths.items()
         }
         self.event_log.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.event_log.state(name, self.time) for name in self.event_log.vehicles}
-        self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=behind), states, logs, fusion)
+        self.fleet.update(
+            Snapshot(self.time, healths, publishers, link=link, behind=behind), states, logs, fusion
+        )
         return self.fleet.snapshot
 
     def vehicle(self, vehicle: str = "wing", **options: Any) -> VehicleView:
@@ -104,7 +112,11 @@ class SimulatedFleet:
         return row
 
     def view(self, address: Address = WING, **options: Any) -> StreamView:
-        return next(view for view in self.vehicle(address.vehicle, **options).streams if view.address == address)
+        return next(
+            view
+            for view in self.vehicle(address.vehicle, **options).streams
+            if view.address == address
+        )
 
     def stream(self, address: Address = WING) -> PageStream:
         return self.fleet.streams[address]
@@ -125,7 +137,9 @@ def addresses_of(snapshot: FleetSnapshot) -> list[Address]:
     return sorted(view.address for row in snapshot.vehicles for view in row.streams)
 
 
-def write_flight(folder: Path, topics: Mapping[str, Callable[[float], Mapping[str, object]]], *, seconds: int) -> Path:
+def write_flight(
+    folder: Path, topics: Mapping[str, Callable[[float], Mapping[str, object]]], *, seconds: int
+) -> Path:
     """Record vehicle "wing" at 10 Hz; `topics`: the fields of each topic as a function of time [s]."""
     file = folder / "flight.mcap"
     with RecordingWriter(file) as writer:
@@ -134,9 +148,15 @@ def write_flight(folder: Path, topics: Mapping[str, Callable[[float], Mapping[st
             for topic, fields in topics.items():
                 definition = BY_TOPIC[topic]
                 given = {**(VALID if definition is DEFAULT else {}), **fields(time / 1e6)}
-                array = arrays_of(definition).of([definition.model(timestamp=1_000_000 + time, **given)])
+                array = arrays_of(definition).of(
+                    [definition.model(timestamp=1_000_000 + time, **given)]
+                )
                 writer.write(
-                    array, definition, [(Address("wing", topic), Provenance("sim"))], logged=stamps, published=stamps
+                    array,
+                    definition,
+                    [(Address("wing", topic), Provenance("sim"))],
+                    logged=stamps,
+                    published=stamps,
                 )
     return file
 
@@ -148,7 +168,9 @@ def models_of(document: Document, kind: type[Model]) -> list[Any]:
 class RenderedPage:
     """The document of a viewer as the user sees it; `query`: the query string of its URL."""
 
-    def __init__(self, fleet: Fleet, timeline: EventTimeline, *, query: str = "", **options: Any) -> None:
+    def __init__(
+        self, fleet: Fleet, timeline: EventTimeline, *, query: str = "", **options: Any
+    ) -> None:
         self.document = Document()
         arguments = {name: [value.encode()] for name, value in parse_qsl(query.removeprefix("?"))}
         request = SimpleNamespace(request=SimpleNamespace(arguments=arguments))
@@ -177,7 +199,9 @@ class RenderedPage:
 
     def panel(self, name: str) -> str:
         """Return the HTML of one panel of the page."""
-        return next(str(div.text) for div in models_of(self.document, Div) if name in div.css_classes)
+        return next(
+            str(div.text) for div in models_of(self.document, Div) if name in div.css_classes
+        )
 
     def elements(self, panel: str, name: str) -> list[ET.Element]:
         """Return the elements of a panel with this tag or CSS class; the panel must be well-formed."""
@@ -260,7 +284,9 @@ class RenderedPage:
         return next(each for each in sources if column in each.data)
 
 
-def flying(publisher: nedbus.Publisher, fields: Mapping[str, object]) -> AbstractContextManager[None]:
+def flying(
+    publisher: nedbus.Publisher, fields: Mapping[str, object]
+) -> AbstractContextManager[None]:
     """Publish at 50 Hz with the current contents of `fields`."""
     numbers = count(1)
     return repeating(lambda: publisher.publish(message(20_000 * next(numbers), **fields)))

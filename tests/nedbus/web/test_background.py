@@ -40,15 +40,28 @@ def drawn(background: Background) -> Any:
         ({"type": "MultiLineString", "coordinates": [RING, RING]}, [4, 4]),
         ({"type": "Polygon", "coordinates": [RING, RING]}, [4, 4]),
         ({"type": "MultiPolygon", "coordinates": [[RING], [RING, RING]]}, [4, 4, 4]),
-        ({"type": "GeometryCollection", "geometries": [{"type": "Point", "coordinates": RING[0]}]}, [1]),
-        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": None}, FEATURE]}, [4]),
+        (
+            {
+                "type": "GeometryCollection",
+                "geometries": [{"type": "Point", "coordinates": RING[0]}],
+            },
+            [1],
+        ),
+        (
+            {
+                "type": "FeatureCollection",
+                "features": [{"type": "Feature", "geometry": None}, FEATURE],
+            },
+            [4],
+        ),
     ],
     ids=lambda value: value.get("type") if isinstance(value, dict) else "",
 )
 def test_every_geojson_geometry_is_drawn(tmp_path: Path, shape: object, lengths: list[int]) -> None:
     """Each GeoJSON geometry becomes lines and points in metres from the common origin."""
     file = tmp_path / "field.geojson"
-    file.write_text(json.dumps(shape), encoding="utf-8-sig")  # with a byte order mark, as Windows editors write
+    # with a byte order mark, as Windows editors write
+    file.write_text(json.dumps(shape), encoding="utf-8-sig")
     lines = drawn(Background(file)).data_source.data
     assert [len(each) for each in lines["east"]] == lengths
     assert (lines["east"][0][0], lines["north"][0][0]) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -148,7 +161,9 @@ def test_invalid_geojson_raises(tmp_path: Path, content: str | None, reason: str
         (WORLD, "--map"),
     ],
 )
-def test_image_without_valid_world_file_raises(tmp_path: Path, world: str | None, reason: str) -> None:
+def test_image_without_valid_world_file_raises(
+    tmp_path: Path, world: str | None, reason: str
+) -> None:
     """An image needs a world file in degrees, north up; the error names the GDAL command that creates one."""
     file = write_image(tmp_path, world=world)
     if world == WORLD:

@@ -41,7 +41,9 @@ def web(run_nedbus: Start) -> Web:
 
     def serve(port: int, *arguments: str) -> Process:
         process = run_nedbus("web", "--http", f"127.0.0.1:{port}", *arguments)
-        wait_for(lambda: "open http" in process.err or process.popen.poll() is not None, what="the page")
+        wait_for(
+            lambda: "open http" in process.err or process.popen.poll() is not None, what="the page"
+        )
         assert process.popen.poll() is None, process.err
         return process
 
@@ -84,13 +86,17 @@ def until_states(page: Tab, **states: str) -> None:
 
 
 def until_order(page: Tab, *vehicles: str) -> None:
-    until(lambda: [row["vehicle"] for row in page.listed] == list(vehicles), f"the order {vehicles}")
+    until(
+        lambda: [row["vehicle"] for row in page.listed] == list(vehicles), f"the order {vehicles}"
+    )
 
 
 # Display
 
 
-def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Start, endpoint: str) -> None:
+def test_simulated_flight_fills_every_panel(
+    url: str, tab: Open, run_nedbus: Start, endpoint: str
+) -> None:
     """A simulated flight fills counts, row, map with track, numbers, and plots with ground truth.
 
     The simulator's second EKF instance does not affect them.
@@ -116,7 +122,11 @@ def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Sta
     page.wait_for_text("vehicle_local_position_groundtruth")
     canvases = page.page.locator(".bk-Figure").all()
     assert len(canvases) == 5
-    assert all(box["width"] > 100 and box["height"] > 50 for each in canvases if (box := each.bounding_box()))
+    assert all(
+        box["width"] > 100 and box["height"] > 50
+        for each in canvases
+        if (box := each.bounding_box())
+    )
 
 
 def points(tracks: dict[str, list[Any]], kind: str) -> list[tuple[float, float]]:
@@ -131,7 +141,11 @@ SIZES = ((390, 844), (1280, 800), (1920, 1080))
 @pytest.fixture
 def fifty_vehicles(bus: nedbus.Bus) -> Iterator[None]:
     """Publish 50 vehicles at 1 Hz each; three of them have faults."""
-    flags: dict[int, dict[str, object]] = {7: {"xy_valid": False}, 23: {"dead_reckoning": True}, 42: {"z_valid": False}}
+    flags: dict[int, dict[str, object]] = {
+        7: {"xy_valid": False},
+        23: {"dead_reckoning": True},
+        42: {"z_valid": False},
+    }
     publishers = [bus.publisher(VLP, vehicle=f"uav-{number}") for number in range(1, 51)]
     ticks = count(1)
 
@@ -156,13 +170,18 @@ def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: st
     """
     page = tab(width=SIZES[0][0], height=SIZES[0][1])
     page.open(f"{url}/?theme={theme}")
-    until(lambda: [row["grade"] for row in page.listed] == ["bad"] * 2 + ["watch"] + ["ok"] * 47, "all vehicles")
+    until(
+        lambda: [row["grade"] for row in page.listed] == ["bad"] * 2 + ["watch"] + ["ok"] * 47,
+        "all vehicles",
+    )
     until(lambda: page.page.title() == "(2 bad) nedbus", "the title")
     names = [row["vehicle"] for row in page.listed]
     others = [f"uav-{number}" for number in range(1, 51) if number not in (7, 23, 42)]
     assert names == ["uav-7", "uav-42", "uav-23", *others]
     page.page.locator(VEHICLE).first.click()
-    until(lambda: page.chosen == ["uav-7"] and "xy not valid from" in page.panel("why"), "its verdict")
+    until(
+        lambda: page.chosen == ["uav-7"] and "xy not valid from" in page.panel("why"), "its verdict"
+    )
     page.page.locator("[data-do=streams]").click()
     for width, height in SIZES:
         page.page.set_viewport_size({"width": width, "height": height})
@@ -183,7 +202,10 @@ def test_phone_shows_a_single_column(url: str, tab: Open, fly: Fly) -> None:
     until(lambda: list(page.states) == ["wing"], "the vehicle")
     assert page.page.evaluate("innerWidth") == 390
     wait_for_none(page.layout_problems, "phone")
-    lefts = [page.page.locator(f"div.{name}").first.bounding_box() for name in ("list", "map", "nums", "plots")]
+    lefts = [
+        page.page.locator(f"div.{name}").first.bounding_box()
+        for name in ("list", "map", "nums", "plots")
+    ]
     assert all(box is not None and box["x"] < 20 for box in lefts), lefts
 
 
@@ -201,7 +223,11 @@ def test_cut_off_text_has_a_visible_hint(web: Web, tab: Open, tmp_path: Path) ->
     page.open(f"http://127.0.0.1:{port}/?time=15")
     until_states(page, wing="xy not valid")
     until(
-        lambda: [(cell.text, cell.is_cut) for cell in page.cells(".row > .mode")[1:]] == [("Offboard", False)], "mode"
+        lambda: (
+            [(cell.text, cell.is_cut) for cell in page.cells(".row > .mode")[1:]]
+            == [("Offboard", False)]
+        ),
+        "mode",
     )
     page.page.set_viewport_size({"width": 1280, "height": 800})
     page.page.locator("[data-do=streams]").click()
@@ -233,15 +259,22 @@ def overlapping_labels(page: Tab) -> list[str]:
         f"{one[0]} on {other[0]}"
         for index, one in enumerate(labels)
         for other in labels[:index]
-        if min(one[3], other[3]) - max(one[1], other[1]) > 1 and min(one[4], other[4]) - max(one[2], other[2]) > 1
+        if min(one[3], other[3]) - max(one[1], other[1]) > 1
+        and min(one[4], other[4]) - max(one[2], other[2]) > 1
     ] or ([] if len(labels) > 2 else ["too few labels"])
 
 
-def test_hostile_text_is_escaped(fly: Fly, tab: Open, zenoh_session: Session, endpoint: str, tmp_path: Path) -> None:
+def test_hostile_text_is_escaped(
+    fly: Fly, tab: Open, zenoh_session: Session, endpoint: str, tmp_path: Path
+) -> None:
     """HTML in a peer's rejection reason or in a GeoJSON file is shown as text, not as elements."""
     field = tmp_path / f"{HOSTILE[:24].replace('/', '')}.geojson"
     line = {"type": "LineString", "coordinates": [[8.545, 47.397], [8.546, 47.398]]}
-    field.write_text(json.dumps({"type": "Feature", "properties": {"name": HOSTILE}, "geometry": line, "id": HOSTILE}))
+    field.write_text(
+        json.dumps(
+            {"type": "Feature", "properties": {"name": HOSTILE}, "geometry": line, "id": HOSTILE}
+        )
+    )
     fly("wing", xy_global=True, ref_lat=47.397, ref_lon=8.545)
     with serving_live(endpoint, PageOptions("127.0.0.1", 0, background=field)) as url:
         page = tab()
@@ -314,7 +347,9 @@ def test_viewers_are_independent(url: str, tab: Open, fly: Fly, zenoh_session: S
     until(lambda: first.query == {"vehicle": "b"}, "the current time")
     until(lambda: second.query == {"vehicle": "a"}, "the other page to be unchanged")
     received: set[str] = set()
-    watcher = zenoh_session.declare_subscriber("**", lambda sample: received.add(str(sample.key_expr)))
+    watcher = zenoh_session.declare_subscriber(
+        "**", lambda sample: received.add(str(sample.key_expr))
+    )
     assert second.page.evaluate(
         """() => {
           for (const model of Bokeh.documents[0].all_models) {
@@ -336,7 +371,9 @@ def test_viewers_are_independent(url: str, tab: Open, fly: Fly, zenoh_session: S
 # Failures
 
 
-def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly: Fly, endpoint: str) -> None:
+def test_page_reconnects_after_a_server_restart(
+    web: Web, browser: Browser, fly: Fly, endpoint: str
+) -> None:
     """When `nedbus web` is killed, the page shows a red bar, and reloads once the server is back."""
     fly("wing")
     port = free_port()
@@ -348,10 +385,13 @@ def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly:
         process.kill()
         page.wait_for_text("nedbus web has not responded since")
         web(port, "-c", endpoint)
-        until(lambda: not page.shows("nedbus web has not responded since"), "the page to load again")
+        until(
+            lambda: not page.shows("nedbus web has not responded since"), "the page to load again"
+        )
         until_states(page, wing="ok")
         assert all(
-            "ERR_CONNECTION" in error or "WebSocket" in error or "bokeh" in error for error in page.console_errors
+            "ERR_CONNECTION" in error or "WebSocket" in error or "bokeh" in error
+            for error in page.console_errors
         )
 
 
@@ -361,7 +401,14 @@ def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly:
 def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_path: Path) -> None:
     """Slider, pause, speed, keys and events control the playback; the page shows the state at the playback position."""
     port = free_port()
-    web(port, str(write_flight(tmp_path, {VLP: lambda time: {"x": time, "xy_valid": time < 60}}, seconds=120)))
+    web(
+        port,
+        str(
+            write_flight(
+                tmp_path, {VLP: lambda time: {"x": time, "xy_valid": time < 60}}, seconds=120
+            )
+        ),
+    )
     page = tab(width=1280, height=800)
     page.open(f"http://127.0.0.1:{port}")
     page.wait_for_text("flight.mcap")
@@ -396,7 +443,8 @@ def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_p
     until(lambda: time() == pytest.approx(60, abs=0.1), "the moment of the event")
     until_states(page, wing="xy not valid")
     until(lambda: "time" in page.query, "the URL")
-    page.page.get_by_text("flight.mcap").click()  # moves the focus from the button, so that keys reach the page
+    # moves the focus from the button, so that keys reach the page
+    page.page.get_by_text("flight.mcap").click()
     for key, seconds in (("ArrowLeft", 59), ("Shift+ArrowLeft", 49), ("ArrowRight", 50), ("n", 60)):
         page.page.keyboard.press(key)
         until(lambda seconds=seconds: time() == pytest.approx(seconds, abs=0.1), key)  # type: ignore[misc]  # bound here

@@ -10,7 +10,9 @@ from tests.nedbus.web.page import SimulatedFleet, sim
 __all__ = ["sim"]  # a fixture
 
 
-def test_cached_stories_and_verdicts_are_bounded(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_stories_and_verdicts_are_bounded(
+    sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Moments and names that viewers request are cached up to a limit, although no event ends their validity."""
     monkeypatch.setattr("nedbus.web.event_timeline._MAX_CACHED", 10)
     timeline = EventTimeline(sim.event_log)
@@ -20,7 +22,10 @@ def test_cached_stories_and_verdicts_are_bounded(sim: SimulatedFleet, monkeypatc
     end = sim.time
     for number in range(100):
         moment = end - 0.1 * number
-        story, verdict = timeline.story("wing", end, moment, ()), timeline.verdict("wing", end, moment)
+        story, verdict = (
+            timeline.story("wing", end, moment, ()),
+            timeline.verdict("wing", end, moment),
+        )
         assert timeline.verdict(f"unknown{number}", end).stories == ()
         assert story == timeline.story("wing", end, moment, ())
         assert verdict is timeline.verdict("wing", end, moment), "the latest one is cached"

@@ -32,7 +32,9 @@ GROUND_TRUTH = Address("wing", TRUTH)
 
 
 def column(stream: PageStream, name: str) -> list[float]:
-    values: list[float] = stream.minute.points(0, stream.minute.written)[:, COLUMNS.index(name)].tolist()
+    values: list[float] = stream.minute.points(0, stream.minute.written)[
+        :, COLUMNS.index(name)
+    ].tolist()
     return values
 
 
@@ -46,7 +48,12 @@ def column(stream: PageStream, name: str) -> list[float]:
         ({"xy_valid": False}, "bad", "xy not valid", "xy invalid"),
         ({"z_valid": False, "v_z_valid": False}, "bad", "z not valid", "z vz invalid"),
         ({"dead_reckoning": True}, "watch", "dead reckoning", "dead reckoning"),
-        ({"dead_reckoning": True, "v_xy_valid": False}, "bad", "vxy not valid", "vxy invalid, dead reckoning"),
+        (
+            {"dead_reckoning": True, "v_xy_valid": False},
+            "bad",
+            "vxy not valid",
+            "vxy invalid, dead reckoning",
+        ),
         ({"heading_good_for_control": False}, "ok", "ok", "ok"),
     ],
 )
@@ -55,16 +62,32 @@ def test_state_follows_the_validity_flags(
 ) -> None:
     """A vehicle has the worst state that the flags of its position imply, even in the first message."""
     sim.fly(3, **fields)
-    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (grade, text, description)
+    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (
+        grade,
+        text,
+        description,
+    )
     sim.fly(3)
-    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == ("ok", "ok", "ok")
+    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (
+        "ok",
+        "ok",
+        "ok",
+    )
     began = sim.time + 0.1
     sim.fly(3, **fields)
-    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (grade, text, description)
-    assert sim.vehicle().state.since == (pytest.approx(began, abs=0.01) if fields and grade != "ok" else None)
+    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (
+        grade,
+        text,
+        description,
+    )
+    assert sim.vehicle().state.since == (
+        pytest.approx(began, abs=0.01) if fields and grade != "ok" else None
+    )
 
 
-@pytest.mark.parametrize("other", [SECOND_EKF, GROUND_TRUTH, Address("wing", "estimator_local_position", 0)], ids=str)
+@pytest.mark.parametrize(
+    "other", [SECOND_EKF, GROUND_TRUTH, Address("wing", "estimator_local_position", 0)], ids=str
+)
 @pytest.mark.parametrize("begins_later", [True, False])
 def test_secondary_estimates_do_not_affect_the_vehicle_state(
     sim: SimulatedFleet, other: Address, begins_later: bool
@@ -76,12 +99,20 @@ def test_secondary_estimates_do_not_affect_the_vehicle_state(
     if not begins_later:
         sim.fly(1, other, xy_valid=False)
     sim.fly(2)
-    for fields in ({"xy_valid": False, "dead_reckoning": True}, {"z_valid": False, "v_z_valid": False}):
+    for fields in (
+        {"xy_valid": False, "dead_reckoning": True},
+        {"z_valid": False, "v_z_valid": False},
+    ):
         for _ in range(30):
             sim.fly(0.1)
             sim.add(other, **fields)
         row = sim.vehicle()
-        assert (row.grade, row.state.text, row.state.conditions, row.main.address) == ("ok", "ok", (), WING)
+        assert (row.grade, row.state.text, row.state.conditions, row.main.address) == (
+            "ok",
+            "ok",
+            (),
+            WING,
+        )
         assert "invalid" in describe(sim.view(other))
     sim.fly(30)
     assert sim.view(other, alive=[WING]).state.name == "gone"
@@ -105,7 +136,10 @@ def test_overloaded_page_does_not_report_vehicles_as_silent(sim: SimulatedFleet)
     for _ in range(3):
         sim.time += 0.5
         snapshot = sim.poll(alive=[], is_behind=True, behind="slow")
-    assert {row.vehicle: row.state.text for row in snapshot.vehicles} == {"quad": "xy not valid", "wing": "ok"}
+    assert {row.vehicle: row.state.text for row in snapshot.vehicles} == {
+        "quad": "xy not valid",
+        "wing": "ok",
+    }
     assert sim.event_log.overload is not None
     assert not [event for event in sim.timeline.events if event.kind in ("silent", "gone")]
     sim.time += 6
@@ -179,12 +213,17 @@ def test_gone_vehicle_stays_bad(sim: SimulatedFleet) -> None:
     sim.fly(3, WING, QUAD)
     sim.time += 2100
     sim.fly(3, WING, dead_reckoning=True)
-    assert [(row.vehicle, row.grade) for row in sim.poll(alive=[WING]).vehicles] == [("quad", "bad"), ("wing", "watch")]
+    assert [(row.vehicle, row.grade) for row in sim.poll(alive=[WING]).vehicles] == [
+        ("quad", "bad"),
+        ("wing", "watch"),
+    ]
     sim.fly(30, WING, QUAD)
     assert [row.grade for row in sim.poll(alive=[WING, QUAD]).vehicles] == ["ok", "ok"]
 
 
-def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_above_the_limit_are_only_counted(
+    sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Streams above the limit are counted but not shown, until a shown stream has been silent for a minute."""
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 3)
     names = [Address(f"v{number}", VLP) for number in range(5)]
@@ -201,7 +240,9 @@ def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypat
     assert (addresses_of(snapshot), snapshot.left_out) == ([names[0], *names[2:4]], 2)
 
 
-def test_streams_added_during_an_update_are_counted(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_added_during_an_update_are_counted(
+    sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Streams above the limit that arrive in another thread while the snapshot is updated are counted."""
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
     others = [Address(f"v{number}", VLP) for number in range(2)]
@@ -224,7 +265,9 @@ def test_streams_added_during_an_update_are_counted(sim: SimulatedFleet, monkeyp
     assert sim.poll(alive=[WING, QUAD, *others]).left_out == 2
 
 
-def test_position_replaces_other_streams_at_the_limit(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_position_replaces_other_streams_at_the_limit(
+    sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At the limit, a new position stream replaces a stream of another topic; no other new stream does."""
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
     attitude, battery = Address("wing", "vehicle_attitude"), Address("wing", "battery_status", 0)
@@ -265,7 +308,10 @@ def test_last_position_is_the_last_valid_position(sim: SimulatedFleet) -> None:
     assert sim.vehicle().last_position == "3.0 m north, -4.0 m east, height 5.0 m"
     sim.fly(1, **ZURICH, x=10.0, z=-12.0)
     sim.fly(1, **ZURICH, xy_valid=False, x=77.0)
-    assert sim.vehicle().last_position == "10.0 m north, 0.0 m east, altitude 500.0 m (47.397832, 8.545594)"
+    assert (
+        sim.vehicle().last_position
+        == "10.0 m north, 0.0 m east, altitude 500.0 m (47.397832, 8.545594)"
+    )
 
 
 # Positions and histories
@@ -301,7 +347,17 @@ def test_invalid_position_is_nan_in_the_history(sim: SimulatedFleet) -> None:
     """Invalid values are NaN in the history, each quantity by its own flag; the last valid position is kept."""
     sim.fly(1, x=1.0, y=2.0, z=-3.0, vx=4.0)
     before = sim.stream().valid
-    sim.fly(1, xy_valid=False, z_valid=False, v_xy_valid=False, v_z_valid=False, x=9.0, y=9.0, z=9.0, vx=9.0)
+    sim.fly(
+        1,
+        xy_valid=False,
+        z_valid=False,
+        v_xy_valid=False,
+        v_z_valid=False,
+        x=9.0,
+        y=9.0,
+        z=9.0,
+        vx=9.0,
+    )
     stream = sim.stream()
     for name, value in (("north", 1.0), ("east", 2.0), ("height", 3.0), ("speed", 4.0)):
         assert column(stream, name)[0] == value
@@ -318,7 +374,11 @@ def test_reset_adds_a_gap_to_the_history(sim: SimulatedFleet) -> None:
     broken = norths.index(5.0) - 1
     assert math.isnan(norths[broken])
     assert norths[broken - 1] == 1.0
-    assert [math.isnan(east) for east in stream.long.points(0, stream.long.written)[:, 1]] == [False, True, False]
+    assert [math.isnan(east) for east in stream.long.points(0, stream.long.written)[:, 1]] == [
+        False,
+        True,
+        False,
+    ]
     written = stream.minute.written
     sim.fly(0.1, x=5.0, z=-9.0, xy_reset_counter=1, z_reset_counter=1, delta_z=-9.0)
     sim.fly(0.1, x=5.0, z=-9.0, xy_reset_counter=1, z_reset_counter=1, **ZURICH)
@@ -342,7 +402,9 @@ def test_histories_have_ten_points_and_one_point_per_second(sim: SimulatedFleet)
 
 
 @pytest.mark.parametrize("rate", [50, 250])
-def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(sim: SimulatedFleet, rate: int) -> None:
+def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(
+    sim: SimulatedFleet, rate: int
+) -> None:
     """PX4's simulators change ref_timestamp of the ground truth with each message, but not its origin.
 
     The history still covers a minute without gaps.
@@ -398,10 +460,15 @@ def test_formatted_time_names_its_clock() -> None:
     recorded = EventTimeline(EventLog(), times=Times())
     assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_clock("1", 70.0, 10.0)
-    assert recorded.format_clock(75.25) == "135.2 s since boot, 75.2 s since the start of the recording"
+    assert (
+        recorded.format_clock(75.25)
+        == "135.2 s since boot, 75.2 s since the start of the recording"
+    )
     recorded.times = Times(offsets={"1": NOON})
     recorded.set_clock("1", 70.0, 10.0)
-    assert recorded.format_clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
+    assert (
+        recorded.format_clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
+    )
     live = EventTimeline(EventLog())
     assert live.format_clock(NOON) == "22:13:20.0 UTC"
     several = EventLog()
@@ -414,7 +481,9 @@ def test_formatted_time_names_its_clock() -> None:
 
 def test_stream_shows_the_newest_message_of_the_monitor(sim: SimulatedFleet) -> None:
     """The page keeps no messages; a retained one is as old as its time of sending, and a forgotten stream is gone."""
-    retained = Sample(message(1, **VALID), QUAD, 0, retained=True, _sent=time.time_ns() - 3_600_000_000_000)
+    retained = Sample(
+        message(1, **VALID), QUAD, 0, retained=True, _sent=time.time_ns() - 3_600_000_000_000
+    )
     sim.monitor.add(retained)
     sim.fleet.add(retained, sim.time)
     sim.fly(1, WING)

@@ -28,7 +28,9 @@ PAGE = (Path(__file__).parents[3] / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [line.partition("#")[0].strip() for block in BLOCKS for line in block.splitlines()]
 COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # these need PX4's .msg files
-SERVES, ROS2 = ([each for each in COMMANDS if each.startswith(f"nedbus {name}")] for name in ("serve", "ros2"))
+SERVES, ROS2 = (
+    [each for each in COMMANDS if each.startswith(f"nedbus {name}")] for name in ("serve", "ros2")
+)
 
 
 def arguments_of(command: str, **others: str) -> list[str]:
@@ -46,7 +48,9 @@ def test_every_command_has_a_test() -> None:
 def test_hash_table_matches_the_layouts() -> None:
     """The table of layouts on the page lists each layout with the prefix of its type hash."""
     rows = re.findall(r"^\| `(RIHS01_\w{8})` \| (\S+)", PAGE, re.MULTILINE)
-    assert {layout: start for start, layout in rows} == {layout: type_hash(layout)[:15] for layout in LAYOUTS}
+    assert {layout: start for start, layout in rows} == {
+        layout: type_hash(layout)[:15] for layout in LAYOUTS
+    }
 
 
 @pytest.mark.parametrize("command", SERVES)
@@ -65,7 +69,10 @@ def test_serve_command_publishes_the_vehicle(
     if "mavlink" in command:
         fly("--system", 1)
     else:
-        with closing(open_client((where,), timeout=DEADLINE)) as session, repeating(partial(Px4(session).put, 1)):
+        with (
+            closing(open_client((where,), timeout=DEADLINE)) as session,
+            repeating(partial(Px4(session).put, 1)),
+        ):
             echo.wait()
     assert echo.wait() == 0, echo.err
     assert echo.out.startswith(f"1/{VLP} ")
@@ -76,10 +83,14 @@ def test_ros2_command_reaches_a_node(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, peer: Peer, command: str
 ) -> None:
     """With the bridge command of the page, a ROS 2 node receives a message and lists the topic."""
-    bridge = run_nedbus(*arguments_of(command, **{"tcp/192.168.1.5:7447": endpoint}), "-c", endpoint)
+    bridge = run_nedbus(
+        *arguments_of(command, **{"tcp/192.168.1.5:7447": endpoint}), "-c", endpoint
+    )
     layout = "1.14" if "1.14" in command else "1.16"
     domain = 3 if "--domain 3" in command else 0
-    vehicle, topic = ("7", f"/drone/fmu/out/{VLP}") if "--vehicle 7" in command else ("1", f"/fmu/out/{VLP}")
+    vehicle, topic = (
+        ("7", f"/drone/fmu/out/{VLP}") if "--vehicle 7" in command else ("1", f"/fmu/out/{VLP}")
+    )
     publisher = bus.publisher(VLP, vehicle=vehicle)
     wait_for(lambda: f"-> {topic}" in bridge.err, what="the topic")
     hashed = {"type_hash": "TypeHashNotSupported"} if "--humble" in command else {}

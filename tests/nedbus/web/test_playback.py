@@ -33,7 +33,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         flags = {"xy_valid": not 90 <= time < 120, "xy_reset_counter": int(time >= 150)}
         return {"x": time, "y": math.sin(time) + 4.0 * flags["xy_reset_counter"], **flags}
 
-    file = write_flight(tmp_path_factory.mktemp("web"), dict.fromkeys((VLP, TRUTH), fields), seconds=180)
+    file = write_flight(
+        tmp_path_factory.mktemp("web"), dict.fromkeys((VLP, TRUTH), fields), seconds=180
+    )
     opened = Recording(file)
     wait_for(lambda: opened.length > 179.8, what="the recording")
     return opened
@@ -65,15 +67,28 @@ def shown(player: Player) -> object:
     found = []
     for row in snapshot.vehicles:
         found.append(
-            repr((row.vehicle, row.grade, row.state.text, row.state.since, row.last_position, row.state.conditions))
+            repr(
+                (
+                    row.vehicle,
+                    row.grade,
+                    row.state.text,
+                    row.state.since,
+                    row.last_position,
+                    row.state.conditions,
+                )
+            )
         )
         for view in row.streams:
             points = view.stream.minute.points(0, view.stream.minute.written)
-            found.append(repr((view.address, describe(view), points[points[:, 0] > end - 50_000].tolist())))
+            found.append(
+                repr((view.address, describe(view), points[points[:, 0] > end - 50_000].tolist()))
+            )
     return found
 
 
-def test_recording_plays_at_the_selected_speed(recording: Recording, clock: SimpleNamespace) -> None:
+def test_recording_plays_at_the_selected_speed(
+    recording: Recording, clock: SimpleNamespace
+) -> None:
     """The playback position advances by elapsed time times speed, stops while paused, and ends with the recording."""
     player = Player(recording)
     play, speed, slider = controls_of(player)
@@ -91,11 +106,15 @@ def test_recording_plays_at_the_selected_speed(recording: Recording, clock: Simp
     speed.value = "50"
     run(player, clock, 10)
     assert slider.value == pytest.approx(179.9)
-    assert [(row.vehicle, row.grade) for row in player.fleet.snapshot.vehicles] == [("wing", "watch")], "after a reset"
+    assert [(row.vehicle, row.grade) for row in player.fleet.snapshot.vehicles] == [
+        ("wing", "watch")
+    ], "after a reset"
 
 
 @pytest.mark.parametrize("target", [5.0, 61.0, 100.0, 155.0, 179.9])
-def test_seek_equals_playing_to_that_time(recording: Recording, clock: SimpleNamespace, target: float) -> None:
+def test_seek_equals_playing_to_that_time(
+    recording: Recording, clock: SimpleNamespace, target: float
+) -> None:
     """After a seek, back or forward, the page is the same as if the recording had been played up to that time."""
     player = Player(recording)
     run(player, clock, target)
@@ -113,7 +132,9 @@ def test_seek_equals_playing_to_that_time(recording: Recording, clock: SimpleNam
 
 
 @pytest.mark.parametrize("value", ["inf", "nan", "-5", "1e300", "fast"])
-def test_invalid_speed_from_the_browser_is_ignored(recording: Recording, clock: SimpleNamespace, value: str) -> None:
+def test_invalid_speed_from_the_browser_is_ignored(
+    recording: Recording, clock: SimpleNamespace, value: str
+) -> None:
     """Whatever speed or time a browser sends, the playback position stays within the recording."""
     player = Player(recording)
     _, speed, slider = controls_of(player)
@@ -158,12 +179,16 @@ def test_selecting_an_event_seeks_to_it(recording: Recording) -> None:
     assert [(mark.get("title"), mark.get("class")) for mark in marks] == [
         ("xy not valid", "bad"), ("reset of xy by 4.1 m (0.1 north, 4.1 east)", "watch"),
     ]  # fmt: skip
-    assert float(marks[0].get("style", "").removeprefix("left: ").rstrip("%")) == pytest.approx(50, abs=0.2)
+    assert float(marks[0].get("style", "").removeprefix("left: ").rstrip("%")) == pytest.approx(
+        50, abs=0.2
+    )
     page.send("event", marks[0].get("data-with"))
     assert page.player.time == pytest.approx(90, abs=0.01)
     assert (page.grades, page.document.title) == ({"wing": "bad"}, "(1 bad) flight.mcap")
     (verdict,) = page.texts("why", "verdict")
-    assert verdict.startswith("not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)")
+    assert verdict.startswith(
+        "not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)"
+    )
     assert page.marks["wing"]["north"] == pytest.approx(89.9)
     assert page.plot_range == pytest.approx((30, 90), abs=0.01)
     page.send("next")
@@ -193,9 +218,15 @@ def test_recording_page_lists_verdict_and_faults(recording: Recording) -> None:
     page = open_page(recording)
     (verdict,), (fault, reset) = page.texts("list", "verdict"), page.elements("list", "fault")
     assert verdict.startswith("not usable: xy not valid from 91.000 to 121.000 s since boot")
-    assert (fault.get("data-do"), fault.get("data-with"), fault.findtext("b")) == ("fault", "0", "xy not valid")
+    assert (fault.get("data-do"), fault.get("data-with"), fault.findtext("b")) == (
+        "fault",
+        "0",
+        "xy not valid",
+    )
     assert str(reset.findtext("b")).startswith("reset of xy by 4.1 m")
-    assert page.texts("list", "fault")[0].endswith(" xy not valid from 91.000 to 121.000 s since boot (30.0 s)")
+    assert page.texts("list", "fault")[0].endswith(
+        " xy not valid from 91.000 to 121.000 s since boot (30.0 s)"
+    )
     assert "1.0 s since boot, 0.0 s since the start" in page.panel("head")
     assert page.viewer._clock.args == {"start": 1.0, "clock": "s since boot"}
     assert page.grades == {"wing": "ok"}
@@ -234,7 +265,19 @@ def test_invalid_time_in_the_url_is_ignored(recording: Recording) -> None:
 def test_malformed_actions_leave_the_recording_playable(recording: Recording) -> None:
     """No action, index or time from a browser breaks the page or moves the position outside the recording."""
     page = open_page(recording)
-    for action in ("left", "left:999", "LEFT:", "Left", "right:x", "play", "play", "now", "next", "previous", "event"):
+    for action in (
+        "left",
+        "left:999",
+        "LEFT:",
+        "Left",
+        "right:x",
+        "play",
+        "play",
+        "now",
+        "next",
+        "previous",
+        "event",
+    ):
         values: list[object] = ["", "-1", "99", "x", "NaN", "9" * 200, None, {}, [1], 1e300]
         for value in values:
             page.send(action, value)
@@ -254,7 +297,9 @@ def test_only_timestamps_of_other_topics_are_kept(tmp_path: Path, clock: SimpleN
     assert {type(payload) for address, payload in opened.entries if address.topic != VLP} == {int}
     player = Player(opened)
     run(player, clock, 10)
-    assert Page(opened, player).plot_range == pytest.approx((0, 19.9), abs=0.01), "the plots end with the recording"
+    assert Page(opened, player).plot_range == pytest.approx((0, 19.9), abs=0.01), (
+        "the plots end with the recording"
+    )
     (row,) = player.fleet.snapshot.vehicles
     view = next(view for view in row.streams if view.address.topic == "vehicle_attitude")
     assert view.health.rate == pytest.approx(10, rel=0.1)
@@ -266,7 +311,9 @@ def test_message_without_a_timestamp_is_rejected(tmp_path: Path) -> None:
     file, attitude = tmp_path / "a.mcap", Address("1", "vehicle_attitude")
     messages = to_array([VehicleAttitude(timestamp=number) for number in (1, 2)])
     with RecordingWriter(file) as writer:
-        streams = [(attitude, Provenance("sim", frozenset(missing))) for missing in (["timestamp"], [])]
+        streams = [
+            (attitude, Provenance("sim", frozenset(missing))) for missing in (["timestamp"], [])
+        ]
         writer.write(messages, VehicleAttitude.DEFINITION, streams, logged=(1, 2), published=(1, 2))
     opened = Recording(file)
     wait_for(lambda: len(opened.entries) == 2, what="the recording")
@@ -288,7 +335,9 @@ def test_seek_keeps_silent_vehicles(tmp_path: Path, clock: SimpleNamespace) -> N
         for second in range(120):
             for vehicle in ("here", "silent"):
                 if vehicle == "here" or second < 20:
-                    sent = message(1_000_000 * (second + 1), **VALID | {"x": 7.0, "xy_valid": second < 15})
+                    sent = message(
+                        1_000_000 * (second + 1), **VALID | {"x": 7.0, "xy_valid": second < 15}
+                    )
                     stamps = [1_700_000_000_000_000_000 + second * 10**9]
                     stream = [(Address(vehicle, VLP), Provenance("sim"))]
                     writer.write(to_array([sent]), DEFAULT, stream, logged=stamps, published=stamps)
@@ -311,7 +360,11 @@ def test_open_condition_is_drawn_to_the_end_of_the_recording() -> None:
     timeline = TimelinePlot(DARK, DatetimeTickFormatter())
     timeline.update([begin], {"1": [span]}, ["1"], begin=0.0, end=60.0, now=10.0)
     renderers: list[Any] = list(timeline.figure.renderers)
-    [bars] = [each.data_source.data for each in renderers if isinstance(getattr(each, "glyph", None), HBar)]
+    [bars] = [
+        each.data_source.data
+        for each in renderers
+        if isinstance(getattr(each, "glyph", None), HBar)
+    ]
     assert (list(bars["begin"]), list(bars["end"])) == ([50e3], [60e3])
 
 

@@ -65,7 +65,9 @@ def open_socket(url: str, origin: str) -> ClientConnection:
         token = re.search(r'"token":"([^"]+)"', page.read().decode())
     assert token
     protocols = [websockets.Subprotocol("bokeh"), websockets.Subprotocol(token[1])]
-    return connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(origin), subprotocols=protocols)
+    return connect(
+        f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(origin), subprotocols=protocols
+    )
 
 
 def is_answered(url: str, origin: str) -> bool:
@@ -104,8 +106,12 @@ def test_write_methods_and_large_bodies_are_refused(url: str) -> None:
         assert status_of(url + path, method=method) in {403, 405}
         assert status_of(url + path, method=method, Host="evil.example") == 403
     bodies = ("Content-Length: 100000000\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\n5f5e100\r\n")
-    for body, host, method in product(bodies, (url.removeprefix("http://"), "evil.example"), ("POST", "PUT", "GET")):
-        with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE) as client:
+    for body, host, method in product(
+        bodies, (url.removeprefix("http://"), "evil.example"), ("POST", "PUT", "GET")
+    ):
+        with socket.create_connection(
+            ("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE
+        ) as client:
             client.sendall(f"{method} / HTTP/1.1\r\nHost: {host}\r\n{body}".encode())
             assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
 
@@ -131,7 +137,9 @@ def test_oversized_websocket_message_closes_the_connection(url: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
-def test_page_above_the_viewer_limit_shows_a_notice(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+def test_page_above_the_viewer_limit_shows_a_notice(
+    monkeypatch: pytest.MonkeyPatch, url: str
+) -> None:
     """A page beyond the maximum number of open pages, here 1, shows only a notice."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for text in ("a word", "limit of 1 open pages reached: close one"):
@@ -140,7 +148,9 @@ def test_page_above_the_viewer_limit_shows_a_notice(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
-def test_requests_without_websocket_do_not_count_as_viewers(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+def test_requests_without_websocket_do_not_count_as_viewers(
+    monkeypatch: pytest.MonkeyPatch, url: str
+) -> None:
     """Pages requested without opening a WebSocket do not count as viewers, but have a separate limit."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for _ in range(10):
@@ -160,7 +170,9 @@ def low_limits(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     _log_once.cache_clear()
 
 
-@pytest.mark.parametrize("start", ["", "GET / HTTP/1.1\r\nHost: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\nx"])
+@pytest.mark.parametrize(
+    "start", ["", "GET / HTTP/1.1\r\nHost: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\nx"]
+)
 @pytest.mark.usefixtures("low_limits")
 def test_incomplete_request_times_out(url: str, start: str) -> None:
     """A client that sends nothing, part of a header or part of a body is disconnected."""
@@ -190,7 +202,11 @@ def test_websocket_without_token_is_refused_without_traceback(
     """A WebSocket without the subprotocol or a valid page token is refused, and nothing is logged."""
     offered = [websockets.Subprotocol(each) for each in protocols]
     with pytest.raises(websockets.InvalidStatus, match="403"):
-        connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(url), subprotocols=offered or None)
+        connect(
+            f"{url.replace('http', 'ws')}/ws",
+            origin=websockets.Origin(url),
+            subprotocols=offered or None,
+        )
     assert not caplog.records
 
 
@@ -249,7 +265,9 @@ def test_listening_on_all_interfaces_warns(run_nedbus: Start, endpoint: str) -> 
     """With --http 0.0.0.0 the command warns about missing authentication; --origin allows a name; Ctrl-C stops it."""
     port = free_port()
     url, listen = f"http://127.0.0.1:{port}", f"--http=0.0.0.0:{port}"
-    process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", coverage=False)
+    process = run_nedbus(
+        "web", "-c", endpoint, listen, "--origin", "ground.example:8420", coverage=False
+    )
     wait_for(lambda: "has no password" in process.err, what="the warning")
     assert status_of(f"{url}/healthz", Host="prometheus.example") == 200
     assert status_of(f"{url}/status", Host="ground.example:8420") == 200

@@ -53,7 +53,8 @@ def line_of(tracks: Tracks, index: int, kind: str, ring: int) -> list[tuple[floa
     """Return the points of a line in drawing order; check the gaps at its ends."""
     begin = index * (ring + 2)
     east, north = (
-        np.asarray(tracks.source.data[name], float)[begin : begin + ring + 2].tolist() for name in ("east", kind)
+        np.asarray(tracks.source.data[name], float)[begin : begin + ring + 2].tolist()
+        for name in ("east", kind)
     )
     assert math.isnan(east[-1]), "two tracks are joined"
     assert math.isnan(north[-1]), "two tracks are joined"
@@ -103,7 +104,8 @@ def test_incremental_tracks_equal_those_of_a_new_viewer(
     for index, (history, _) in enumerate(histories.values()):
         for kind in LINE_TYPES:
             old, new = (line_of(each, index, kind, ring) for each in (tracks, fresh))
-            oldest = (max(0, history.written - points) - 1) // step % ring  # an old viewer may keep it longer
+            # an old viewer may keep it longer
+            oldest = (max(0, history.written - points) - 1) // step % ring
             del old[oldest], new[oldest]
             assert repr(old) == repr(new)
 
@@ -112,14 +114,21 @@ def data_sent(document: Document) -> list[Any]:
     """Return a list that collects the data source events that a document sends after this call."""
     sent: list[Any] = []
     document.on_change(
-        lambda event: sent.append(event) if isinstance(getattr(event, "model", None), ColumnDataSource) else None
+        lambda event: (
+            sent.append(event)
+            if isinstance(getattr(event, "model", None), ColumnDataSource)
+            else None
+        )
     )
     return sent
 
 
 def tracks_of(sim: SimulatedFleet) -> dict[Address, Track]:
     """Return the last minute of all streams, each with its own colour."""
-    return {address: (stream.minute, number) for number, (address, stream) in enumerate(sim.fleet.streams.items())}
+    return {
+        address: (stream.minute, number)
+        for number, (address, stream) in enumerate(sim.fleet.streams.items())
+    }
 
 
 def test_tracks_send_only_new_points(sim: SimulatedFleet) -> None:
@@ -169,7 +178,9 @@ class Page(RenderedPage):
 
     def tap(self, column: str, text: str) -> None:
         """Tap the mark with this text in the first data source that has this column."""
-        source = next(each for each in sources(self) if column in each.data and "words" in each.data)
+        source = next(
+            each for each in sources(self) if column in each.data and "words" in each.data
+        )
         source.selected.indices = [list(source.data["words"]).index(text)]
         assert source.selected.indices == [], "the same mark cannot be tapped again"
         self.update()
@@ -185,7 +196,13 @@ def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
     sim.fly(3)
     page.refresh()
     assert "ULog stream" not in page.text
-    page.refresh(logs={"wing": LogStreamStatus(vehicle="wing", state="refused", reason="<b>another client has it")})
+    page.refresh(
+        logs={
+            "wing": LogStreamStatus(
+                vehicle="wing", state="refused", reason="<b>another client has it"
+            )
+        }
+    )
     assert "ULog stream" in page.text
     assert "refused, &lt;b&gt;another client has it" in page.text
 
@@ -198,12 +215,21 @@ def test_use_of_an_external_position_is_shown_escaped(sim: SimulatedFleet) -> No
     assert "external position" not in page.text
     fused, yaw = QuantityFusion("position", "fused", 5.0), QuantityFusion("yaw", "fused", 5.0)
     page.refresh(fusion={"wing": Fusion("wing", (fused, yaw), echoed=40.0)})
-    assert '<div class="quiet">external position: position, yaw fused since 5.0 s; PX4 receives 40.0 Hz' in page.text
+    assert (
+        '<div class="quiet">external position: position, yaw fused since 5.0 s; PX4 receives 40.0 Hz'
+        in page.text
+    )
     rejected = QuantityFusion("yaw", "rejected", 5.0, cause="q is no unit quaternion")
     sent = PositionStatus(vehicle="wing", address="mocap/vehicle_odometry", sender="<b>", sent=7)
     page.refresh(fusion={"wing": Fusion("wing", (fused, rejected), sent)})
-    assert '<div class="watch">external position: sent: 7 positions of mocap/vehicle_odometry sent' in page.text
-    assert "from &lt;b&gt;; position fused since 5.0 s; yaw rejected since 5.0 s: q is no unit quaternion" in page.text
+    assert (
+        '<div class="watch">external position: sent: 7 positions of mocap/vehicle_odometry sent'
+        in page.text
+    )
+    assert (
+        "from &lt;b&gt;; position fused since 5.0 s; yaw rejected since 5.0 s: q is no unit quaternion"
+        in page.text
+    )
 
 
 def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:
@@ -321,8 +347,16 @@ def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
     page.refresh(alive=[])
     row = page.listed["wing"]
     assert (row["text"], row["mode"], row["battery"], row["gps"]) == ("gone", "-", "-", "-")
-    for name, text in (("armed", "armed"), ("battery", "50 %"), ("height", "7.0 m"), ("heading", "0°")):
-        assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.panel("nums")
+    for name, text in (
+        ("armed", "armed"),
+        ("battery", "50 %"),
+        ("height", "7.0 m"),
+        ("heading", "0°"),
+    ):
+        assert (
+            f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>'
+            in page.panel("nums")
+        )
 
 
 def test_attitude_is_shown_as_angles_in_degrees(sim: SimulatedFleet) -> None:
@@ -330,8 +364,13 @@ def test_attitude_is_shown_as_angles_in_degrees(sim: SimulatedFleet) -> None:
     attitude = Address("wing", "vehicle_attitude")
     sim.fly(3)
     assert "roll" not in Page(sim).panel("nums")
-    turned = nedbus.frames.euler_to_quaternion(*(math.radians(degrees) for degrees in (10.0, -20.0, 90.0)))
-    for q, text in ((turned, "roll 10.0°, pitch -20.0°, yaw 90.0°"), ((math.nan,) * 4, "roll -, pitch -, yaw -")):
+    turned = nedbus.frames.euler_to_quaternion(
+        *(math.radians(degrees) for degrees in (10.0, -20.0, 90.0))
+    )
+    for q, text in (
+        (turned, "roll 10.0°, pitch -20.0°, yaw 90.0°"),
+        ((math.nan,) * 4, "roll -, pitch -, yaw -"),
+    ):
         for _ in range(20):
             sim.fly(0.1)
             sim.add(attitude, q=q)
@@ -367,7 +406,9 @@ def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
     page = Page(sim)
     (badge,), (verdict,) = page.texts("why", "badge"), page.texts("why", "verdict")
     assert badge.split(maxsplit=1)[1] == page.states["wing"] == "dead reckoning"
-    assert re.match(r"position valid since \d\d:\d\d:\d\d\.\d UTC, but dead reckoning from", verdict)
+    assert re.match(
+        r"position valid since \d\d:\d\d:\d\d\.\d UTC, but dead reckoning from", verdict
+    )
 
 
 def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> None:
@@ -378,7 +419,10 @@ def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> No
     assert page.marks["wing"]["fill"] == page.marks["wing"]["colour"] != DARK.colours["ground"]
     sim.add(xy_valid=False)
     page.refresh()
-    assert (page.marks["wing"]["shape"], page.marks["wing"]["fill"]) == ("square", DARK.colours["ground"]), "at once"
+    assert (page.marks["wing"]["shape"], page.marks["wing"]["fill"]) == (
+        "square",
+        DARK.colours["ground"],
+    ), "at once"
     sim.fly(3, WING, x=99.0, xy_valid=False)
     page.refresh(alive=[WING])
     assert page.marks["wing"]["words"] == "xy not valid"
@@ -419,7 +463,12 @@ def test_search_filters_by_name_and_state(sim: SimulatedFleet) -> None:
     sim.fly(3, WING, Address("wind", VLP), QUAD)
     sim.fly(3, Address("wind", VLP), QUAD, xy_valid=False)
     page = Page(sim)
-    for text, found in ((" WIN ", ["wind", "wing"]), ("not VALID", ["quad", "wind"]), (HOSTILE, []), ("", 3)):
+    for text, found in (
+        (" WIN ", ["wind", "wing"]),
+        ("not VALID", ["quad", "wind"]),
+        (HOSTILE, []),
+        ("", 3),
+    ):
         page.search(text)
         assert page.vehicles == found if isinstance(found, list) else len(page.vehicles) == found
         assert "2 bad" in page.panel("head")
@@ -549,11 +598,19 @@ def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
 @pytest.mark.parametrize("size", ["340x330", "560x430", "1100x700"])
 def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
     """With 50 vehicles close together only labels that fit are shown, selected and bad vehicles first."""
-    places = {f"uav-{number}": (7.0 * (number // 10), 11.0 * (number % 10)) for number in range(1, 51)}
+    places = {
+        f"uav-{number}": (7.0 * (number // 10), 11.0 * (number % 10)) for number in range(1, 51)
+    }
     for _ in range(5):
         sim.time += 0.1
         for name, (x, y) in places.items():
-            sim.add(Address(name, VLP), x=x, y=y, xy_valid=True, z_valid=name not in ("uav-17", "uav-50"))
+            sim.add(
+                Address(name, VLP),
+                x=x,
+                y=y,
+                xy_valid=True,
+                z_valid=name not in ("uav-17", "uav-50"),
+            )
     page = Page(sim, query="?vehicle=uav-23")
     page.send("size", size)
     width, height = map(int, size.split("x"))
@@ -573,7 +630,9 @@ def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
     for mark, (x, y, wide) in zip(shown, boxes, strict=True):
         for other in page.marks.values():
             is_on = 1 < other["north"] / scale - y < 21 and x < other["east"] / scale < x + wide
-            assert not is_on or mark["name"] in ("uav-23", "uav-17", "uav-50"), "it covers another marker"
+            assert not is_on or mark["name"] in ("uav-23", "uav-17", "uav-50"), (
+                "it covers another marker"
+            )
 
 
 def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFleet) -> None:
@@ -692,7 +751,9 @@ def test_tapped_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> No
 def test_tapped_map_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """An event is marked on the map at the vehicle's position at that time; the mark can be tapped repeatedly."""
     page = Page(faulty_fleet, query="?vehicle=wing")
-    source = next(each for each in sources(page) if "marker" in each.data and "row" not in each.data)
+    source = next(
+        each for each in sources(page) if "marker" in each.data and "row" not in each.data
+    )
     assert source.data["words"] == ["reset of xy by 30.0 m (30.0 north, 0.0 east)"]
     for _ in range(2):
         source.selected.indices = [0]
@@ -735,7 +796,10 @@ def test_url_restores_the_page(faulty_fleet: SimulatedFleet, event: str | None) 
     assert other.pinned == (None if event is None else pytest.approx(page.pinned, abs=0.06))
     assert other.panel("tool") == page.panel("tool")
     assert len(other.texts("why", "verdict")) == 1
-    shown, restored = (re.sub(r"\([^)]*\)", "", each.texts("why", "body")[0]) for each in (page, other))  # no durations
+    # no durations
+    shown, restored = (
+        re.sub(r"\([^)]*\)", "", each.texts("why", "body")[0]) for each in (page, other)
+    )
     assert restored == shown
     assert other.marks["wing"]["colour"] in LIGHT.vehicles
 
@@ -749,7 +813,10 @@ QUERIES = (
 
 @pytest.mark.parametrize(
     "query",
-    [each if index % 4 == 1 else pytest.param(each, marks=pytest.mark.slow) for index, each in enumerate(QUERIES)],
+    [
+        each if index % 4 == 1 else pytest.param(each, marks=pytest.mark.slow)
+        for index, each in enumerate(QUERIES)
+    ],
 )
 def test_invalid_url_arguments_are_ignored(faulty_fleet: SimulatedFleet, query: str) -> None:
     """Invalid URL arguments are ignored; if the vehicle is unknown, another can be selected."""
@@ -834,8 +901,12 @@ def contrast(one: str, other: str) -> float:
 
     def luminance(colour: str) -> float:
         parts = [int(colour[index : index + 2], 16) / 255 for index in (1, 3, 5)]
-        linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
-        return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+        linear = [
+            part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+        ]
+        return sum(
+            weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True)
+        )
 
     bright, dim = sorted((luminance(one), luminance(other)), reverse=True)
     return (bright + 0.05) / (dim + 0.05)
@@ -859,7 +930,9 @@ def test_colours_have_sufficient_contrast(style: Style) -> None:
 
 
 @contextmanager
-def open_page(endpoint: str) -> Iterator[tuple[RenderedPage, Callable[[Callable[[], object], str], None]]]:
+def open_page(
+    endpoint: str,
+) -> Iterator[tuple[RenderedPage, Callable[[Callable[[], object], str], None]]]:
     """Yield the page of a bus, and a function that updates it like the server until a condition holds."""
     stop = threading.Event()
     with nedbus.connect(endpoint) as bus, ThreadPoolExecutor(1) as pool:
@@ -881,7 +954,9 @@ def open_page(endpoint: str) -> Iterator[tuple[RenderedPage, Callable[[Callable[
         reading.result()
 
 
-def test_past_loss_of_a_link_is_on_the_page_once(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_past_loss_of_a_link_is_on_the_page_once(
+    endpoint: str, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """A loss of the link that a service reports for each of its vehicles is one event of the page, not one of each."""
     now = time.time()
     with ExitStack() as answering:
@@ -889,7 +964,9 @@ def test_past_loss_of_a_link_is_on_the_page_once(endpoint: str, bus: nedbus.Bus,
             key = f"nedbus/@service/{vehicle}/x/status"
             event = Event(vehicle, "link_down", "begin", "bad", "no link", now - 60)
             own = Event(vehicle, "takeoff", "once", "info", f"takeoff of {vehicle}", now - 50)
-            report = AccountReport("x", "h", now, {vehicle: VehicleReport("info", "ok")}, (event, own))
+            report = AccountReport(
+                "x", "h", now, {vehicle: VehicleReport("info", "ok")}, (event, own)
+            )
             [payload] = reply_parts(report)
             answering.enter_context(answer_queries(zenoh_session, key, reply_with({key: payload})))
         events = LiveFleet(bus, Selection(), version="0").timeline.events
@@ -899,7 +976,9 @@ def test_past_loss_of_a_link_is_on_the_page_once(endpoint: str, bus: nedbus.Bus,
     assert sorted(event.text for event in only) == ["no link", "takeoff of wing"]
 
 
-def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_page_follows_published_vehicles(
+    endpoint: str, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """Published vehicles are in the list and on the map, and stay there when invalid or gone."""
     fields = {**VALID, "x": 5.0}
     wing, quad = (bus.publisher(VLP, vehicle=name) for name in ("wing", "quad"))
@@ -912,12 +991,18 @@ def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_s
                 until(lambda: page.states["wing"] == "xy not valid", "the flag")
                 assert page.marks["wing"]["north"] == 5.0
             quad.close()
-            until(lambda: page.states == {"quad": "gone", "wing": "xy not valid"}, "the end of the other")
+            until(
+                lambda: page.states == {"quad": "gone", "wing": "xy not valid"},
+                "the end of the other",
+            )
         assert page.marks["quad"]["shape"] == "square"
         zenoh_session.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
         page.send("streams")
         until(lambda: "<td>a rule</td>" in page.panel("more"), "the report")
-        until(lambda: any("rejected: a rule" in event.text for event in page.viewer._timeline.events), "its event")
+        until(
+            lambda: any("rejected: a rule" in event.text for event in page.viewer._timeline.events),
+            "its event",
+        )
 
 
 def test_page_survives_a_router_restart() -> None:
@@ -939,7 +1024,9 @@ def test_page_survives_a_router_restart() -> None:
         until(lambda: page.marks["wing"]["fill"] != DARK.colours["ground"], "the vehicle again")
         until(lambda: "no link to" not in page.panel("head"), "the alarm to end")
         texts = [
-            event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"
+            event.text.partition(" after")[0]
+            for event in page.viewer._timeline.events
+            if event.kind == "link_down"
         ]
         assert texts == [f"no link to {where}", "link restored"]
     router.close()

@@ -10,10 +10,16 @@ from nedbus.health import PositionStatus
 from nedbus.web.vision import VisionWatch
 from nedbus_msgs import Address
 
-SENT: Final = {"wing": PositionStatus(vehicle="wing", address="mocap/vehicle_visual_odometry", sent=3, rate=50.0)}
+SENT: Final = {
+    "wing": PositionStatus(
+        vehicle="wing", address="mocap/vehicle_visual_odometry", sent=3, rate=50.0
+    )
+}
 
 
-def add(watch: VisionWatch, topic: str, time: float, vehicle: str = "wing", **fields: object) -> None:
+def add(
+    watch: VisionWatch, topic: str, time: float, vehicle: str = "wing", **fields: object
+) -> None:
     """Add a message of PX4 at its time since boot [s]."""
     message: Any = SimpleNamespace(timestamp=round(1e6 * time), **fields)
     watch.add(Sample(message, Address(vehicle, topic), 0))
@@ -32,7 +38,14 @@ def test_report_of_fused_positions() -> None:
     watch = VisionWatch()
     for step in range(40):
         time = 5 + step / 40
-        add(watch, "estimator_aid_src_ev_pos", time, fused=True, innovation_rejected=False, test_ratio=(0.1, 0.2))
+        add(
+            watch,
+            "estimator_aid_src_ev_pos",
+            time,
+            fused=True,
+            innovation_rejected=False,
+            test_ratio=(0.1, 0.2),
+        )
     report = watch.reports({"wing", "quad"}, {})["wing"]
     assert report.used
     assert report.lines[0] == "position fused since 5.0 s"
@@ -43,8 +56,14 @@ def test_sent_positions_without_evidence_have_a_report() -> None:
     reports = VisionWatch().reports({"wing", "quad"}, SENT)
     assert set(reports) == {"wing"}
     assert reports["wing"].used is None
-    assert reports["wing"].lines[0].startswith("sent: 3 positions of mocap/vehicle_visual_odometry sent, 50.0 Hz")
-    assert any(line.startswith("not in the data: estimator_aid_src_ev_*") for line in reports["wing"].lines)
+    assert (
+        reports["wing"]
+        .lines[0]
+        .startswith("sent: 3 positions of mocap/vehicle_visual_odometry sent, 50.0 Hz")
+    )
+    assert any(
+        line.startswith("not in the data: estimator_aid_src_ev_*") for line in reports["wing"].lines
+    )
 
 
 def test_vehicles_that_left_the_page_are_forgotten() -> None:

@@ -41,7 +41,13 @@ def vectors(path: Path) -> Iterator[Any]:
 
 
 def as_python(value: object) -> object:
-    return tuple(map(float, value)) if isinstance(value, list) else float(value) if isinstance(value, str) else value
+    return (
+        tuple(map(float, value))
+        if isinstance(value, list)
+        else float(value)
+        if isinstance(value, str)
+        else value
+    )
 
 
 @pytest.mark.parametrize(("layout", "vector"), [*vectors(VECTORS), *vectors(SHARED_VECTORS)])
@@ -96,18 +102,25 @@ def test_other_encapsulation_is_rejected(head: str) -> None:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_bool_other_than_0_or_1_is_rejected(layout: str) -> None:
     """A bool byte other than 0 or 1 is rejected, because it means that the payload has another layout."""
-    payload = bytearray(encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout))
+    payload = bytearray(
+        encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout)
+    )
     payload[4 + 16] = 2
     with pytest.raises(DecodeError, match="xy_valid is 2"):
         decode_cdr(bytes(payload), layout=layout)
 
 
-@pytest.mark.parametrize(("layout", "size"), {"1.13": 184, "1.14": 188, "1.15": 204, "V0": 216, "1.16": 220}.items())
+@pytest.mark.parametrize(
+    ("layout", "size"), {"1.13": 184, "1.14": 188, "1.15": 204, "V0": 216, "1.16": 220}.items()
+)
 def test_padding_is_ignored(layout: str, size: int) -> None:
     """Padding bytes may have any value, because ROS leaves uninitialized memory there."""
     # No byte of these values is 0, so each 0 is padding.
     filled = {"bool": True, "uint8": 255, "uint64": 2**64 - 1, "float32": 0.1, "float64": 0.1}
-    values = {name: filled.get(str(LAYOUTS[layout].types[name]), (0.1, 0.1)) for name in LAYOUTS[layout].fields}
+    values = {
+        name: filled.get(str(LAYOUTS[layout].types[name]), (0.1, 0.1))
+        for name in LAYOUTS[layout].fields
+    }
     payload = encode_cdr(values, layout=layout)
     head, data = payload[:4], payload[4:]
     dirty = head + bytes(byte or 255 - index % 200 for index, byte in enumerate(data))

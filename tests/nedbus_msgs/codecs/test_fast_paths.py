@@ -14,7 +14,14 @@ import pytest
 from hypothesis import example, given, strategies as st
 from pydantic import ValidationError, field_validator
 
-from nedbus_msgs import DEFAULT, DecodeError, EncodeError, InvalidMessageError, Row, VehicleLocalPosition
+from nedbus_msgs import (
+    DEFAULT,
+    DecodeError,
+    EncodeError,
+    InvalidMessageError,
+    Row,
+    VehicleLocalPosition,
+)
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.flights.local_position import (
     CURRENT,
@@ -44,7 +51,22 @@ ANY_VALUE = st.one_of(
     st.booleans(),
     st.none(),
     st.sampled_from(["", "x", "NaN"]),
-    st.sampled_from([math.nan, math.inf, -math.inf, 1e39, -0.0, -1e-50, 2**64, 2**64 - 1, 256, 255, math.pi, 90.5]),
+    st.sampled_from(
+        [
+            math.nan,
+            math.inf,
+            -math.inf,
+            1e39,
+            -0.0,
+            -1e-50,
+            2**64,
+            2**64 - 1,
+            256,
+            255,
+            math.pi,
+            90.5,
+        ]
+    ),
     st.tuples(st.floats(), st.floats()),
     st.lists(st.floats(), max_size=3),
 )
@@ -81,17 +103,30 @@ def test_fields_and_rows_are_validated_like_the_model(
     expected = payload_by_model(fields)
     if expected is not None:
         created = VehicleLocalPosition(**fields)
-        assert encode(created) == encode_fields(fields) == encode_row(list(fields.values())) == expected
+        assert (
+            encode(created)
+            == encode_fields(fields)
+            == encode_row(list(fields.values()))
+            == expected
+        )
         assert bits(created) == bits(VehicleLocalPosition.model_validate(fields))
         return
-    expected_reasons = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
+    expected_reasons = reasons(
+        lambda each: encode(VehicleLocalPosition.model_validate(each)), fields
+    )
     assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected_reasons
-    assert reasons(encode_fields, fields) == reasons(encode_row, list(fields.values())) == expected_reasons
+    assert (
+        reasons(encode_fields, fields)
+        == reasons(encode_row, list(fields.values()))
+        == expected_reasons
+    )
 
 
 def test_misspelled_field_with_right_field_count_is_rejected() -> None:
     """If a field is misspelled, the fast path leaves the error to the model, even if the field count is right."""
-    fields = {("hagl" if name == "hagl_min" else name): value for name, value in GOOD.model_dump().items()}
+    fields = {
+        ("hagl" if name == "hagl_min" else name): value for name, value in GOOD.model_dump().items()
+    }
     expected = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
     assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected
     assert reasons(encode_fields, fields) == expected
@@ -101,17 +136,29 @@ def test_misspelled_field_with_right_field_count_is_rejected() -> None:
     ("changes", "text"),
     [
         ({"eph": -1.0}, "eph: must not be negative (is -1.0)"),
-        ({"x": "1", "xy_reset_counter": 300}, "x: Input should be a valid number (is '1'); xy_reset_counter: "),
+        (
+            {"x": "1", "xy_reset_counter": 300},
+            "x: Input should be a valid number (is '1'); xy_reset_counter: ",
+        ),
         ({"delta_xy": (0.0, None)}, "delta_xy.1: Input should be a valid number (is None)"),
         ({"z_dervi": 1.0}, "unknown field 'z_dervi': did you mean z_deriv or "),
         ({"Heading": 1.0}, "unknown field 'Heading': did you mean heading or "),
-        ({"temperature": 20.0}, "unknown field 'temperature': 'nedbus schema VehicleLocalPosition' lists the fields"),
+        (
+            {"temperature": 20.0},
+            "unknown field 'temperature': 'nedbus schema VehicleLocalPosition' lists the fields",
+        ),
         ({"timestamp": None}, "timestamp: Field required"),
     ],
 )
-def test_invalid_message_error_names_field_rule_and_value(changes: dict[str, object], text: str) -> None:
+def test_invalid_message_error_names_field_rule_and_value(
+    changes: dict[str, object], text: str
+) -> None:
     """InvalidMessageError is a ValueError that names each field, its rule and value, and suggests a field."""
-    fields = {name: value for name, value in {"timestamp": 1, **changes}.items() if name != "timestamp" or value}
+    fields = {
+        name: value
+        for name, value in {"timestamp": 1, **changes}.items()
+        if name != "timestamp" or value
+    }
     with pytest.raises(InvalidMessageError) as info:
         encode_fields(MappingProxyType(fields))
     assert str(info.value).startswith(f"not a valid VehicleLocalPosition: {text}")
@@ -120,12 +167,18 @@ def test_invalid_message_error_names_field_rule_and_value(changes: dict[str, obj
     assert str(pickle.loads(pickle.dumps(info.value))) == str(info.value)
 
 
-@given(st.lists(st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=3)), min_size=1, max_size=5))
+@given(
+    st.lists(
+        st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=3)), min_size=1, max_size=5
+    )
+)
 def test_payloads_are_validated_like_the_model(
     cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]],
 ) -> None:
     """Models, rows and arrays decode to bit-identical values, or are all rejected."""
-    payloads = [pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases]
+    payloads = [
+        pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases
+    ]
     array, valid = decode_array(b"".join(payloads))
     for index, payload in enumerate(payloads):
         fields = dict(zip(FIELD_TYPES, msgpack.unpackb(payload, use_list=False)[1:], strict=True))
@@ -202,7 +255,12 @@ def test_validation_of_dicts_and_json_bypasses_the_constructor() -> None:
 
 def test_row_has_the_fields_of_the_model() -> None:
     """Row, model and current layout have PX4's names in PX4's order."""
-    assert DEFAULT.row._fields == tuple(FIELD_TYPES) == tuple(VehicleLocalPosition.model_fields) == CURRENT.fields
+    assert (
+        DEFAULT.row._fields
+        == tuple(FIELD_TYPES)
+        == tuple(VehicleLocalPosition.model_fields)
+        == CURRENT.fields
+    )
 
 
 def test_row_is_a_named_tuple() -> None:
@@ -216,7 +274,11 @@ def test_row_is_a_named_tuple() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [lambda message, y: message.__dict__.update(y=y), lambda message, y: object.__setattr__(message, "y", y)]
+    "change",
+    [
+        lambda message, y: message.__dict__.update(y=y),
+        lambda message, y: object.__setattr__(message, "y", y),
+    ],
 )
 def test_forced_change_of_a_constructed_message_is_encoded(
     change: Callable[[VehicleLocalPosition, object], None],

@@ -9,7 +9,13 @@ import msgpack
 import pytest
 from hypothesis import example, given, strategies as st
 
-from nedbus_msgs import PAYLOAD_LIMIT, DecodeError, EncodeError, UnknownLayoutError, VehicleLocalPosition
+from nedbus_msgs import (
+    PAYLOAD_LIMIT,
+    DecodeError,
+    EncodeError,
+    UnknownLayoutError,
+    VehicleLocalPosition,
+)
 from nedbus_msgs.arrays import to_message
 from tests.flights.local_position import (
     FIELD_TYPES,
@@ -42,18 +48,30 @@ def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) ->
     assert len(payload) == PAYLOAD_SIZE
     array = msgpack.unpackb(payload, use_list=False)
     assert array[0] == 1
-    assert [repr(value) for value in array[1:]] == [repr(getattr(message, name)) for name in FIELD_TYPES]
+    assert [repr(value) for value in array[1:]] == [
+        repr(getattr(message, name)) for name in FIELD_TYPES
+    ]
     assert bits(decode(payload)) == bits(message)
 
 
 @given(messages(), st.booleans(), st.booleans())
-def test_other_msgpack_encodings_are_decoded(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
+def test_other_msgpack_encodings_are_decoded(
+    message: VehicleLocalPosition, single: bool, whole: bool
+) -> None:
     """Short ints, doubles, and ints in float fields decode to the same message and row."""
     values = [value for name, value in message.model_dump().items()]
     if whole:
-        values = [int(each) if isinstance(each, float) and each.is_integer() and each else each for each in values]
-        values = [each if not isinstance(each, int) or -(2**63) <= each < 2**64 else float(each) for each in values]
-    payload = msgpack.packb([1, *values], use_single_float=single and not (message.ref_lat or message.ref_lon))
+        values = [
+            int(each) if isinstance(each, float) and each.is_integer() and each else each
+            for each in values
+        ]
+        values = [
+            each if not isinstance(each, int) or -(2**63) <= each < 2**64 else float(each)
+            for each in values
+        ]
+    payload = msgpack.packb(
+        [1, *values], use_single_float=single and not (message.ref_lat or message.ref_lon)
+    )
     assert bits(decode(payload)) == bits(message)
     assert encode_row(decode_row(payload)) == encode(message)
 
@@ -70,7 +88,9 @@ def test_newer_layout_is_decoded_by_field_names() -> None:
     """Given the field names of an unknown layout, known fields are decoded and all others ignored."""
     names = ["timestamp", "x", "y", "brand_new"]
     payload = msgpack.packb([2, 5, 1.0, 2.0, True])
-    with pytest.raises(UnknownLayoutError, match=r"unknown layout 2 with 4 fields \(known: 0, 1\)") as info:
+    with pytest.raises(
+        UnknownLayoutError, match=r"unknown layout 2 with 4 fields \(known: 0, 1\)"
+    ) as info:
         decode(payload)
     assert (info.value.layout, info.value.count, info.value.known) == (2, 4, (0, 1))
     message = decode(payload, newer={2: names})
@@ -121,7 +141,9 @@ def test_payload_that_breaks_a_rule_is_rejected() -> None:
 def test_flipped_bit_has_the_same_effect_in_model_row_and_array() -> None:
     """A payload with one flipped bit is decoded, or rejected, identically as a model, as a row and in an array."""
     number = int.from_bytes(REAL[0], "big")
-    payloads = [(number ^ 1 << bit).to_bytes(PAYLOAD_SIZE, "big") for bit in range(8 * PAYLOAD_SIZE)]
+    payloads = [
+        (number ^ 1 << bit).to_bytes(PAYLOAD_SIZE, "big") for bit in range(8 * PAYLOAD_SIZE)
+    ]
     array, valid = decode_array(b"".join(payloads))
     for index, payload in enumerate(payloads):
         try:
@@ -150,15 +172,26 @@ def test_random_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
 
 SHORT = st.binary(max_size=5)
 msgpack_values = st.recursive(
-    st.one_of(st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=5), SHORT),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(-(2**63), 2**64 - 1),
+        st.floats(),
+        st.text(max_size=5),
+        SHORT,
+    ),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 
 
 @given(st.sampled_from(FLIGHTS), st.integers(0, 53), msgpack_values)
 @MANY_EXAMPLES
-def test_random_value_is_decoded_unchanged_or_rejected(good: VehicleLocalPosition, index: int, value: object) -> None:
+def test_random_value_is_decoded_unchanged_or_rejected(
+    good: VehicleLocalPosition, index: int, value: object
+) -> None:
     """In an otherwise valid payload, a value is decoded unchanged up to float32 rounding, or raises DecodeError."""
     array: list[object] = [1, *good.model_dump().values()]
     array[index] = value
@@ -171,13 +204,23 @@ def test_random_value_is_decoded_unchanged_or_rejected(good: VehicleLocalPositio
         forms += [float(value), *struct.unpack("<f", struct.pack("<f", value))]
     elif isinstance(value, list) and len(value) == 2:
         forms += [tuple(map(float, value)), struct.unpack("<2f", struct.pack("<2f", *value))]
-    assert index == 0 or repr(message.model_dump()[list(FIELD_TYPES)[index - 1]]) in map(repr, forms)
+    assert index == 0 or repr(message.model_dump()[list(FIELD_TYPES)[index - 1]]) in map(
+        repr, forms
+    )
 
 
 def test_encoding_after_bypassed_validation_raises() -> None:
     """Encoding a message from model_construct raises if a value does not fit; it never encodes another value."""
-    for field, value in (("x", 1e39), ("timestamp", -1), ("xy_reset_counter", 300), ("x", "1"), ("delta_xy", None)):
-        message = VehicleLocalPosition.model_construct(**{**VehicleLocalPosition(timestamp=1).__dict__, field: value})
+    for field, value in (
+        ("x", 1e39),
+        ("timestamp", -1),
+        ("xy_reset_counter", 300),
+        ("x", "1"),
+        ("delta_xy", None),
+    ):
+        message = VehicleLocalPosition.model_construct(
+            **{**VehicleLocalPosition(timestamp=1).__dict__, field: value}
+        )
         with pytest.raises(EncodeError, match="VehicleLocalPosition"):
             encode(message)
 
@@ -185,7 +228,9 @@ def test_encoding_after_bypassed_validation_raises() -> None:
 def test_deeply_nested_array_is_rejected() -> None:
     """An array nested 400 deep is rejected before it is formatted, which would overflow the stack."""
     deep = b"\x91" * 400 + b"\x01"
-    values = [msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()]
+    values = [
+        msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()
+    ]
     values[6] = deep
     with pytest.raises(DecodeError, match="x has a nested array"):
         decode(b"\xdc\x00\x36\x01" + b"".join(values))

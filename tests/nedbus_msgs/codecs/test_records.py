@@ -26,9 +26,19 @@ from nedbus_msgs import (
     record_encoder,
 )
 
-LAYOUTS = [(definition, layout.types) for definition in MESSAGES.values() for layout in definition.layouts.values()]
-BOOLS = st.sampled_from([0, 1, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 2, 255])
-FLOATS = st.floats(-100, 100, width=32) | st.floats(width=32) | st.sampled_from([math.nan, math.inf, -0.0, 0.0, 1.0])
+LAYOUTS = [
+    (definition, layout.types)
+    for definition in MESSAGES.values()
+    for layout in definition.layouts.values()
+]
+BOOLS = st.sampled_from(
+    [0, 1, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 2, 255]
+)
+FLOATS = (
+    st.floats(-100, 100, width=32)
+    | st.floats(width=32)
+    | st.sampled_from([math.nan, math.inf, -0.0, 0.0, 1.0])
+)
 
 
 class Records:
@@ -47,7 +57,9 @@ class Records:
             form = f"<{kind.form}"
             values: tuple[Any, ...] = struct.unpack_from(form, record, offset)
             offset += struct.calcsize(form)
-            fields[name] = values if kind.is_array else decode_text(values[0]) if kind.is_text else values[0]
+            fields[name] = (
+                values if kind.is_array else decode_text(values[0]) if kind.is_text else values[0]
+            )
         return fields
 
 
@@ -61,7 +73,9 @@ def values_of(kind: FieldType) -> st.SearchStrategy[bytes]:
     elif kind.is_text:
         return st.binary(min_size=kind.size, max_size=kind.size)
     else:
-        one = st.sampled_from([b"\0", b"\x01", b"\x02"]).map(lambda byte: byte.ljust(kind.size, b"\0"))
+        one = st.sampled_from([b"\0", b"\x01", b"\x02"]).map(
+            lambda byte: byte.ljust(kind.size, b"\0")
+        )
         one |= st.binary(min_size=kind.size, max_size=kind.size)
     return st.lists(one, min_size=kind.values, max_size=kind.values).map(b"".join)
 
@@ -89,13 +103,24 @@ def test_record_is_encoded_as_its_fields(data: st.DataObject) -> None:
         assert repr(read(found.row)) == repr(read(by_name.row))
 
 
-@pytest.mark.parametrize(("definition", "types"), LAYOUTS, ids=lambda each: getattr(each, "name", ""))
-def test_valid_record_of_each_layout_is_encoded(definition: Definition[Any], types: Mapping[str, FieldType]) -> None:
+@pytest.mark.parametrize(
+    ("definition", "types"), LAYOUTS, ids=lambda each: getattr(each, "name", "")
+)
+def test_valid_record_of_each_layout_is_encoded(
+    definition: Definition[Any], types: Mapping[str, FieldType]
+) -> None:
     """A valid record of each layout is encoded in one step, and its payload decodes to its values."""
-    records, halves = Records(definition, types), {"float32": struct.pack("<f", 0.5), "float64": struct.pack("<d", 0.5)}
-    found = records.encode(b"".join(halves.get(kind.base, bytes(kind.size)) * kind.values for kind in types.values()))
+    records, halves = (
+        Records(definition, types),
+        {"float32": struct.pack("<f", 0.5), "float64": struct.pack("<d", 0.5)},
+    )
+    found = records.encode(
+        b"".join(halves.get(kind.base, bytes(kind.size)) * kind.values for kind in types.values())
+    )
     assert found is not None
-    assert repr(FieldReader(definition.names)(found.row)) == repr(tuple(codec_of(definition).decode_row(found.payload)))
+    assert repr(FieldReader(definition.names)(found.row)) == repr(
+        tuple(codec_of(definition).decode_row(found.payload))
+    )
     assert found.missing == definition.all_fields - found.provided
 
 
@@ -117,7 +142,9 @@ def test_number_beyond_float32_is_left_to_the_model() -> None:
     """A float64 of the record that does not fit the float32 of the model is rejected, not published as infinity."""
     records = Records(DEFAULT, {**DEFAULT.types, "x": field_type("float64")})
     record = bytearray(records.size)
-    offset = sum(each.size * each.values for each in [*records.types.values()][: [*records.types].index("x")])
+    offset = sum(
+        each.size * each.values for each in [*records.types.values()][: [*records.types].index("x")]
+    )
     struct.pack_into("<d", record, offset, 1e300)
     assert records.encode(bytes(record)) is None
     struct.pack_into("<d", record, offset, 1.5)
@@ -132,7 +159,10 @@ def test_signalling_nan_is_published_as_from_its_fields() -> None:
     records = Records(define("Debug", types.items()), types)
     for bits in (0x7F800001, 0xFFC00001, 0x7FC00000):
         record = struct.pack("<QI", 7, bits)
-        found, by_name = records.encode(record), encode_upgraded(records.definition, records.fields(record))
+        found, by_name = (
+            records.encode(record),
+            encode_upgraded(records.definition, records.fields(record)),
+        )
         assert found is not None
         assert found.payload == by_name.payload
 
@@ -175,7 +205,10 @@ def test_field_reader_forgets_types_of_messages() -> None:
 def test_fields_of_another_type_name_the_broken_rule() -> None:
     """Fields that the quick validation does not accept are judged by the model, which gives the reason."""
     assert encode_upgraded(DEFAULT, {"timestamp": 1, "x": 1}).row[DEFAULT.names.index("x")] == 1.0
-    for value, reason in (("1", "x: Input should be a valid number"), (1e39, "x: is beyond the range of float32")):
+    for value, reason in (
+        ("1", "x: Input should be a valid number"),
+        (1e39, "x: is beyond the range of float32"),
+    ):
         with pytest.raises(InvalidMessageError, match=reason):
             encode_upgraded(DEFAULT, {"timestamp": 1, "x": value})
     with pytest.raises(InvalidMessageError, match="timestamp: Field required"):

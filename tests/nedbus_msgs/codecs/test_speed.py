@@ -108,5 +108,7 @@ def exceeded_bounds(best: dict[str, dict[str, float]]) -> list[str]:
             if ratio > bound:
                 slow.append(f"{name}, {flight}: {ratio:.2f} of the baseline, limit {bound}")
             if spread > MAX_SPREAD:
-                slow.append(f"{name}, {flight}: {spread:.2f} of the fastest flight, limit {MAX_SPREAD}")
+                slow.append(
+                    f"{name}, {flight}: {spread:.2f} of the fastest flight, limit {MAX_SPREAD}"
+                )
     return slow

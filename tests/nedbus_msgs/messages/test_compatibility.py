@@ -30,7 +30,13 @@ from tests.flights.local_position import (
 from tests.nedbus_msgs.strategies import DATA, FLIGHTS, REAL
 
 SNAPSHOT: Final = DATA / "vehicle_local_position.json"
-VALID: Final[dict[str, Any]] = {"timestamp": 5, "timestamp_sample": 4, "xy_valid": True, "x": 1.0, "y": 2.0}
+VALID: Final[dict[str, Any]] = {
+    "timestamp": 5,
+    "timestamp_sample": 4,
+    "xy_valid": True,
+    "x": 1.0,
+    "y": 2.0,
+}
 INVALID: Final[Mapping[str, Mapping[str, object]]] = {
     "no timestamp": {"x": 1.0},
     "text": {**VALID, "x": "north"},
@@ -41,7 +47,13 @@ INVALID: Final[Mapping[str, Mapping[str, object]]] = {
     "text in an array": {**VALID, "delta_vxy": (1.0, "2")},
     "beyond float32": {**VALID, "vx": 1e39, "delta_xy": (1e39, 0.0)},
     "not finite while valid": {**VALID, "x": math.nan, "y": math.inf},
-    "several rules": {**VALID, "timestamp_sample": 6, "eph": -1.0, "heading": 4.0, "ref_lat": -91.0},
+    "several rules": {
+        **VALID,
+        "timestamp_sample": 6,
+        "eph": -1.0,
+        "heading": 4.0,
+        "ref_lat": -91.0,
+    },
     "unknown field": {**VALID, "hight": 1.0},
     "unknown field without a suggestion": {**VALID, "qqqq": 1.0},
 }

@@ -108,7 +108,9 @@ def test_char_array_is_encoded_and_hashed_as_in_ros_2() -> None:
     assert type_hash == "RIHS01_3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9"
     layout = MESSAGES["LogMessage"].current
     assert hash_of(layout, "px4_msgs/msg/LogMessage") == hash_of_msg("LogMessage", LOG_MESSAGE)
-    assert hash_of_msg("LogMessage", LOG_MESSAGE) == hash_of_msg("LogMessage", LOG_MESSAGE.replace("char", "uint8"))
+    assert hash_of_msg("LogMessage", LOG_MESSAGE) == hash_of_msg(
+        "LogMessage", LOG_MESSAGE.replace("char", "uint8")
+    )
     fields: dict[str, object] = {"timestamp": 7, "severity": 4, "text": "12 µs"}
     payload = encode_with(MESSAGES["LogMessage"], fields, layout)
     assert payload == struct.pack("<4sQB127s", b"\0\1\0\0", 7, 4, "12 µs".encode())
@@ -166,7 +168,8 @@ def test_text_may_be_unpadded_but_not_too_long() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_fields_of_older_layouts_round_trip_through_the_model(name: str) -> None:
     """Values of an older layout are unchanged after an upgrade to the model and a downgrade back."""
-    dropped = {"q_offset", "pose_covariance", "velocity_covariance", "local_frame"}  # VehicleOdometry of 1.13
+    # VehicleOdometry of 1.13
+    dropped = {"q_offset", "pose_covariance", "velocity_covariance", "local_frame"}
     for vector in (each for each in vectors() if each["message"] == name):
         known = message_of_type_hash(vector["type_hash"])
         assert known is not None
@@ -175,7 +178,9 @@ def test_fields_of_older_layouts_round_trip_through_the_model(name: str) -> None
         absent = {field: kind.absent for field, kind in definition.types.items()}
         back = definition.downgrade(absent | upgrade_fields(definition, fields), layout)
         kept = fields.keys() - dropped
-        assert {field: bits(back[field]) for field in kept} == {field: bits(fields[field]) for field in kept}
+        assert {field: bits(back[field]) for field in kept} == {
+            field: bits(fields[field]) for field in kept
+        }
 
 
 @pytest.mark.parametrize(
@@ -199,9 +204,15 @@ def test_value_beyond_the_range_of_an_older_type_becomes_0(
 
 @pytest.mark.parametrize(
     ("name", "older"),
-    [("SensorGps", {"lat": None}), ("VehicleOdometry", {"local_frame": {}}), ("SensorGps", {"lat": []})],
+    [
+        ("SensorGps", {"lat": None}),
+        ("VehicleOdometry", {"local_frame": {}}),
+        ("SensorGps", {"lat": []}),
+    ],
 )
-def test_non_numeric_value_of_a_renamed_field_is_rejected(name: str, older: dict[str, object]) -> None:
+def test_non_numeric_value_of_a_renamed_field_is_rejected(
+    name: str, older: dict[str, object]
+) -> None:
     """The conversion of a renamed field leaves a wrong type to the model, which rejects it."""
     definition = MESSAGES[name]
     payload = msgpack.packb([99, 1, *older.values()])
@@ -239,16 +250,21 @@ def any_fields(draw: st.DrawFn) -> tuple[Definition[Any], dict[str, object]]:
         times = [name for name in ("timestamp_sample", "timestamp") if name in fields]
         fields |= {name: number for number, name in enumerate(times)}
         for rule in definition.rules:
-            fields |= {name: definition.types[name].absent for name in rule.fields if name not in times}
+            fields |= {
+                name: definition.types[name].absent for name in rule.fields if name not in times
+            }
     return definition, fields
 
 
 @given(any_fields())
-def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[str, object]]) -> None:
+def test_model_fields_rows_and_arrays_agree(
+    case: tuple[Definition[Any], dict[str, object]],
+) -> None:
     """Model, fields, rows and arrays accept the same messages, write the same bytes, and read the same values."""
     definition, fields = case
     codec, arrays = codec_of(definition), arrays_of(definition)
-    array = np.array([arrays.to_element(tuple(fields.values()))] * 21, arrays.dtype)  # enough for checks by column
+    # enough for checks by column
+    array = np.array([arrays.to_element(tuple(fields.values()))] * 21, arrays.dtype)
     try:
         message = definition.model.model_validate(fields)
     except ValidationError:
@@ -274,7 +290,9 @@ def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[st
     assert few.tobytes() == decoded.tobytes()
     cdr = arrays.encode_cdr(array, definition.current)
     again = [decode_with(definition, each.tobytes(), definition.current) for each in cdr]
-    assert [codec.encode_fields(upgrade_fields(definition, each)) for each in again] == 21 * [payload]
+    assert [codec.encode_fields(upgrade_fields(definition, each)) for each in again] == 21 * [
+        payload
+    ]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -305,10 +323,16 @@ def test_definition_is_complete(name: str) -> None:
 @pytest.mark.quick  # a new property of a message changes its page
 def test_generated_pages_and_imports_are_up_to_date() -> None:
     """Each message has an up-to-date page (`make generated`) and an import for type checkers."""
-    assert [path.name for path, text in committed().items() if not path.exists() or path.read_text() != text] == []
+    assert [
+        path.name
+        for path, text in committed().items()
+        if not path.exists() or path.read_text() != text
+    ] == []
     imports = Path(messages.__file__ or "").read_text()
     assert [name for name in MESSAGES if f"import {name} as {name}\n" not in imports] == []
-    assert {path.name for path in PAGES.glob("*.md")} == {path.name for path in committed() if path.suffix == ".md"}
+    assert {path.name for path in PAGES.glob("*.md")} == {
+        path.name for path in committed() if path.suffix == ".md"
+    }
 
 
 WHEEL_ENCODERS = '''

@@ -118,13 +118,18 @@ def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
     assert "nan" not in text
     assert "inf" not in text
     document = json.loads(text)
-    again = [VehicleLocalPosition.model_validate_json(text), VehicleLocalPosition.model_validate(document)]
+    again = [
+        VehicleLocalPosition.model_validate_json(text),
+        VehicleLocalPosition.model_validate(document),
+    ]
     for each in (*again, VehicleLocalPosition(**document)):
         assert bits(each) == bits(message)
 
 
 @given(messages(), st.sampled_from(sorted(FIELD_TYPES)))
-def test_copy_with_unchanged_value_equals_the_message(message: VehicleLocalPosition, name: str) -> None:
+def test_copy_with_unchanged_value_equals_the_message(
+    message: VehicleLocalPosition, name: str
+) -> None:
     """Validation does not change a valid value."""
     assert bits(message.model_copy(update={name: getattr(message, name)})) == bits(message)
 
@@ -137,7 +142,9 @@ def test_json_schema_matches_the_model() -> None:
     assert list(properties) == list(FIELD_TYPES)
     assert all(field["description"] and "default" not in field for field in properties.values())
     assert properties["x"]["anyOf"][0] == {"type": "number"}
-    assert properties["x"]["anyOf"][1:] == [{"enum": ["NaN", "Infinity", "-Infinity"], "type": "string"}]
+    assert properties["x"]["anyOf"][1:] == [
+        {"enum": ["NaN", "Infinity", "-Infinity"], "type": "string"}
+    ]
     assert schema["additionalProperties"] is False
 
 
@@ -152,7 +159,15 @@ def test_messages_are_compared_by_value() -> None:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"x": "nan"}, {"x": "1.0"}, {"timestamp": "NaN"}, {"xy_valid": "NaN"}, {"delta_xy": [1.0]}, {"x": [1.0]}]
+    "fields",
+    [
+        {"x": "nan"},
+        {"x": "1.0"},
+        {"timestamp": "NaN"},
+        {"xy_valid": "NaN"},
+        {"delta_xy": [1.0]},
+        {"x": [1.0]},
+    ],
 )
 def test_unexpected_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
     """The model accepts only the strings and lengths that its own JSON contains."""
@@ -174,7 +189,12 @@ def test_numpy_scalars_are_accepted() -> None:
     plain = {"timestamp": 2**63, "xy_reset_counter": 7, "xy_valid": True, "x": 1.5, "y": 0.5}
     assert message == VehicleLocalPosition.model_validate({**plain, "delta_xy": (1.5, math.nan)})
     assert {type(value) for value in message.__dict__.values()} == {int, bool, float, tuple}
-    wrong_values = {"xy_valid": np.uint8(1), "timestamp": np.int64(-1), "xy_reset_counter": np.uint16(256), "x": array}
+    wrong_values = {
+        "xy_valid": np.uint8(1),
+        "timestamp": np.int64(-1),
+        "xy_reset_counter": np.uint16(256),
+        "x": array,
+    }
     for name, wrong in wrong_values.items():
         rejection(**{name: wrong})
 
@@ -183,13 +203,20 @@ def test_array_element_is_accepted() -> None:
     """The columns of an element returned by `nedbus.read` are valid fields of a message."""
     [element] = to_array([VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))])
     fields = {name: element[name] for name in FIELD_TYPES}
-    assert VehicleLocalPosition(**fields) == VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))
+    assert VehicleLocalPosition(**fields) == VehicleLocalPosition(
+        timestamp=3, x=1.0, delta_vxy=(1.0, 2.0)
+    )
 
 
 @given(fields=fields(), names=st.sets(st.sampled_from(sorted(FIELD_TYPES))))
-def test_omitted_fields_are_the_same_on_the_fast_path(fields: dict[str, object], names: set[str]) -> None:
+def test_omitted_fields_are_the_same_on_the_fast_path(
+    fields: dict[str, object], names: set[str]
+) -> None:
     """The fast path creates and encodes a message with omitted fields exactly as the model's validator does."""
-    given_fields: dict[str, Any] = {"timestamp": fields["timestamp"], **{name: fields[name] for name in sorted(names)}}
+    given_fields: dict[str, Any] = {
+        "timestamp": fields["timestamp"],
+        **{name: fields[name] for name in sorted(names)},
+    }
     try:
         slow = VehicleLocalPosition.model_validate(given_fields)
     except ValidationError:

@@ -12,7 +12,15 @@ from hypothesis import given
 from pydantic import ValidationError
 
 from nedbus_msgs import VehicleLocalPosition, field_type
-from tests.flights.local_position import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
+from tests.flights.local_position import (
+    CURRENT,
+    FIELD_TYPES,
+    LAYOUTS,
+    downgrade,
+    find_layout,
+    layout_table,
+    upgrade,
+)
 from tests.nedbus_msgs.strategies import DATA, bits, messages
 
 SEEDS = json.loads((DATA / "seeds.json").read_text())
@@ -33,7 +41,9 @@ def test_fixture_matches_px4_page(name: str) -> None:
     if not path.exists():
         pytest.skip(f"page not found: {path.name}")
     rows = re.findall(
-        r"^(uint64|uint8|bool|float32(?:\[2\])?|float64)\s+(\w+)\s*(?=#|$)", path.read_text(), re.MULTILINE
+        r"^(uint64|uint8|bool|float32(?:\[2\])?|float64)\s+(\w+)\s*(?=#|$)",
+        path.read_text(),
+        re.MULTILINE,
     )
     assert [[field, kind] for kind, field in rows] == SEEDS[name]["fields"]
 
@@ -44,7 +54,10 @@ def test_layout_table_lists_px4_layouts() -> None:
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
         ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),
     ]  # fmt: skip
-    assert {layout.name: layout.wire for layout in LAYOUTS.values() if layout.wire is not None} == {"V0": 0, "1.16": 1}
+    assert {layout.name: layout.wire for layout in LAYOUTS.values() if layout.wire is not None} == {
+        "V0": 0,
+        "1.16": 1,
+    }
     assert [row["name"] for row in table] == list(LAYOUTS)
     assert CURRENT.fields == tuple(FIELD_TYPES)
     assert all(len(set(layout.fields)) == len(layout.fields) for layout in LAYOUTS.values())
@@ -69,14 +82,20 @@ def test_downgrade_and_upgrade_keep_common_fields(message: VehicleLocalPosition)
         assert bits(back) == bits(provided)
         if "hagl_max" in older:
             assert repr(older["hagl_max"]) == repr(message.hagl_max_z)
-            assert repr(lost.pop("hagl_max_z")) == repr(lost.pop("hagl_max_xy")) == repr(message.hagl_max_z)
+            assert (
+                repr(lost.pop("hagl_max_z"))
+                == repr(lost.pop("hagl_max_xy"))
+                == repr(message.hagl_max_z)
+            )
             assert {"hagl_max_z", "hagl_max_xy"} <= back.model_fields_set
         assert not set(lost) & back.model_fields_set
 
 
 def test_fields_missing_in_an_old_layout_are_not_provided() -> None:
     """Fields that 1.13 lacks are NaN, false or 0."""
-    older = downgrade(VehicleLocalPosition(timestamp=7, dead_reckoning=True, tilt_var=1.0, hagl_max_z=5.0), "1.13")
+    older = downgrade(
+        VehicleLocalPosition(timestamp=7, dead_reckoning=True, tilt_var=1.0, hagl_max_z=5.0), "1.13"
+    )
     message = upgrade(older)
     assert (message.dead_reckoning, message.dist_bottom_reset_counter) == (False, 0)
     assert math.isnan(message.tilt_var)
@@ -85,7 +104,9 @@ def test_fields_missing_in_an_old_layout_are_not_provided() -> None:
 
 def test_yaw_of_px4_1_11_becomes_heading() -> None:
     """In logs of PX4 up to 1.11, yaw is renamed to heading; unknown fields are ignored, missing ones not provided."""
-    message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
+    message = upgrade(
+        {"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0}
+    )
     assert (message.heading, message.x) == (0.5, 1.0)
     assert message.model_fields_set == {"timestamp", "x", "heading"}
 
@@ -107,7 +128,9 @@ def test_upgrade_validates_the_message() -> None:
         ("uint8[1]", (1, 2), None), ("uint8", (1,), None), ("uint8[1]", 1, None),
     ],
 )  # fmt: skip
-def test_number_fits_only_if_its_value_is_unchanged(kind: str, value: object, fitted: object) -> None:
+def test_number_fits_only_if_its_value_is_unchanged(
+    kind: str, value: object, fitted: object
+) -> None:
     """A number of another type, or a shorter array, is converted exactly or not at all."""
     found = field_type(kind).fit(value)
     assert found == fitted

@@ -18,7 +18,11 @@ from tests.peers.command_line import run_command
 
 SHARED: Final = LOGS.parents[1]
 FLIGHTS: Final = sorted(
-    [*LOGS.glob("*.ulg"), *SHARED.glob("data/px4/*.ulg"), *SHARED.glob("data/px4/ulog_stream/*.ulg")]
+    [
+        *LOGS.glob("*.ulg"),
+        *SHARED.glob("data/px4/*.ulg"),
+        *SHARED.glob("data/px4/ulog_stream/*.ulg"),
+    ]
 )
 SHORT_FLIGHTS: Final = ["boot_time_utc_us.ulg", "uxrce_unix_time.mcap", "fmu_in_topics.mcap"]
 DATA: Final = Path(__file__).parents[2] / "data"
@@ -27,20 +31,27 @@ MANY: Final = 1000  # messages, which are checked by columns
 ZEROS, NAN4 = (0.0,) * 4, (math.nan,) * 4
 
 PUBLISHED: Final[list[tuple[str, dict[str, Any]]]] = [
-    ("VehicleGlobalPosition", {"lat": -17.0, "lon": 180.0000156, "lat_lon_valid": True}),  # MapProjection::reproject
+    # MapProjection::reproject
+    ("VehicleGlobalPosition", {"lat": -17.0, "lon": 180.0000156, "lat_lon_valid": True}),
     ("VehicleGlobalPosition", {"lat": -17.0, "lon": -359.9}),
-    ("HomePosition", {"lat": -17.0, "lon": 180.01, "valid_hpos": True}),  # a copy of the global position
-    ("VehicleLocalPosition", {"ref_lat": -17.0, "ref_lon": 180.01, "xy_global": True}),  # an origin that was moved
-    ("SensorGps", {"latitude_deg": -17.0, "longitude_deg": -180.00001}),  # add_vector_to_global_position, for blending
+    # a copy of the global position
+    ("HomePosition", {"lat": -17.0, "lon": 180.01, "valid_hpos": True}),
+    # an origin that was moved
+    ("VehicleLocalPosition", {"ref_lat": -17.0, "ref_lon": 180.01, "xy_global": True}),
+    # add_vector_to_global_position, for blending
+    ("SensorGps", {"latitude_deg": -17.0, "longitude_deg": -180.00001}),
     ("SensorGps", {"eph": -1.0, "epv": -1.0}),  # DroneCAN without covariances
     ("SensorGps", {"timestamp_sample": 10_100_000}),  # PpsTimeSync::correct_gps_timestamp
-    ("VehicleOdometry", {"timestamp_sample": 10_100_000}),  # vision: a synchronised time of another computer
+    # vision: a synchronised time of another computer
+    ("VehicleOdometry", {"timestamp_sample": 10_100_000}),
     ("BatteryStatus", {"remaining": 1.27}),  # a DroneCAN battery: 127 %
-    ("BatteryStatus", {"remaining": 1.0001}),  # a current sensor that reads below 0 on a full battery
+    # a current sensor that reads below 0 on a full battery
+    ("BatteryStatus", {"remaining": 1.0001}),
     ("BatteryStatus", {"remaining": -0.01}),  # a MAVLink battery with an unknown charge
     ("VehicleAttitude", {"q": NAN4}),
     ("VehicleOdometry", {"q": ZEROS}),  # vision without attitude, as ODOMETRY is copied
-    ("VehicleOdometry", {"q": (1.05, 0.0, 0.0, 0.0)}),  # copied from ODOMETRY; EKF2 ignores its attitude
+    # copied from ODOMETRY; EKF2 ignores its attitude
+    ("VehicleOdometry", {"q": (1.05, 0.0, 0.0, 0.0)}),
 ]
 WRONG: Final[list[tuple[str, dict[str, Any], str]]] = [
     ("VehicleGlobalPosition", {"lon": 360.1}, "lon: must be within +-360"),
@@ -48,7 +59,8 @@ WRONG: Final[list[tuple[str, dict[str, Any], str]]] = [
     ("SensorGps", {"eph": -0.5}, "eph: must be 0 to inf, or -1 if unknown"),
     ("BatteryStatus", {"remaining": 2.1}, "remaining: must be -1 to 2"),
     ("BatteryStatus", {"remaining": -1.1}, "remaining: must be -1 to 2"),
-    ("VehicleAttitude", {"q": ZEROS}, "q: must have norm 1"),  # in logs that PX4's replay module wrote
+    # in logs that PX4's replay module wrote
+    ("VehicleAttitude", {"q": ZEROS}, "q: must have norm 1"),
     ("VehicleAttitude", {"q": (1.05, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
     ("VehicleAttitude", {"q": (1e-3, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
     ("VehicleOdometry", {"q": (1.2, 0.0, 0.0, 0.0)}, "q: must have norm 1"),
@@ -79,7 +91,9 @@ def test_values_of_sound_flights_are_valid(name: str, fields: dict[str, Any]) ->
 
 
 @pytest.mark.parametrize(("name", "fields", "reason"), WRONG, ids=str)
-def test_values_beyond_px4s_range_are_rejected(name: str, fields: dict[str, Any], reason: str) -> None:
+def test_values_beyond_px4s_range_are_rejected(
+    name: str, fields: dict[str, Any], reason: str
+) -> None:
     """Values that no code of PX4 can publish are rejected with the reason."""
     valid, why = is_valid(name, fields)
     assert not valid
@@ -97,7 +111,9 @@ def test_page_lists_every_rule() -> None:
         for rule in definition.rules:
             names = rule.flags or [check.field for check in rule.checks]
             missing = [name for name in names if f"`{name}`" not in rules]
-            assert missing == [], f"{definition.name}: add a row with the code of PX4 that publishes the field"
+            assert missing == [], (
+                f"{definition.name}: add a row with the code of PX4 that publishes the field"
+            )
 
 
 def test_longitudes_are_wrapped_where_they_are_used() -> None:
@@ -106,8 +122,12 @@ def test_longitudes_are_wrapped_where_they_are_used() -> None:
         estimate = VehicleGlobalPosition(
             timestamp=1, lat=-17.0, lon=longitude, alt=1.0, lat_lon_valid=True, alt_valid=True
         )
-        home = HomePosition(timestamp=1, lat=-17.0, lon=longitude, alt=1.0, valid_hpos=True, valid_alt=True)
-        gps = SensorGps(timestamp=1, latitude_deg=-17.0, longitude_deg=longitude, altitude_msl_m=1.0, fix_type=3)
+        home = HomePosition(
+            timestamp=1, lat=-17.0, lon=longitude, alt=1.0, valid_hpos=True, valid_alt=True
+        )
+        gps = SensorGps(
+            timestamp=1, latitude_deg=-17.0, longitude_deg=longitude, altitude_msl_m=1.0, fix_type=3
+        )
         assert (estimate.lon, home.lon, gps.longitude_deg) == (longitude,) * 3
         positions = estimate.global_position, home.global_position, gps.global_position
         assert {position and position.longitude for position in positions} == {wrapped}
@@ -127,7 +147,9 @@ def test_no_message_of_a_short_flight_is_rejected(tmp_path: Path, name: str) -> 
     """All messages of short recordings are valid, and none contradicts the estimate."""
     result = run_command("convert", str(DATA / name), str(tmp_path / "a.mcap"), "--topics", "*")
     assert (result.exit_code, "rejected" in result.out + result.err) == (0, False), result
-    assert [event.text for event in nedbus.events(DATA / name) if event.kind.endswith("_contradicted")] == []
+    assert [
+        event.text for event in nedbus.events(DATA / name) if event.kind.endswith("_contradicted")
+    ] == []
 
 
 @pytest.mark.slow

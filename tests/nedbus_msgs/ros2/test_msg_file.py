@@ -9,7 +9,16 @@ from contextlib import suppress
 import pytest
 from pydantic import ValidationError
 
-from nedbus_msgs import MESSAGES, MsgError, define_msg, definition_text, hash_of, hash_of_msg, read_msg, ros2_type
+from nedbus_msgs import (
+    MESSAGES,
+    MsgError,
+    define_msg,
+    definition_text,
+    hash_of,
+    hash_of_msg,
+    read_msg,
+    ros2_type,
+)
 from tests.flights.local_position import decode, encode
 from tests.nedbus_msgs.strategies import DATA
 
@@ -39,8 +48,15 @@ def test_nested_messages_are_flattened_and_hashed() -> None:
     assert hash_of_msg("PositionSetpointTriplet", TRIPLET) == TRIPLET_HASH
     definition = define_msg("PositionSetpointTriplet", TRIPLET)
     assert len(definition.types) == 61
-    assert list(definition.types)[:4] == ["timestamp", "previous_timestamp", "previous_valid", "previous_type"]
-    many = define_msg("Many", f"uint64 timestamp\nPart[2] parts{NESTED}Part\nuint8[3] of\nbool is\n")
+    assert list(definition.types)[:4] == [
+        "timestamp",
+        "previous_timestamp",
+        "previous_valid",
+        "previous_type",
+    ]
+    many = define_msg(
+        "Many", f"uint64 timestamp\nPart[2] parts{NESTED}Part\nuint8[3] of\nbool is\n"
+    )
     assert list(many.types) == ["timestamp", "parts_0_of", "parts_0_is", "parts_1_of", "parts_1_is"]
 
 
@@ -50,8 +66,13 @@ def test_byte_and_char_are_hashed_as_in_ros_2() -> None:
     hashes = {kind: hash_of_msg("Probe", text.format(kind)) for kind in ("uint8", "byte")}
     assert hashes["uint8"] != hashes["byte"]
     single = "uint64 timestamp\n{} flags\n"
-    assert hash_of_msg("Probe", single.format("char")) == hash_of_msg("Probe", single.format("uint8"))
-    assert define_msg("Probe", text.format("byte")).types == define_msg("Probe", text.format("uint8")).types
+    assert hash_of_msg("Probe", single.format("char")) == hash_of_msg(
+        "Probe", single.format("uint8")
+    )
+    assert (
+        define_msg("Probe", text.format("byte")).types
+        == define_msg("Probe", text.format("uint8")).types
+    )
 
 
 def test_annotations_become_rules() -> None:
@@ -76,7 +97,13 @@ def test_annotations_become_rules() -> None:
     for share in (0.0, 1.0, -1.0, float("nan")):
         definition.model.model_validate({"timestamp": 1, "share": share})
     definition.model.model_validate({"timestamp": 1, "pair": (0.1, 5.0)})
-    for wrong in ({"share": 1.5}, {"share": -0.5}, {"pair": (0.2, 0.05)}, {"steer": 2.0}, {"letters": "long"}):
+    for wrong in (
+        {"share": 1.5},
+        {"share": -0.5},
+        {"pair": (0.2, 0.05)},
+        {"steer": 2.0},
+        {"letters": "long"},
+    ):
         with pytest.raises(ValidationError):
             definition.model.model_validate({"timestamp": 1, **wrong})
 
@@ -90,15 +117,30 @@ def test_annotations_become_rules() -> None:
         ("uint64 timestamp\nfloat32[] x\n", r"line 2, column 1: 'float32\[\]' is not a type"),
         ("uint64 timestamp\nfloat32[<=4] x\n", r"line 2, column 1: expected a field, such as"),
         ("uint64 timestamp\nstring name\n", r"line 2, column 1: 'string' is not a type"),
-        ("uint64 timestamp\nfloat32[100000] x\n", r"line 2, column 1: array of 100000 elements; expected 1 to 1024"),
+        (
+            "uint64 timestamp\nfloat32[100000] x\n",
+            r"line 2, column 1: array of 100000 elements; expected 1 to 1024",
+        ),
         ("uint64 timestamp\nbool x\nuint8  x\n", r"line 3, column 8: duplicate field 'x'"),
         ("uint64 timestamp\nOther other\n", r"line 2, column 1: 'Other' is not a type"),
-        (f"uint64 timestamp\nSelf a{NESTED}Self\nSelf a\n", r"line 5, column 1: 'Self' is not a type"),
+        (
+            f"uint64 timestamp\nSelf a{NESTED}Self\nSelf a\n",
+            r"line 5, column 1: 'Self' is not a type",
+        ),
         ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: unsupported constant type 'Other'"),
         ("uint64 timestamp\nuint8 Upper\n", r"line 2, column 1: invalid field name 'Upper'"),
-        ("uint64 timestamp\n  float32 range; # [m]\n", r"line 2, column 3: invalid field name 'range;'"),
-        (f"uint64 timestamp\nPart a{NESTED}Part\nbool B\n", r"line 5, column 1: invalid field name 'a_B'"),
-        ("uint64 timestamp\nfloat32 copy\n", r"line 2, column 1: invalid field name 'copy', which is a member of"),
+        (
+            "uint64 timestamp\n  float32 range; # [m]\n",
+            r"line 2, column 3: invalid field name 'range;'",
+        ),
+        (
+            f"uint64 timestamp\nPart a{NESTED}Part\nbool B\n",
+            r"line 5, column 1: invalid field name 'a_B'",
+        ),
+        (
+            "uint64 timestamp\nfloat32 copy\n",
+            r"line 2, column 1: invalid field name 'copy', which is a member of",
+        ),
         (f"uint64 timestamp\nfloat32 a_b\nBar a{NESTED}Bar\nfloat32 b\n", r"duplicate field 'a_b'"),
         (
             f"uint64 timestamp\nA[20] a{NESTED}A\nB[20] b{NESTED}B\nC[20] c{NESTED}C\n",
@@ -127,24 +169,45 @@ def test_invalid_sentinel_survives_float32_rounding() -> None:
 
 @pytest.mark.parametrize(
     "rest",
-    [" x [m] [@range 0, 100]", " x [m", " x 5 m", " x true5", "[2] x [1 2]", " A=foo", " A =", " A=1 [m]", ' x "a'],
+    [
+        " x [m] [@range 0, 100]",
+        " x [m",
+        " x 5 m",
+        " x true5",
+        "[2] x [1 2]",
+        " A=foo",
+        " A =",
+        " A=1 [m]",
+        ' x "a',
+    ],
 )
 def test_text_that_is_no_comment_raises(rest: str) -> None:
     """A missing # is reported; without the error, the annotations after it would be ignored."""
-    with pytest.raises(MsgError, match=r"line 2, column 2: expected a field, such as 'float32\[4\] q  # comment'"):
+    with pytest.raises(
+        MsgError, match=r"line 2, column 2: expected a field, such as 'float32\[4\] q  # comment'"
+    ):
         read_msg(f"uint64 timestamp\n float32{rest}\n")
 
 
-@pytest.mark.parametrize("annotation", ["[@range 0; 9]", "[@range 0, 9", "[@range]", "@range 0-9", "[@range 0, 9 m]"])
+@pytest.mark.parametrize(
+    "annotation", ["[@range 0; 9]", "[@range 0, 9", "[@range]", "@range 0-9", "[@range 0, 9 m]"]
+)
 def test_malformed_range_raises(annotation: str) -> None:
-    with pytest.raises(MsgError, match=r"line 2, column 1: malformed @range of x; expected limits, such as \[@range"):
+    with pytest.raises(
+        MsgError,
+        match=r"line 2, column 1: malformed @range of x; expected limits, such as \[@range",
+    ):
         define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # [m] {annotation}\n")
 
 
-@pytest.mark.parametrize(("annotation", "limits"), [("5, 0", "5 to 0"), ("inf, 1.5 @invalid 3", "inf to 1.5")])
+@pytest.mark.parametrize(
+    ("annotation", "limits"), [("5, 0", "5 to 0"), ("inf, 1.5 @invalid 3", "inf to 1.5")]
+)
 def test_empty_range_raises(annotation: str, limits: str) -> None:
     """Limits in the wrong order, which would reject every message, are an error of the file; equal ones are not."""
-    with pytest.raises(MsgError, match=f"line 2, column 1: no number is in the @range of x, from {limits}"):
+    with pytest.raises(
+        MsgError, match=f"line 2, column 1: no number is in the @range of x, from {limits}"
+    ):
         define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # @range {annotation}\n")
     assert define_msg("Right", "uint64 timestamp\nfloat32 x  # @range 1, 1\n").rules
 
@@ -207,7 +270,9 @@ def test_ros_2_syntax_is_accepted(line: str) -> None:
         "uint8 a [" + "1, " * 80_000,
         "uint8 a" + " " * 200_000 + "b",
         f"A[20] a{NESTED}A\nuint8 b #" + "@range " * 30_000,
-        f"A[20] a{NESTED}A\nB[20] b{NESTED}B\n" + "".join(f"C[0] c{i}\n" for i in range(20)) + f"{NESTED}C\nbool d",
+        f"A[20] a{NESTED}A\nB[20] b{NESTED}B\n"
+        + "".join(f"C[0] c{i}\n" for i in range(20))
+        + f"{NESTED}C\nbool d",
         "A[20] " + "a" * 20_000 + f"{NESTED}A\nuint8 b",
     ],
     ids=["fields", "spaces", "digits", "list", "default", "comment", "empty arrays", "long name"],

@@ -30,10 +30,15 @@ from tests.flights.local_position import (
     upgrade,
 )
 
-NAMESPACES = st.lists(st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,9}", fullmatch=True), max_size=3).map("/".join)
+NAMESPACES = st.lists(st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,9}", fullmatch=True), max_size=3).map(
+    "/".join
+)
 ADDRESSES = st.sampled_from(sorted(TOPICS)).flatmap(
     lambda topic: st.builds(
-        Address, st.just("7"), st.just(topic), st.integers(0, 255) if TOPICS[topic].instances else st.none()
+        Address,
+        st.just("7"),
+        st.just(topic),
+        st.integers(0, 255) if TOPICS[topic].instances else st.none(),
     )
 )
 
@@ -49,8 +54,16 @@ def test_topic_round_trip(address: Address, namespace: str, slash: str) -> None:
     ("address", "namespace", "name"),
     [
         (Address("1", "vehicle_local_position"), "", "fmu/out/vehicle_local_position"),
-        (Address("1", "estimator_local_position", 0), "px4_1", "px4_1/fmu/out/estimator_local_position_0"),
-        (Address("1", "vehicle_local_position"), "/fleet/a/", "fleet/a/fmu/out/vehicle_local_position"),
+        (
+            Address("1", "estimator_local_position", 0),
+            "px4_1",
+            "px4_1/fmu/out/estimator_local_position_0",
+        ),
+        (
+            Address("1", "vehicle_local_position"),
+            "/fleet/a/",
+            "fleet/a/fmu/out/vehicle_local_position",
+        ),
     ],
 )
 def test_topic_name_matches_px4(address: Address, namespace: str, name: str) -> None:
@@ -73,12 +86,16 @@ def test_topic_name_matches_px4(address: Address, namespace: str, name: str) -> 
         ("fmu/out/wheel_encoders_1", ("", "wheel_encoders", 1)),
     ],
 )
-def test_variants_of_topic_names_are_accepted(name: str, parts: tuple[str, str, int | None]) -> None:
+def test_variants_of_topic_names_are_accepted(
+    name: str, parts: tuple[str, str, int | None]
+) -> None:
     """A version suffix is ignored, an instance may lack its underscore, and instance 0 may lack its number."""
     assert split_ros2_topic(name) == parts
 
 
-@pytest.mark.parametrize("name", ["", "/", "fmu/out/Attitude", "fmu/out/vehicle_local_position_x", "a_/", "fmu/out/_0"])
+@pytest.mark.parametrize(
+    "name", ["", "/", "fmu/out/Attitude", "fmu/out/vehicle_local_position_x", "a_/", "fmu/out/_0"]
+)
 def test_invalid_topic_name_raises(name: str) -> None:
     """A name that no PX4 topic can have, or a misspelled one, raises AddressError."""
     with pytest.raises(AddressError, match="topic"):

@@ -11,7 +11,14 @@ import typer
 
 from nedbus import Bus, __version__, bridges, monitoring, web as page
 from nedbus.bridges import FOXGLOVE_PORT
-from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicsOption, VehiclesOption, command
+from nedbus.cli.options import (
+    ALL,
+    FilesArgument,
+    InstanceOption,
+    TopicsOption,
+    VehiclesOption,
+    command,
+)
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.endpoints import is_loopback, split_http
@@ -28,9 +35,15 @@ _ORIGIN: Final = "Additional host name of this page, for example of a proxy; rep
 _LAYOUT: Final = f"PX4 release of px4_msgs in the ROS 2 workspace: {', '.join(RELEASES)}"
 _TO: Final = "ROS 2's router (default: nedbus's router)"
 
-MapOption = Annotated[Path | None, typer.Option("--map", exists=True, dir_okay=False, metavar="FILE", help=_MAP)]
-NamespaceOption = Annotated[list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help=_NAMESPACE)]
-HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Address to listen on (port 0: any free)")]
+MapOption = Annotated[
+    Path | None, typer.Option("--map", exists=True, dir_okay=False, metavar="FILE", help=_MAP)
+]
+NamespaceOption = Annotated[
+    list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help=_NAMESPACE)
+]
+HttpOption = Annotated[
+    str, typer.Option("--http", metavar="HOST:PORT", help="Address to listen on (port 0: any free)")
+]
 
 
 @command
@@ -58,7 +71,9 @@ def web(
             write_stderr(_OPEN % http)
 
     if files:
-        run_until_stopped(lambda stop: page.serve_recording(files, options, stop=stop, on_listening=on_listening))
+        run_until_stopped(
+            lambda stop: page.serve_recording(files, options, stop=stop, on_listening=on_listening)
+        )
         return
     serve_live = partial(page.serve_live, version=__version__, on_listening=on_listening)
     with open_bus() as bus:
@@ -66,13 +81,16 @@ def web(
 
 
 @command
-def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464") -> None:
+def export(
+    open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464"
+) -> None:
     """Serve Prometheus metrics of all streams, measured by a subscriber, until Ctrl-C.
 
     Use it for routers without a nedbus service; a service serves its own metrics (serve --http).
     """
     _split_http("--http", http)
-    make_exporter = monitoring.Exporter  # raises ConfigError without the extra, before a bus is opened
+    # raises ConfigError without the extra, before a bus is opened
+    make_exporter = monitoring.Exporter
     with open_bus() as bus:
         exporter = make_exporter(bus, selection, version=__version__)
         with serve_pages(http, exporter.pages):
@@ -81,16 +99,22 @@ def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: Htt
 
 @command
 def foxglove(
-    open_bus: Callable[[], Bus], *, vehicle: VehiclesOption = None, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
+    open_bus: Callable[[], Bus],
+    *,
+    vehicle: VehiclesOption = None,
+    http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}",
 ) -> None:
     """Serve live vehicles to Foxglove until Ctrl-C.
 
     Foxglove can plot every field, and show poses in 3D and positions on a map.
     """
     host, port = _split_http("--http", http)
-    make_server = bridges.FoxgloveServer  # raises ConfigError without the extra, before a bus is opened
+    # raises ConfigError without the extra, before a bus is opened
+    make_server = bridges.FoxgloveServer
     with open_bus() as bus, make_server(bus, host=host, port=port) as server:
-        write_stderr(f"in Foxglove, choose Open connection > Foxglove WebSocket, and enter {server.url}")
+        write_stderr(
+            f"in Foxglove, choose Open connection > Foxglove WebSocket, and enter {server.url}"
+        )
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle or ANY)))
 
 
@@ -99,9 +123,13 @@ def ros2(
     bus: Bus,
     selection: Selection = ALL,
     *,
-    humble: Annotated[bool, typer.Option("--humble", help="Use ROS 2 Humble's keys, without type hash")] = False,
+    humble: Annotated[
+        bool, typer.Option("--humble", help="Use ROS 2 Humble's keys, without type hash")
+    ] = False,
     layout: Annotated[str, typer.Option(help=_LAYOUT)] = RELEASES[-1],
-    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain id")] = 0,
+    domain: Annotated[
+        int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain id")
+    ] = 0,
     namespace: NamespaceOption = None,
     to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=_TO)] = None,
 ) -> None:
@@ -113,7 +141,9 @@ def ros2(
     try:
         session, observer = bus.open_session(to), bus.open_session(to)
     except ConnectError as exc:
-        raise NedbusError(f"no router answers at {to}: start ROS 2's router there, or correct --to") from exc
+        raise NedbusError(
+            f"no router answers at {to}: start ROS 2's router there, or correct --to"
+        ) from exc
     with closing(session), closing(observer):
         bridge = bridges.Ros2Bridge(
             bus, session, observer=observer, selection=selection, layout=layout, domain=domain, hashed=not humble,
@@ -126,7 +156,11 @@ def ros2(
 def serve_pages(where: str, pages: Mapping[str, Callable[[], monitoring.Page]]) -> Iterator[None]:
     """Serve pages on HOST:PORT inside a `with` block."""
     with closing(monitoring.HttpServer(where, pages)):
-        _log.info("serving http://%s/metrics, /healthz, /readyz, /vehicles and /status", where, extra=about("http"))
+        _log.info(
+            "serving http://%s/metrics, /healthz, /readyz, /vehicles and /status",
+            where,
+            extra=about("http"),
+        )
         if not is_loopback(split_http(where)[0]):
             _log.warning(_OPEN, where, extra=about("http"))
         yield

@@ -42,11 +42,21 @@ def health(
     bus: Bus,
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help=_REQUIRED)] = None,
-    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N services, on any host")] = None,
-    max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Maximum age of the newest message")] = 3.0,
-    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="Require these vehicles, on any host")] = None,
-    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N vehicles, on any host")] = None,
-    valid: Annotated[str | None, typer.Option(metavar="xy,z", help="Require valid estimates: xy, z, vxy, vz")] = None,
+    services: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Require N services, on any host")
+    ] = None,
+    max_age: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="Maximum age of the newest message")
+    ] = 3.0,
+    expect: Annotated[
+        str | None, typer.Option(metavar="1,2,7", help="Require these vehicles, on any host")
+    ] = None,
+    vehicles: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Require N vehicles, on any host")
+    ] = None,
+    valid: Annotated[
+        str | None, typer.Option(metavar="xy,z", help="Require valid estimates: xy, z, vxy, vz")
+    ] = None,
     within: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help=_WITHIN)] = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -58,27 +68,48 @@ def health(
     other hosts. --vehicle queries the vehicle's publisher, as any client would. --valid and --within use the event
     history of the services. A vehicle that has been silent for an hour is considered switched off, not faulty.
     """
-    required = dict.fromkeys([*_parse_names("--expect", expect), *([] if vehicle is None else [vehicle])])
+    required = dict.fromkeys(
+        [*_parse_names("--expect", expect), *([] if vehicle is None else [vehicle])]
+    )
     for name in required:
         check_vehicle(name)
     estimates = _parse_names("--valid", valid)
     if unknown := [each for each in estimates if each not in VALID]:
         raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
-    check = _Check(bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within))
+    check = _Check(
+        bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within)
+    )
     faults = [*check.service_faults(), *check.vehicle_faults()]
     for remark in check.outdated:
         if remark not in faults:
             write_stderr(to_text(f"nedbus: {remark}", MAX_TEXT))
     if json_output:
-        counts = {"services": len(check.services), "sources": len(check.sources), "vehicles": check.ages}
-        write(json.dumps({"healthy": not faults, "reason": faults[0] if faults else None, **counts, "faults": faults}))
+        counts = {
+            "services": len(check.services),
+            "sources": len(check.sources),
+            "vehicles": check.ages,
+        }
+        write(
+            json.dumps(
+                {
+                    "healthy": not faults,
+                    "reason": faults[0] if faults else None,
+                    **counts,
+                    "faults": faults,
+                }
+            )
+        )
     if faults:
         for fault in faults[:-1]:
             write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
         raise NedbusError(faults[-1])
     if not json_output:
-        newest = f"{format_duration(min(check.ages.values()))} old" if check.ages else "of unknown age"
-        found = f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
+        newest = (
+            f"{format_duration(min(check.ages.values()))} old" if check.ages else "of unknown age"
+        )
+        found = (
+            f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
+        )
         write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest}")
 
 
@@ -95,17 +126,28 @@ class _Check:
     `ages`: age of each vehicle's newest message [s]. `outdated`: a line for each older service.
     """
 
-    def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        vehicle: str | None,
+        count: int | None,
+        max_age: float,
+        expected: Expectation,
+    ) -> None:
         self._vehicle = vehicle
         self._count = count
         self._max_age = max_age
         self._expected = expected
         self._routers = " or ".join(bus.routers)
         self._is_local = count is None and not expected.expect and expected.vehicles is None
-        self._statuses = [each for each in bus.services() if not self._is_local or each.host == _HOST]
+        self._statuses = [
+            each for each in bus.services() if not self._is_local or each.host == _HOST
+        ]
         self.services = dict.fromkeys(each.service for each in self._statuses)
         self.outdated = describe_outdated(self._statuses)
-        self.sources = {(each.service, source.source) for each in self._statuses for source in each.sources}
+        self.sources = {
+            (each.service, source.source) for each in self._statuses for source in each.sources
+        }
         # A source occurs once for each of its vehicles.
         self._sources = [source for status in self._statuses for source in status.sources]
         self.ages: dict[str, float] = {}  # as measured by the services
@@ -120,8 +162,14 @@ class _Check:
         self._publishers = bus.publishers()
         self._answers: list[Sample[Message]] = []
         if expected.expect or expected.vehicles is not None:
-            only = expected.expect[0] if len(expected.expect) == 1 and expected.vehicles is None else ANY
-            self._answers = [sample for sample in bus.latest(ANY, vehicle=only) if not sample.stored]
+            only = (
+                expected.expect[0]
+                if len(expected.expect) == 1 and expected.vehicles is None
+                else ANY
+            )
+            self._answers = [
+                sample for sample in bus.latest(ANY, vehicle=only) if not sample.stored
+            ]
         # The status also lists streams that the router's access rules drop.
         self._is_refused = False
         if vehicle is not None:
@@ -134,7 +182,9 @@ class _Check:
 
     def service_faults(self) -> Iterator[str]:
         """Yield at most one fault: of a service or a source, or that the newest message is missing or too old."""
-        refused = sorted({to_text(name, 64) for status in self._statuses for name in status.refused})
+        refused = sorted(
+            {to_text(name, 64) for status in self._statuses for name in status.refused}
+        )
         failed = [source for source in self._sources if source.state in {"retrying", "failed"}]
         if self._count is not None and len(self.services) < self._count:
             yield f"{len(self.services)} of {self._count} services answer at {self._routers}"
@@ -148,12 +198,20 @@ class _Check:
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
         elif overloaded := [each for each in self._sources if each.overload]:
             yield f"{to_text(overloaded[0].source)}: {to_text(overloaded[0].overload, 300)}"
-        elif not self.ages and (self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)):
-            texts = (f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self._sources)
+        elif not self.ages and (
+            self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)
+        ):
+            texts = (
+                f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self._sources
+            )
             states = ", ".join(dict.fromkeys(texts))
             others = sorted({each.vehicle for each in self._publishers} - {self._vehicle})[:20]
             only = f" (published: {', '.join(others)})" if others and not self._is_refused else ""
-            what = f"vehicle {self._vehicle} is not published{only}" if self._vehicle else "no vehicle is published"
+            what = (
+                f"vehicle {self._vehicle} is not published{only}"
+                if self._vehicle
+                else "no vehicle is published"
+            )
             yield f"{what}{_REFUSED if self._is_refused else f': {states[:300]}' if states else ''}"
         elif self.ages and min(self.ages.values()) > self._max_age:
             name = min(self.ages, key=lambda each: self.ages[each])
@@ -166,16 +224,20 @@ class _Check:
         others = [
             sample
             for sample in self._answers
-            if sample.vehicle not in self._known and (sample.latency is None or sample.latency <= self._max_age)
+            if sample.vehicle not in self._known
+            and (sample.latency is None or sample.latency <= self._max_age)
         ]
         shared = {address.vehicle for address, count in self._publishers.items() if count > 1}
-        for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
+        for name in sorted(
+            shared.intersection(self.ages if self._is_local or self._vehicle else shared)
+        ):
             if not expected.expect or name in expected.expect:
                 yield f"vehicle {name} has several publishers: stop one, or give it another vehicle id"
         reports = [*self._reports, AccountReport("", _HOST, 0.0, _reports_of(others))]
         faults = faults_of(reports, expected, only=_HOST if self._is_local else None)
         for fault in (*faults, *self._faults_of_answers(faults)):
-            if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
+            # reported above
+            if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):
                 yield fault
         yield from self._faults_of_history()
 
@@ -196,7 +258,8 @@ class _Check:
                 yield from faults_of([AccountReport("", _HOST, 0.0, own)], asked)
 
     def _faults_of_history(self) -> Iterator[str]:
-        if not self._expected.expect:  # else the vehicles are asked, and an unrelated service is no fault of theirs
+        # else the vehicles are asked, and an unrelated service is no fault of theirs
+        if not self._expected.expect:
             yield from self.outdated
         if self._expected.valid or self._expected.within is not None:
             with_history = {report.service for report in self._reports}
@@ -212,9 +275,15 @@ def _reports_of(answers: Iterable[Sample[Message]]) -> dict[str, VehicleReport]:
     for sample in answers:
         if sample.topic == DEFAULT_TOPIC:
             unknown = tuple(sample.missing.intersection(VALID.values()))
-            invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
+            invalid = [
+                flag
+                for flag in VALID.values()
+                if flag not in unknown and not getattr(sample.message, flag)
+            ]
             flags = dict.fromkeys(invalid)
-            vehicles[sample.vehicle] = VehicleReport("info", "ok", flags=flags, has_position=True, unknown=unknown)
+            vehicles[sample.vehicle] = VehicleReport(
+                "info", "ok", flags=flags, has_position=True, unknown=unknown
+            )
         vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
     return vehicles
 
@@ -225,7 +294,9 @@ def doctor(
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help=_EXAMINED)] = None,
     mavlink: Annotated[str | None, typer.Option(metavar="LINK", help=_LINK)] = None,
-    rules: Annotated[Path | None, typer.Option(metavar="FILE", help=_RULES, show_default=False)] = None,
+    rules: Annotated[
+        Path | None, typer.Option(metavar="FILE", help=_RULES, show_default=False)
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Diagnose why no messages arrive.
@@ -235,7 +306,9 @@ def doctor(
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    findings = examine(read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink, rules=rules)
+    findings = examine(
+        read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink, rules=rules
+    )
     state = worst_state(findings)
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
@@ -253,9 +326,13 @@ def doctor(
 
 @command
 def check(
-    files: Annotated[list[Path] | None, typer.Argument(metavar="CONFIG", help=_CONFIGS, show_default=False)] = None,
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="CONFIG", help=_CONFIGS, show_default=False)
+    ] = None,
     *,
-    offline: Annotated[bool, typer.Option("--offline", help="Check only the text of the files")] = False,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Check only the text of the files")
+    ] = False,
 ) -> None:
     """Check settings and router files.
 
@@ -264,7 +341,11 @@ def check(
     mistakes = [] if files else check_service(offline=offline)
     for file in files or ():
         is_toml = file.suffix == ".toml"
-        mistakes += check_service(file, offline=offline) if is_toml else check_router_file(file, offline=offline)
+        mistakes += (
+            check_service(file, offline=offline)
+            if is_toml
+            else check_router_file(file, offline=offline)
+        )
     report_mistakes(mistakes)
 
 

@@ -25,7 +25,9 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus_msgs import Address, Selection, check_max_rate
 
 _MAX_RATE: Final = "Downsample each stream at its publisher to this rate, in Hz"
-_EVERY: Final = "Print every message in order; a replay at speed=max waits for this terminal or pipe"
+_EVERY: Final = (
+    "Print every message in order; a replay at speed=max waits for this terminal or pipe"
+)
 
 
 @command
@@ -34,13 +36,19 @@ def echo(
     selection: Selection = POSITIONS,
     *,
     field: FieldOption = None,
-    full: Annotated[bool, typer.Option("--full", "-f", help="Print all fields, one per line")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", "-f", help="Print all fields, one per line")
+    ] = False,
     every: Annotated[bool, typer.Option("--every", help=_EVERY)] = False,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
-    interval: Annotated[float, typer.Option(min=0.0, help="Minimum time between messages of a stream, in s")] = 0.0,
+    interval: Annotated[
+        float, typer.Option(min=0.0, help="Minimum time between messages of a stream, in s")
+    ] = 0.0,
     max_rate: Annotated[float | None, typer.Option(metavar="HZ", help=_MAX_RATE)] = None,
-    once: Annotated[bool, typer.Option("--once", help="Stop after one message, same as --count 1")] = False,
+    once: Annotated[
+        bool, typer.Option("--once", help="Stop after one message, same as --count 1")
+    ] = False,
     count: CountOption = None,
     duration: DurationOption = None,
 ) -> None:
@@ -69,7 +77,11 @@ def echo(
     with (
         open_bus() as bus,
         bus.subscribe(
-            *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode=mode, max_rate=max_rate
+            *selection.topics,
+            vehicle=selection.vehicles,
+            instance=selection.instance,
+            mode=mode,
+            max_rate=max_rate,
         ) as subscription,
     ):
         try:
@@ -77,7 +89,17 @@ def echo(
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has read enough
                 counts = subscription.counts
-                if csv_output or counts.lost or counts.dropped or counts.invalid or counts.discarded:
-                    unread = f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"
+                if (
+                    csv_output
+                    or counts.lost
+                    or counts.dropped
+                    or counts.invalid
+                    or counts.discarded
+                ):
+                    unread = (
+                        f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"
+                    )
                     text = f"{counts.received} received, {counts.lost} lost, {unread}, {counts.invalid} invalid"
-                    write_stderr(f"{text}, {counts.discarded} discarded" if counts.discarded else text)
+                    write_stderr(
+                        f"{text}, {counts.discarded} discarded" if counts.discarded else text
+                    )

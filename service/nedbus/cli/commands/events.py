@@ -49,7 +49,9 @@ def events(
     *,
     vehicle: VehiclesOption = None,
     within: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help=_WITHIN)] = None,
-    severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
+    severity: Annotated[
+        str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")
+    ] = "info",
     origin: Annotated[str, typer.Option(metavar="px4|nedbus", help=_ORIGIN)] = ANY,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
@@ -64,11 +66,20 @@ def events(
     """
     allow_one({"--json": json_output, "--csv": csv_output})
     selection = Selection(ANY, vehicle or ANY)
-    for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):
+    for option, value, choices in (
+        ("--severity", severity, SEVERITIES),
+        ("--origin", origin, ("px4", "nedbus", ANY)),
+    ):
         if value not in choices:
             raise ConfigError(option, f"{value!r}: expected {' or '.join(choices)}")
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
-    form = (lambda *each: json.dumps(_to_fields(*each))) if json_output else _to_csv if csv_output else to_line
+    form = (
+        (lambda *each: json.dumps(_to_fields(*each)))
+        if json_output
+        else _to_csv
+        if csv_output
+        else to_line
+    )
 
     def begin(times: Times, clocks: set[str]) -> None:
         if csv_output:
@@ -77,8 +88,16 @@ def events(
             write_stderr(f"times: {times.describe(clocks)}")
 
     def select(found: Iterable[Event]) -> list[Event]:
-        chosen = [event for event in found if event.severity in severities and origin in (ANY, event.origin)]
-        return [event for event in chosen if event.vehicle == ANY or selection.matches_vehicle(event.vehicle)]
+        chosen = [
+            event
+            for event in found
+            if event.severity in severities and origin in (ANY, event.origin)
+        ]
+        return [
+            event
+            for event in chosen
+            if event.vehicle == ANY or selection.matches_vehicle(event.vehicle)
+        ]
 
     def show(found: Iterable[Event], times: Times) -> None:
         for event in select(found):
@@ -92,7 +111,9 @@ def events(
             _follow(bus, live, lambda new: show(new, times), duration)
         return
     if within is not None or duration is not None:
-        raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
+        raise ConfigError(
+            "--within" if within is not None else "--duration", "needs live vehicles, not a file"
+        )
     history = _read(files)
     _require_vehicles(_name(files), history.vehicles, vehicle or ())
     selected = select(history)
@@ -100,9 +121,13 @@ def events(
     unknown = {"boot"} if times.remarks.keys() - times.offsets.keys() else set()
     begin(times, {times.clock(event) for event in selected} or unknown)
     show(selected, times)
-    initial = {name: text for name, text in history.from_start.items() if selection.matches_vehicle(name)}
+    initial = {
+        name: text for name, text in history.from_start.items() if selection.matches_vehicle(name)
+    }
     if initial:
-        write_stderr("\n".join(f"{name}: {text}, throughout the file" for name, text in initial.items()))
+        write_stderr(
+            "\n".join(f"{name}: {text}, throughout the file" for name, text in initial.items())
+        )
     elif not selected:
         limit = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
         write_stderr(f"{_name(files)}: no events{limit} in {history.end:.0f} s")
@@ -115,7 +140,9 @@ def why(
     *,
     vehicle: VehiclesOption = None,
     at: Annotated[str | None, typer.Option(metavar="TIME", help=_AT)] = None,
-    details: Annotated[bool, typer.Option("--all", help="Show all faults with their evidence")] = False,
+    details: Annotated[
+        bool, typer.Option("--all", help="Show all faults with their evidence")
+    ] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Show the verdict on each vehicle, live or from a file: usable or not, since when, for how long, and why.
@@ -162,12 +189,16 @@ def _verdict(history: EventHistory, vehicle: str, at: str | None) -> Verdict:
         raise ConfigError("--at", f"{at!r}: {exc.__cause__}: expected {_AT}") from exc
 
 
-def _require_history(bus: "Bus", history: EventHistory, published: Collection[str], vehicles: Collection[str]) -> None:
+def _require_history(
+    bus: "Bus", history: EventHistory, published: Collection[str], vehicles: Collection[str]
+) -> None:
     for name in vehicles:
         if name in published and name not in history.vehicles:
             _name_outdated(bus)
             hint = f"follow it with 'nedbus events --vehicle {name}'"
-            raise NedbusError(f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}")
+            raise NedbusError(
+                f"vehicle {name} is published, but no nedbus service keeps its event history: {hint}"
+            )
     if not history.vehicles:
         from nedbus.cli.absence import explain_absence  # loads Zenoh, which files do not need
 
@@ -180,7 +211,9 @@ def _name_unreported(bus: "Bus", vehicles: Sequence[str]) -> None:
     """Name vehicles that are published, but about which no service reports, and older services."""
     if vehicles:
         names = to_text(", ".join(vehicles), _MAX_TEXT)
-        write_stderr(f"no verdict on {names}: published, but no nedbus service keeps the event history")
+        write_stderr(
+            f"no verdict on {names}: published, but no nedbus service keeps the event history"
+        )
         _name_outdated(bus)
 
 
@@ -205,11 +238,14 @@ def _describe(verdict: Verdict, story: Story, advice: str) -> Iterator[str]:
     if story.remark:
         yield f"  {story.remark}"
     if story.lacking:
-        yield fold("  ", f"missing topics that may explain it: {', '.join(story.lacking)}; {advice}")
+        yield fold(
+            "  ", f"missing topics that may explain it: {', '.join(story.lacking)}; {advice}"
+        )
 
 
 _LIVE_ADVICE: Final = (
-    "to publish them, add them to PX4's dds_topics.yaml or pub.csv, and to topics= of the source if it is set"
+    "to publish them, add them to PX4's dds_topics.yaml or pub.csv, "
+    "and to topics= of the source if it is set"
 )
 _ADVICE: Final = {
     ".ulg": "PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)",
@@ -222,7 +258,10 @@ def to_line(event: Event, times: Times) -> str:
     evidence = ", ".join(_before(each, event.time) for each in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
-    return fold(f"{times.text(event):>10}  {to_text(event.vehicle):<8} {severity:<5}  ", f"{_shown(event)}{because}")
+    return fold(
+        f"{times.text(event):>10}  {to_text(event.vehicle):<8} {severity:<5}  ",
+        f"{_shown(event)}{because}",
+    )
 
 
 def _shown(event: Event) -> str:
@@ -230,7 +269,9 @@ def _shown(event: Event) -> str:
 
 
 def _timed(event: Event, times: Times, since: float | None = None) -> str:
-    return fold(f"    {times.text(event)}  ", _shown(event) if since is None else _before(event, since))
+    return fold(
+        f"    {times.text(event)}  ", _shown(event) if since is None else _before(event, since)
+    )
 
 
 def _before(event: Event, time: float) -> str:
@@ -239,7 +280,12 @@ def _before(event: Event, time: float) -> str:
     return f"{_shown(event)} ({distance} {'before' if event.time <= time else 'after'})"
 
 
-def _follow(bus: "Bus", live: "LiveEvents", show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
+def _follow(
+    bus: "Bus",
+    live: "LiveEvents",
+    show: Callable[[Iterable[Event]], object],
+    duration: float | None,
+) -> None:
     from nedbus.cli.follow import follow
 
     known: set[str] = set()
@@ -272,18 +318,26 @@ def _read(files: Sequence[Path]) -> EventHistory:
 
 def _to_fields(event: Event, times: Times) -> dict[str, object]:
     utc = times.utc(event)
-    time = None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
+    time = (
+        None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
+    )
     evidence = [
         {"kind": each.kind, "change": each.change, "text": each.text, "topic": each.topic,
          "before": round(event.time - each.time, 3)}
         for each in event.evidence
     ]  # fmt: skip
-    return {"time": time, "clock": times.clock(event)} | asdict(event) | {"time": time, "evidence": evidence}
+    return (
+        {"time": time, "clock": times.clock(event)}
+        | asdict(event)
+        | {"time": time, "evidence": evidence}
+    )
 
 
 def _to_csv(event: Event, times: Times) -> str:
     fields = _to_fields(event, times)
-    fields["evidence"] = "; ".join(f"{each.kind} {event.time - each.time:.1f} s" for each in event.evidence)
+    fields["evidence"] = "; ".join(
+        f"{each.kind} {event.time - each.time:.1f} s" for each in event.evidence
+    )
     fields["numbers"] = json.dumps(dict(event.numbers)) if event.numbers else ""
     return csv_line([fields[name] for name in _HEAD])
 
@@ -301,7 +355,13 @@ def _verdict_fields(verdict: Verdict) -> dict[str, object]:
         for each in verdict.stories
     ]  # fmt: skip
     begin, end = fields([verdict.begin, verdict.end])
-    head = {"text": verdict.text, "usable": verdict.usable, "begin": begin, "end": end, "cause": fields(verdict.cause)}
+    head = {
+        "text": verdict.text,
+        "usable": verdict.usable,
+        "begin": begin,
+        "end": end,
+        "cause": fields(verdict.cause),
+    }
     return {"verdict": head, "faults": faults}
 
 
@@ -311,4 +371,6 @@ def _require_vehicles(where: object, names: Collection[str], vehicles: Collectio
             continue
         check_vehicle(vehicle)
         known = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT)
-        raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}{known and f': choose one of {known}'}")
+        raise ConfigError(
+            "--vehicle", f"no vehicle {vehicle} in {where}{known and f': choose one of {known}'}"
+        )

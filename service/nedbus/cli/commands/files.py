@@ -17,16 +17,24 @@ from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 _FLIGHTS: Final = ".ulg, .mcap or .tlog files; several are merged by UTC"
 _IMAGE: Final = "Image to write (default: next to the flight)"
 _PLOTTED: Final = "Fields to plot over time, or height, speed, roll_deg, ..."
-FlightsArgument = Annotated[list[Path], typer.Argument(metavar="FLIGHT", help=_FLIGHTS, show_default=False)]
+FlightsArgument = Annotated[
+    list[Path], typer.Argument(metavar="FLIGHT", help=_FLIGHTS, show_default=False)
+]
 
 
 @command
 def convert(
     sources: FlightsArgument,
-    output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Recording to write", show_default=False)],
+    output: Annotated[
+        Path, typer.Argument(metavar="FILE.mcap", help="Recording to write", show_default=False)
+    ],
     *,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id, for a log of one vehicle")] = None,
-    topics: Annotated[str | None, typer.Option("--topics", "-t", help='Topics, separated by commas, or "*"')] = None,
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", "-v", help="Vehicle id, for a log of one vehicle")
+    ] = None,
+    topics: Annotated[
+        str | None, typer.Option("--topics", "-t", help='Topics, separated by commas, or "*"')
+    ] = None,
 ) -> None:
     """Convert flight logs to an MCAP recording.
 
@@ -50,11 +58,17 @@ def convert(
 def plot(
     sources: FlightsArgument,
     *,
-    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.png", help=_IMAGE)] = None,
-    topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.png", help=_IMAGE)
+    ] = None,
+    topic: Annotated[
+        str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')
+    ] = DEFAULT_TOPIC,
     vehicle: VehiclesOption = None,
     instance: InstanceOption = None,
-    field: Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help=_PLOTTED)] = None,
+    field: Annotated[
+        str | None, typer.Option("--field", metavar="NAME,NAME,...", help=_PLOTTED)
+    ] = None,
 ) -> None:
     """Plot flights: track, height, speed, flags, resets and events; or fields over time."""
     draw, limit = tables.draw, tables.MAX_STREAMS
@@ -63,10 +77,16 @@ def plot(
     is_position = topic in (ANY, *DEFAULT.topics)
     if not fields and not is_position:
         positions = " or ".join(DEFAULT.topics)
-        raise ConfigError("--topic", f"{topic} has no track; name fields with --field, or plot {positions}")
-    flight, selected = tables.read_plotted(sources, selection, DEFAULT.topics if is_position else [topic])
+        raise ConfigError(
+            "--topic", f"{topic} has no track; name fields with --field, or plot {positions}"
+        )
+    flight, selected = tables.read_plotted(
+        sources, selection, DEFAULT.topics if is_position else [topic]
+    )
     if len(selected) > limit:
-        write_stderr(f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i")
+        write_stderr(
+            f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i"
+        )
     streams = []
     for address in selected[:limit]:
         messages, _ = tables.array_of(flight, address, unix_times=len(sources) > 1)
@@ -79,7 +99,11 @@ def plot(
     target = output or sources[0].with_suffix(".png")
     history = nedbus.events(sources)
     held = (condition for vehicle in history.vehicles.values() for condition in vehicle.held)
-    initial = [condition.begin for condition in held if condition.initial and not KINDS[condition.kind].usual]
+    initial = [
+        condition.begin
+        for condition in held
+        if condition.initial and not KINDS[condition.kind].usual
+    ]
     events = [*dict.fromkeys(initial), *history.events]
     title = ", ".join(source.name for source in sources)
     if fields:

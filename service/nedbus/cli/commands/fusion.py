@@ -9,7 +9,14 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 import nedbus
-from nedbus.cli.options import DurationOption, FilesArgument, JsonOption, OpenBus, VehiclesOption, command
+from nedbus.cli.options import (
+    DurationOption,
+    FilesArgument,
+    JsonOption,
+    OpenBus,
+    VehiclesOption,
+    command,
+)
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.errors import ConfigError, NoDataError
@@ -56,7 +63,10 @@ def fusion(
 
 
 def _follow(
-    bus: "Bus", vehicles: list[str] | None, duration: float | None, sent: "dict[str, PositionStatus]"
+    bus: "Bus",
+    vehicles: list[str] | None,
+    duration: float | None,
+    sent: "dict[str, PositionStatus]",
 ) -> "Iterator[Sample[Any]]":
     """Yield live samples, and update what is sent."""
     start, next_status = time.monotonic(), 0.0
@@ -66,15 +76,20 @@ def _follow(
         while (now := time.monotonic()) < end:
             if now >= next_status:
                 next_status = now + _STATUS_INTERVAL
-                statuses = [status for service in bus.services(timeout=0.5) for status in service.sources]
-                sent.update({each.vehicle: each for status in statuses for each in status.positions})
+                statuses = [
+                    status for service in bus.services(timeout=0.5) for status in service.sources
+                ]
+                sent.update(
+                    {each.vehicle: each for status in statuses for each in status.positions}
+                )
             with suppress(NoDataError):
                 sample = subscription.receive(min(_STATUS_INTERVAL, max(0.0, end - now)))
                 has_data = True
                 yield sample
     if not has_data:
         raise NoDataError(
-            f"{', '.join(vehicles or ['all vehicles'])}: topics {', '.join(FUSION_TOPICS)}", duration or 0.0
+            f"{', '.join(vehicles or ['all vehicles'])}: topics {', '.join(FUSION_TOPICS)}",
+            duration or 0.0,
         )
 
 

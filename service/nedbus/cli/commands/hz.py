@@ -7,7 +7,15 @@ from typing import Any, Final
 
 from nedbus import Bus, clock
 from nedbus.cli.follow import follow
-from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, allow_one, command
+from nedbus.cli.options import (
+    ALL,
+    CountOption,
+    CsvOption,
+    DurationOption,
+    JsonOption,
+    allow_one,
+    command,
+)
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import live_table
 from nedbus.clock import format_duration
@@ -52,7 +60,9 @@ def hz(
 
         def show() -> None:
             states = _states(bus, monitor)
-            streams = sorted(states, key=lambda each: (each[2].severity, describe_stream(*each[1:]) == "ok"))
+            streams = sorted(
+                states, key=lambda each: (each[2].severity, describe_stream(*each[1:]) == "ok")
+            )
             if not (json_output or csv_output):
                 show_table([_to_row(*each) for each in streams])
                 return
@@ -61,7 +71,11 @@ def hz(
             for address, health, state in streams:
                 written[address] = health.messages, state.name
                 if former.get(address) != written[address]:
-                    fields: dict[str, Any] = {"time": clock.utc(), **asdict(address), "state": state.name}
+                    fields: dict[str, Any] = {
+                        "time": clock.utc(),
+                        **asdict(address),
+                        "state": state.name,
+                    }
                     fields |= {"reason": state.reason, **asdict(health)}
                     cells = {**fields, **(health.flags or {}), "time": f"{fields['time']:.3f}"}
                     write(csv_line(map(cells.get, _CSV_HEAD)) if csv_output else json.dumps(fields))
@@ -82,6 +96,8 @@ def _states(bus: Bus, monitor: Monitor) -> Iterator[tuple[Address, Health, Strea
 def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
     rate = "-" if health.rate is None else f"{health.rate:.1f}"
     jitter = "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms"
-    latencies = (None if health.rate is None else each for each in (health.latency, health.latency_max))
+    latencies = (
+        None if health.rate is None else each for each in (health.latency, health.latency_max)
+    )
     ages = ("-" if each is None else format_duration(each) for each in latencies)
     return [str(address), rate, jitter, *ages, str(health.lost), describe_stream(health, state)]

@@ -16,11 +16,19 @@ from nedbus.errors import ConfigError, PkiError
 from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
 from nedbus_msgs.text import counted
 
-pki = typer.Typer(help="Manage keys, certificates and access rules for tls/ endpoints.", no_args_is_help=True)
+pki = typer.Typer(
+    help="Manage keys, certificates and access rules for tls/ endpoints.", no_args_is_help=True
+)
 
-FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
-WithinOption = Annotated[int, typer.Option(min=0, help="Days before expiry when a certificate is due for renewal")]
-DaysOption = Annotated[int | None, typer.Option(min=1, help=f"Validity in days (default: {certificates.DAYS})")]
+FolderArgument = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")
+]
+WithinOption = Annotated[
+    int, typer.Option(min=0, help="Days before expiry when a certificate is due for renewal")
+]
+DaysOption = Annotated[
+    int | None, typer.Option(min=1, help=f"Validity in days (default: {certificates.DAYS})")
+]
 
 
 @command
@@ -35,9 +43,13 @@ def ca(folder: FolderArgument) -> None:
 @command
 def cert(
     folder: FolderArgument,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="router, vehicle-1, reader, operator, ...")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="router, vehicle-1, reader, operator, ...")
+    ],
     *,
-    host: Annotated[list[str] | None, typer.Option(help="Host name or address of a router; repeatable")] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(help="Host name or address of a router; repeatable")
+    ] = None,
     days: DaysOption = None,
 ) -> None:
     """Create a certificate and its key: NAME.crt and NAME.key.
@@ -50,14 +62,24 @@ def cert(
 @command
 def enroll(
     folder: FolderArgument,
-    vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Vehicle id, the second part of its Zenoh keys")],
+    vehicle: Annotated[
+        str, typer.Argument(metavar="VEHICLE", help="Vehicle id, the second part of its Zenoh keys")
+    ],
     *,
-    router: Annotated[list[str], typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="Router; repeatable")],
+    router: Annotated[
+        list[str],
+        typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="Router; repeatable"),
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder to create (default: vehicle-VEHICLE)")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder to create (default: vehicle-VEHICLE)"),
     ] = None,
-    source: Annotated[list[str] | None, typer.Option("--source", "-s", help="Source; repeatable")] = None,
-    target: Annotated[Path | None, typer.Option(help="Folder on the vehicle (default: /etc/nedbus)")] = None,
+    source: Annotated[
+        list[str] | None, typer.Option("--source", "-s", help="Source; repeatable")
+    ] = None,
+    target: Annotated[
+        Path | None, typer.Option(help="Folder on the vehicle (default: /etc/nedbus)")
+    ] = None,
     days: DaysOption = None,
 ) -> None:
     """Create the bundle of a vehicle.
@@ -69,11 +91,15 @@ def enroll(
         folder, vehicle, output, routers=router, sources=source or (), target=target, days=days
     )
     _write_paths(made)
-    write_stderr(f"move {output} to the vehicle and follow its README.txt: it has the only copy of the private key")
+    write_stderr(
+        f"move {output} to the vehicle and follow its README.txt: it has the only copy of the private key"
+    )
 
 
 @command
-def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_json: JsonOption = False) -> None:
+def list_(
+    folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_json: JsonOption = False
+) -> None:
     """List the certificates of a folder and their expiry."""
     now = clock.now()
     rows: list[dict[str, Any]] = [
@@ -92,7 +118,13 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
     for row in rows:
         row |= {name: row[name].replace("authority", "CA") for name in ("use", "state")}
     cells = [
-        [row["name"], row["use"], row["until"][:10], str(row["days_left"]), ", ".join([row["state"], *row["hosts"]])]
+        [
+            row["name"],
+            row["use"],
+            row["until"][:10],
+            str(row["days_left"]),
+            ", ".join([row["state"], *row["hosts"]]),
+        ]
         for row in rows
     ]
     write(to_table(("NAME", "USE", "UNTIL", "DAYS", "STATE, HOSTS"), cells))
@@ -101,7 +133,9 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
 @command
 def renew(
     folder: FolderArgument,
-    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all that expire soon")] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME", help="Default: all that expire soon")
+    ] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
     new_key: Annotated[bool, typer.Option("--new-key", help="Also create new keys")] = False,
@@ -114,25 +148,41 @@ def renew(
     now = clock.now()
     entries = certificates.list_certificates(folder)
     if unknown := sorted({*(names or ())} - {entry.name for entry in entries}):
-        raise PkiError(f"{folder} has no certificate named {unknown[0]!r}: 'nedbus pki list' shows all names")
-    due = [entry for entry in entries if entry.certificate.is_due(now, within) and not entry.problem]
+        raise PkiError(
+            f"{folder} has no certificate named {unknown[0]!r}: 'nedbus pki list' shows all names"
+        )
+    due = [
+        entry for entry in entries if entry.certificate.is_due(now, within) and not entry.problem
+    ]
     chosen = [entry for entry in entries if entry.name in names] if names else due
     for entry in chosen:
         _write_paths(certificates.renew_certificate(entry, replace_key=new_key, days=days))
     if chosen:
-        write_stderr("replace the old files with these, and restart routers: they read certificates only at startup")
+        write_stderr(
+            "replace the old files with these, and restart routers: they read certificates only at startup"
+        )
     else:
         write_stderr(f"no certificate expires within {within} days: 'nedbus pki list' shows all")
 
 
 @command
 def rules(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Router file, such as config/router-secure.json5")],
-    vehicles: Annotated[list[str] | None, typer.Argument(metavar="VEHICLE", help="Vehicle ids")] = None,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Router file, such as config/router-secure.json5")
+    ],
+    vehicles: Annotated[
+        list[str] | None, typer.Argument(metavar="VEHICLE", help="Vehicle ids")
+    ] = None,
     *,
-    source: Annotated[Path | None, typer.Option("--from", help="Read ids from a file, stdin (-) or PKI folder")] = None,
-    add: Annotated[bool, typer.Option("--add", help="Add these vehicles to those in the file")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove these vehicles from the file")] = False,
+    source: Annotated[
+        Path | None, typer.Option("--from", help="Read ids from a file, stdin (-) or PKI folder")
+    ] = None,
+    add: Annotated[
+        bool, typer.Option("--add", help="Add these vehicles to those in the file")
+    ] = False,
+    remove: Annotated[
+        bool, typer.Option("--remove", help="Remove these vehicles from the file")
+    ] = False,
     prefix: Annotated[str, typer.Option("--prefix", help="Key prefix")] = "nedbus",
 ) -> None:
     """Set or show the vehicles in the access rules of a router file.
@@ -148,7 +198,11 @@ def rules(
     given = {*(vehicles or ())}
     if source is not None and source.is_dir():
         known = [entry.name for entry in certificates.list_certificates(source)]
-        given.update(name.removeprefix(CERTIFICATE_PREFIX) for name in known if name.startswith(CERTIFICATE_PREFIX))
+        given.update(
+            name.removeprefix(CERTIFICATE_PREFIX)
+            for name in known
+            if name.startswith(CERTIFICATE_PREFIX)
+        )
     elif source is not None:
         text = sys.stdin.read() if str(source) == "-" else source.read_text(encoding="utf-8")
         given.update(filter(None, (line.partition("#")[0].strip() for line in text.splitlines())))

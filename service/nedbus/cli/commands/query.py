@@ -10,7 +10,14 @@ import typer
 
 from nedbus import Bus
 from nedbus.cli.absence import explain_absence
-from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehiclesOption, command, parse_fields
+from nedbus.cli.options import (
+    POSITIONS,
+    FieldOption,
+    JsonOption,
+    VehiclesOption,
+    command,
+    parse_fields,
+)
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
@@ -26,18 +33,42 @@ from nedbus.health import (
     stream_state,
 )
 from nedbus.timings import TIMINGS
-from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
+from nedbus_msgs import (
+    ANY,
+    DEFAULT_TOPIC,
+    MESSAGES,
+    TOPICS,
+    Definition,
+    Message,
+    Selection,
+    definition_of,
+    get_topic,
+)
 from nedbus_msgs.text import counted
 
-_SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
+_SOURCE_HEAD: Final = (
+    "SOURCE",
+    "STATE",
+    "PUBLISHED",
+    "REJECTED",
+    "LOST",
+    "REBOOTS",
+    "RETRIES",
+    "REMARK",
+)
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
 _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
-_ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
+_ABSENT: Final = {
+    "stale": "gone: ",
+    "silent": "announced, nothing arrives: ",
+    "not_carried": "not carried: ",
+}
 _SIMILAR: Final = 0.8  # minimum similarity of a name that counts as a misspelling
 _MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
-_MAX_WARNINGS: Final = 5  # shown per source: damage of its file, or the first rejection of each origin
+# shown per source: damage of its file, or the first rejection of each origin
+_MAX_WARNINGS: Final = 5
 
 
 @command
@@ -61,7 +92,17 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
         is_stored = sample is not None and sample.stored
         if json_output:
             name, reason = (state.name, state.reason) if state else (None, "no answer")
-            write(json.dumps({**asdict(address), "age": age, "state": name, "reason": reason, "stored": is_stored}))
+            write(
+                json.dumps(
+                    {
+                        **asdict(address),
+                        "age": age,
+                        "state": name,
+                        "reason": reason,
+                        "stored": is_stored,
+                    }
+                )
+            )
         text = describe_stream(health, state) if health and state else "no answer"
         since = "-" if age is None else format_duration(age)
         rows.append([str(address), since, f"stored, {text}" if is_stored else text])
@@ -81,12 +122,20 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
 
 def _measured_by_services(bus: Bus) -> dict[str, Health]:
     """Return the health of the streams that services report, by address; one message reveals no usual interval."""
-    return {stream.address: stream.health for service in bus.services() for stream in service.own_streams}
+    return {
+        stream.address: stream.health
+        for service in bus.services()
+        for stream in service.own_streams
+    }
 
 
 @command
 def get(
-    bus: Bus, selection: Selection = POSITIONS, *, field: FieldOption = None, json_output: JsonOption = False
+    bus: Bus,
+    selection: Selection = POSITIONS,
+    *,
+    field: FieldOption = None,
+    json_output: JsonOption = False,
 ) -> None:
     """Show the last message of each stream with all its fields.
 
@@ -99,7 +148,9 @@ def get(
     if all(sample.stored for sample in samples):
         expression = ", ".join(selection.key_exprs(prefix=bus.prefix))
         nothing = f"nothing is published on {expression}: 'nedbus list' shows the published streams"
-        write_stderr("no publisher answers: these messages are from a storage" if samples else nothing)
+        write_stderr(
+            "no publisher answers: these messages are from a storage" if samples else nothing
+        )
         raise typer.Exit(1)
 
 
@@ -109,7 +160,9 @@ def _write_left_out(service: ServiceStatus) -> None:
         if absent := [each for source in service.sources for each in getattr(source, what)]:
             write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
     if copies := sum(source.copies for source in service.sources):
-        write(f"left out: {copies} messages that came again, or late, over a second link to their vehicle")
+        write(
+            f"left out: {copies} messages that came again, or late, over a second link to their vehicle"
+        )
 
 
 @command
@@ -135,20 +188,30 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         if rows:
             write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         _write_left_out(service)
-        for text in (each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]):
+        for text in (
+            each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]
+        ):
             write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
         for head, text in _links_of(service):
             write(fold(f"{head}: ", to_text(text, _MAX_VEHICLES)))
         if refused := service.refused:
-            write(fold("vehicles refused by the router: ", to_text(", ".join(refused), _MAX_VEHICLES)))
-        streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
+            write(
+                fold("vehicles refused by the router: ", to_text(", ".join(refused), _MAX_VEHICLES))
+            )
+        streams = [
+            _stream_row(source, refused, each)
+            for source in service.sources
+            for each in source.streams
+        ]
         if streams:
             table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
             write(f"\n{table}")
     if len(services) > _MAX_ROWS:
         write(counted(len(services) - _MAX_ROWS, "more service"))
     if not services:
-        write_stderr("no nedbus service answers: start one with 'nedbus serve', or run 'nedbus doctor'")
+        write_stderr(
+            "no nedbus service answers: start one with 'nedbus serve', or run 'nedbus doctor'"
+        )
 
 
 def _links_of(service: ServiceStatus) -> Iterator[tuple[str, str]]:
@@ -163,9 +226,13 @@ def _links_of(service: ServiceStatus) -> Iterator[tuple[str, str]]:
 @command
 def schema(
     open_bus: Callable[[], Bus],
-    message: Annotated[str, typer.Argument(help="Message, such as VehicleAttitude, or topic")] = DEFAULT_TOPIC,
+    message: Annotated[
+        str, typer.Argument(help="Message, such as VehicleAttitude, or topic")
+    ] = DEFAULT_TOPIC,
     *,
-    layouts: Annotated[bool, typer.Option("--layouts", help="Print PX4's layouts: fields and types in order")] = False,
+    layouts: Annotated[
+        bool, typer.Option("--layouts", help="Print PX4's layouts: fields and types in order")
+    ] = False,
 ) -> None:
     """Print the JSON Schema of a message, or its supported layouts.
 
@@ -195,12 +262,18 @@ def _ask_publisher(open_bus: Callable[[], Bus], name: str) -> Definition[Any]:
     except ConnectError as exc:
         reason = f"and no publisher can be queried ({exc})"
     near = get_close_matches(name, [*MESSAGES, *TOPICS], 3, _SIMILAR)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
+    hint = (
+        f"did you mean {' or '.join(near)}?"
+        if near
+        else f"known messages are {', '.join(MESSAGES)}"
+    )
     raise ConfigError("message", f"unknown message {name!r}, {reason}: {hint}")
 
 
 def _head_of(service: ServiceStatus) -> str:
-    name, version, role, host = map(to_text, (service.service, service.version, service.role, service.host))
+    name, version, role, host = map(
+        to_text, (service.service, service.version, service.role, service.host)
+    )
     if service.is_outdated:
         reason = "its status does not name its vehicle, and is not shown: update nedbus on its host"
         return f"service {name} on {host}, nedbus {version}: {reason}"

@@ -26,14 +26,17 @@ def record(
     open_bus: Callable[[], Bus],
     selection: Selection = ALL,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="Recording to write")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="Recording to write")
+    ],
     duration: DurationOption = None,
 ) -> None:
     """Record messages to an MCAP file until Ctrl-C.
 
     A crash loses about the last second.
     """
-    recorders = import_optional("mcap", "nedbus.cli.recorder")  # before a bus is opened, and waited for
+    # before a bus is opened, and waited for
+    recorders = import_optional("mcap", "nedbus.cli.recorder")
     notice = time.monotonic() + TIMINGS.first_sample
     with (
         open_bus() as bus,
@@ -51,7 +54,8 @@ def record(
                 write_notice(subscription)
 
         try:
-            with show_progress() as show, suppress(typer.Exit):  # Ctrl-C is the normal end of a recording
+            # Ctrl-C is the normal end of a recording
+            with show_progress() as show, suppress(typer.Exit):
                 run_until_stopped(lambda stop: recorder.run(stop, duration=duration), on_tick=tick)
         except NoDataError:
             write_stderr(f"{output}: {recorder.status}, removed the empty file")

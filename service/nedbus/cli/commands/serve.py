@@ -9,7 +9,14 @@ from typing import Annotated
 import typer
 
 from nedbus import __version__
-from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
+from nedbus.cli.options import (
+    ConfigOption,
+    PrefixOption,
+    TlsCaOption,
+    TlsCertificateOption,
+    TlsKeyOption,
+    command,
+)
 from nedbus.cli.output.progress import log_progress
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
@@ -29,25 +36,37 @@ _SOURCES = f"Source to publish: {', '.join(SOURCE_FORMS)}, with ?OPTION=VALUE&..
 _HTTP = "Serve metrics, health and status on this address"
 _ZENOHD = "Router configuration in the format of zenohd"
 _LISTEN = f"Endpoint to listen on; repeatable (default: {DEFAULT_ENDPOINT})"
-ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
+ListenOption = Annotated[
+    list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)
+]
 _JOIN = "Router to join; repeatable"
-JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_JOIN)]
+JoinOption = Annotated[
+    list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_JOIN)
+]
 
 
 @command
 def serve(
     *,
-    source: Annotated[list[str] | None, typer.Option("--source", "-s", metavar="SOURCE", help=_SOURCES)] = None,
+    source: Annotated[
+        list[str] | None, typer.Option("--source", "-s", metavar="SOURCE", help=_SOURCES)
+    ] = None,
     connect: JoinOption = None,
     listen: ListenOption = None,
-    router_config: Annotated[Path | None, typer.Option(help="Configuration file of the embedded router, JSON5")] = None,
+    router_config: Annotated[
+        Path | None, typer.Option(help="Configuration file of the embedded router, JSON5")
+    ] = None,
     tls_ca: TlsCaOption = None,
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
     prefix: PrefixOption = None,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id for sources without one")] = None,
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", "-v", help="Vehicle id for sources without one")
+    ] = None,
     http: Annotated[str | None, typer.Option(metavar="HOST:PORT", help=_HTTP)] = None,
-    until_done: Annotated[bool | None, typer.Option("--until-done", help="Exit when finite sources have ended")] = None,
+    until_done: Annotated[
+        bool | None, typer.Option("--until-done", help="Exit when finite sources have ended")
+    ] = None,
     config: ConfigOption = None,
     check: Annotated[bool, typer.Option("--check", help="Check the settings and exit")] = False,
 ) -> None:
@@ -64,7 +83,11 @@ def serve(
     daemon = Daemon(settings, version=__version__)
     if daemon.role == "router" and any(each.startswith("tls/") for each in daemon.endpoints):
         log_refusals()
-    pages = serve_pages(settings.http, service_pages(daemon)) if settings.http is not None else nullcontext()
+    pages = (
+        serve_pages(settings.http, service_pages(daemon))
+        if settings.http is not None
+        else nullcontext()
+    )
     progress = log_progress(daemon)
     with pages, Notifier(daemon) as notifier:
 
@@ -81,11 +104,21 @@ def serve(
                 with notifier.reloading():
                     done = daemon.reload(load_settings(config, **given))
             except NedbusError as exc:
-                _log.error("settings not reloaded, the old ones stay active: %s", exc, extra=about("reload"))
+                _log.error(
+                    "settings not reloaded, the old ones stay active: %s",
+                    exc,
+                    extra=about("reload"),
+                )
             else:
                 _log.info("settings reloaded: %s", done, extra=about("reload"))
 
-        run_until_stopped(lambda _: daemon.run(), on_stop=stop, on_tick=tick, on_hangup=reload, closing=daemon.closing)
+        run_until_stopped(
+            lambda _: daemon.run(),
+            on_stop=stop,
+            on_tick=tick,
+            on_hangup=reload,
+            closing=daemon.closing,
+        )
 
 
 @command
@@ -105,11 +138,20 @@ def router(
 
     --listen and --connect replace the endpoints of the file, like the flags of zenohd.
     """
-    settings = load_settings(config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key)
+    settings = load_settings(
+        config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key
+    )
     routers, closing = tuple(connect or ()), threading.Event()
     tls = settings.tls if routers else None
 
     def run(stop: threading.Event) -> None:
-        run_router(stop, listen=settings.listen, connect=routers, config_file=config_file, tls=tls, closing=closing)
+        run_router(
+            stop,
+            listen=settings.listen,
+            connect=routers,
+            config_file=config_file,
+            tls=tls,
+            closing=closing,
+        )
 
     run_until_stopped(run, closing=closing)

@@ -27,7 +27,12 @@ _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
 _MAX_KINDS: Final = 1000  # nedbus itself has about 40
 _MAX_TRACEBACK: Final = 20_000  # characters; the end is kept, which names the error
-_PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
+_PRIORITIES: Final = (
+    (logging.ERROR, 3),
+    (logging.WARNING, 4),
+    (logging.INFO, 6),
+    (logging.NOTSET, 7),
+)
 
 ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
 
@@ -55,7 +60,10 @@ class JsonFormatter(TextFormatter):
         """Return the JSON object of a record."""
         about: About | None = getattr(record, "about", None)  # None for records of other packages
         fields: dict[str, object] = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[
+                :-6
+            ]
+            + "Z",
             "level": record.levelname.lower(),
             "event": None,
             "message": to_text(record.getMessage(), MAX_TEXT),
@@ -89,7 +97,8 @@ class _TokenBucket:
     refilled: float
     tokens: float = BURST
     suppressed: int = 0
-    first: Mapping[str, object] = field(default_factory=dict)  # not the record itself, which may keep a traceback alive
+    # not the record itself, which may keep a traceback alive
+    first: Mapping[str, object] = field(default_factory=dict)
 
     def refill(self, now: float) -> bool:
         """Add the tokens earned since the last call; return True if a line may be logged."""
@@ -106,13 +115,17 @@ class RateLimit(logging.Filter):
     """
 
     def __init__(
-        self, handle: Callable[[logging.LogRecord], object], *, now: Callable[[], float] = time.monotonic
+        self,
+        handle: Callable[[logging.LogRecord], object],
+        *,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__()
         self._handle = handle
         self._now = now
         self._buckets: dict[tuple[str, str | None, str], _TokenBucket] = {}
-        self._lock = threading.RLock()  # reentrant, as in logging: garbage collection may log while it is held
+        # reentrant, as in logging: garbage collection may log while it is held
+        self._lock = threading.RLock()
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
@@ -132,7 +145,11 @@ class RateLimit(logging.Filter):
                 return True
             if not bucket.suppressed:
                 text = f"suppressed %s like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
-                names = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname}
+                names = {
+                    "name": record.name,
+                    "levelno": record.levelno,
+                    "levelname": record.levelname,
+                }
                 bucket.first = {**names, "msg": text}
             bucket.suppressed += 1
             return False
@@ -144,8 +161,11 @@ class RateLimit(logging.Filter):
             for (_, event, _), bucket in self._buckets.items():
                 if bucket.suppressed and is_due(bucket):
                     count = bucket.suppressed
-                    about, args = About("suppressed", count=count, of=event), (counted(count, "more line"),)
-                    reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
+                    about = About("suppressed", count=count, of=event)
+                    args = (counted(count, "more line"),)
+                    reports.append(
+                        logging.makeLogRecord({**bucket.first, "args": args, "about": about})
+                    )
                     bucket.suppressed = 0
         for report in reports:
             self._handle(report)
@@ -164,14 +184,23 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     is_journal, is_json = False, log_format == "json"
     with suppress(OSError, ValueError):  # stderr is closed, or not a file
         status = os.fstat(sys.stderr.fileno())
-        is_journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"  # see systemd.exec(5)
-    formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
+        # see systemd.exec(5)
+        is_journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+    formatter = (
+        JsonFormatter()
+        if is_json
+        else TextFormatter("%(message)s")
+        if is_journal
+        else TextFormatter()
+    )
     handler = _StderrHandler()
     handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
     if is_journal or is_json:
         handler.name = STRUCTURED
         sys.excepthook = _log_uncaught
-        threading.excepthook = lambda caught: _log_uncaught(caught.exc_type, caught.exc_value, caught.exc_traceback)
+        threading.excepthook = lambda caught: _log_uncaught(
+            caught.exc_type, caught.exc_value, caught.exc_traceback
+        )
     limit = RateLimit(handler.handle)
     handler.addFilter(limit)
     atexit.register(limit.report)
@@ -181,8 +210,12 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     logging.getLogger().setLevel(max(number, logging.WARNING))
 
 
-def _log_uncaught(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
+def _log_uncaught(
+    kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None
+) -> None:
     if not issubclass(kind, SystemExit):
         exc_info = None if error is None else (kind, error, traceback)
-        text = str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
+        text = (
+            str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
+        )
         _log.error("%s", text, exc_info=exc_info, extra=about("error"))

@@ -32,7 +32,8 @@ def log_progress(daemon: Daemon) -> Iterator[None]:
 
     Once the daemon is ready, commands to try in a second terminal are written to stderr.
     """
-    reported, counts = time.monotonic(), Counter[str]()  # time of the last report, and messages by source until then
+    # time of the last report, and messages by source until then
+    reported, counts = time.monotonic(), Counter[str]()
     while not daemon.ready.is_set():
         yield
     if not is_log_structured() and not daemon.until_done:

@@ -40,9 +40,12 @@ def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38)
     message = sample.message
     start = f"{sample.address!s:<{width}} {message.timestamp / 1e6:12.3f} s"
     if fields:
-        return "  ".join([start, *(f"{name} {_to_value(sample, name)}" for name in fields)]) + _notes(sample)
+        return "  ".join(
+            [start, *(f"{name} {_to_value(sample, name)}" for name in fields)]
+        ) + _notes(sample)
     if message.DEFINITION is not DEFAULT:
-        return f"{start}{_notes(sample)}  {_to_summary(message)}"  # a terminal cuts the end of the line
+        # a terminal cuts the end of the line
+        return f"{start}{_notes(sample)}  {_to_summary(message)}"
     position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
     velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
     heading = f"hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}"
@@ -67,20 +70,29 @@ class Lines:
         if width is None:
             return to_line(sample, fields)
         self._lines_left -= 1
-        if not fields and message.DEFINITION is not DEFAULT:  # no columns: as much as fits into a line
+        # no columns: as much as fits into a line
+        if not fields and message.DEFINITION is not DEFAULT:
             line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
             return line if len(line) <= width else f"{line[: width - 1]}…"
         cells = {_ADDRESS: str(sample.address), "TIME s": f"{message.timestamp / 1e6:8.2f}"}
         if fields:
             cells |= {name: _to_value(sample, name).rjust(_FIELD_WIDTH) for name in fields}
         else:
-            cells[_POSITION] = " ".join(f"{value:7.2f}" for value in (message.x, message.y, message.z))
-            cells[_VELOCITY] = " ".join(f"{value:6.2f}" for value in (message.vx, message.vy, message.vz))
+            cells[_POSITION] = " ".join(
+                f"{value:7.2f}" for value in (message.x, message.y, message.z)
+            )
+            cells[_VELOCITY] = " ".join(
+                f"{value:6.2f}" for value in (message.vx, message.vy, message.vz)
+            )
             cells |= {_HEADING: f"{math.degrees(message.heading):.1f}", _EPH: f"{message.eph:.2f}"}
         cells[_STATE] = _to_state(sample)
-        self._widths = {name: max(len(name), len(cell), self._widths.get(name, 0)) for name, cell in cells.items()}
+        self._widths = {
+            name: max(len(name), len(cell), self._widths.get(name, 0))
+            for name, cell in cells.items()
+        }
         shown = fit_columns(self._widths, _OPTIONAL, width)
-        head, line = self._join({name: name for name in shown}), self._join({name: cells[name] for name in shown})
+        head = self._join({name: name for name in shown})
+        line = self._join({name: cells[name] for name in shown})
         if head == self._head and self._lines_left >= 0:
             return line
         self._head = head
@@ -96,7 +108,9 @@ class Lines:
 def _to_state(sample: Sample[Any]) -> str:
     """Return a sample's doubtful flags, or "ok"; then its age if old, and the number of messages lost before it."""
     is_position = sample.message.DEFINITION is DEFAULT
-    return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(sample)
+    return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(
+        sample
+    )
 
 
 def _to_summary(message: Message) -> str:
@@ -144,12 +158,18 @@ def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
 
 def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format a sample as one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
-    head = asdict(sample.address) | {name: getattr(sample, name) for name in ("received", "sent", "lost", "source")}
+    head = asdict(sample.address) | {
+        name: getattr(sample, name) for name in ("received", "sent", "lost", "source")
+    }
     head |= {"missing": sorted(sample.missing)} | ({"stored": True} if sample.stored else {})
     message = sample.message.model_dump_json(include=set(fields) or None)
-    derived = {name: derive(sample.message, name) for name in _derived_fields(sample.message, fields)}
+    derived = {
+        name: derive(sample.message, name) for name in _derived_fields(sample.message, fields)
+    }
     if derived:
-        numbers = {name: value if math.isfinite(value) else "NaN" for name, value in derived.items()}
+        numbers = {
+            name: value if math.isfinite(value) else "NaN" for name, value in derived.items()
+        }
         message = json.dumps(json.loads(message) | numbers, separators=(",", ":"))
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 
@@ -193,10 +213,16 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
         value = getattr(message, name, "")
         digits = _DIGITS.get(types[name].base) if name in types else None
         if isinstance(value, tuple):
-            row += [(f"{name}[{index}]", _to_number(each, digits)) for index, each in enumerate(value)]
+            row += [
+                (f"{name}[{index}]", _to_number(each, digits)) for index, each in enumerate(value)
+            ]
         else:
             row.append((name, _to_number(value, digits)))
-    return [*row, ("state", message_doubts(message, sample.missing))] if message.DEFINITION is DEFAULT else row
+    return (
+        [*row, ("state", message_doubts(message, sample.missing))]
+        if message.DEFINITION is DEFAULT
+        else row
+    )
 
 
 def _derived_fields(message: Message, fields: Sequence[str]) -> list[str]:
@@ -209,7 +235,9 @@ def _to_value(sample: Sample[Any], name: str) -> str:
     if _derived_fields(sample.message, [name]):
         return f"{derive(sample.message, name):.9g}"
     kind = sample.message.DEFINITION.types.get(name)
-    return "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
+    return (
+        "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
+    )
 
 
 def _to_number(value: object, digits: int | None) -> str:

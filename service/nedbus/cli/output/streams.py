@@ -14,10 +14,23 @@ from nedbus.errors import NedbusError
 from nedbus.log_event import about
 
 MAX_TEXT: Final = 1000  # maximum number of characters of an error or log line
-STRUCTURED: Final = "structured"  # name of the log handler if the log is read by a program: JSON, or the journal
+# name of the log handler if the log is read by a program: JSON, or the journal
+STRUCTURED: Final = "structured"
 _MAX_CELL: Final = 120  # characters of a value from a peer
 # As listed by OWASP, with the wide forms of Japanese input.
-_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+_FORMULA_STARTS: Final = (
+    "=",
+    "+",
+    "-",
+    "@",
+    "\t",
+    "\r",
+    "\n",
+    "\uff1d",
+    "\uff0b",
+    "\uff0d",
+    "\uff20",
+)
 _log = logging.getLogger("nedbus")
 
 
@@ -26,7 +39,8 @@ def printable(text: str) -> str:
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
     return "".join(
-        char if char.isprintable() or char == "\n" else char.encode("unicode_escape").decode() for char in text
+        char if char.isprintable() or char == "\n" else char.encode("unicode_escape").decode()
+        for char in text
     )
 
 

@@ -13,7 +13,8 @@ from typing import Final, Literal
 from .streams import write
 
 COLUMN_GAP: Final = "  "
-_LAST_WIDTH: Final = len("disconnected: no link")  # optional columns are removed to make the last one this wide
+# optional columns are removed to make the last one this wide
+_LAST_WIDTH: Final = len("disconnected: no link")
 _MIN_LAST_WIDTH: Final = 16  # the first column is folded to make the last one this wide
 _MAX_ROWS: Final = 50  # rows of a live table
 _UNLIMITED: Final = 10_000  # width if stdout is not a terminal
@@ -23,7 +24,9 @@ Rows = Sequence[Sequence[str]]
 
 def terminal_width() -> int | None:
     """Return the width of the terminal; None if stdout is not a terminal."""
-    is_terminal = sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    is_terminal = (
+        sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    )
     return shutil.get_terminal_size().columns if is_terminal else None
 
 
@@ -32,7 +35,9 @@ def fold(head: str, text: str) -> str:
     width = terminal_width()
     if width is None:
         return head + text
-    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
+    return textwrap.fill(
+        text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
+    )
 
 
 def fit_columns(widths: Mapping[str, int], optional: Sequence[str], width: int) -> list[str]:
@@ -50,7 +55,9 @@ def _width_of(columns: Sequence[str], widths: Mapping[str, int]) -> int:
     return sum(widths[name] for name in columns) + len(COLUMN_GAP) * (len(columns) - 1)
 
 
-def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), max_rows: int | None = None) -> str:
+def to_table(
+    head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), max_rows: int | None = None
+) -> str:
     """Format rows as a table: the first and the last column are text, aligned left, the others numbers.
 
     On a narrow terminal columns of `optional` are removed in this order; after that, text is folded.
@@ -62,7 +69,9 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
 
     shown, width = rows[:max_rows], terminal_width() or _UNLIMITED
     first, last = head[0], head[-1]
-    widths = {name: max(map(len, (name, *cells))) for name, *cells in zip(head, *shown, strict=True)}
+    widths = {
+        name: max(map(len, (name, *cells))) for name, *cells in zip(head, *shown, strict=True)
+    }
     widths[last] = min(widths[last], _LAST_WIDTH)
     kept = fit_columns(widths, optional, width)
     widths[last] = min(widths[last], _MIN_LAST_WIDTH)
@@ -76,7 +85,9 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
     drawn = io.StringIO()
     Console(file=drawn, width=width, color_system=None).print(table)
     lines = [line.rstrip() for line in drawn.getvalue().splitlines()]
-    return "\n".join([*lines, f"{len(rows) - len(shown)} more"] if len(rows) > len(shown) else lines)
+    return "\n".join(
+        [*lines, f"{len(rows) - len(shown)} more"] if len(rows) > len(shown) else lines
+    )
 
 
 @contextmanager
@@ -90,12 +101,18 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
     from rich.text import Text
 
     def show(rows: Rows) -> None:
-        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # minus header and the line "N more"
+        # minus header and the line "N more"
+        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))
         text = to_table(head, rows, optional=optional, max_rows=most)
         live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 
     console = Console()
-    live = Live(console=console, auto_refresh=False, vertical_overflow="crop", redirect_stderr=sys.stderr.isatty())
+    live = Live(
+        console=console,
+        auto_refresh=False,
+        vertical_overflow="crop",
+        redirect_stderr=sys.stderr.isatty(),
+    )
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         with live:
@@ -111,6 +128,10 @@ def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
     from rich.progress import BarColumn, Progress, TextColumn
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(bar_width=24)
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+    with Progress(
+        *columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
+    ) as progress:
         task = progress.add_task("", total=None)
-        yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)
+        yield lambda text, done, total: progress.update(
+            task, description=text, completed=done or 0, total=total
+        )

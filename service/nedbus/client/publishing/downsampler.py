@@ -20,8 +20,10 @@ from nedbus_msgs import ANY, Address, Topic, get_topic
 from .group import Outgoing
 from .writer import Heartbeats, Writer
 
-_CHECK: Final = 0.005  # s between checks whether any downsampled stream of a vehicle has subscribers
-_LINGER: Final = 60_000_000_000  # ns for which an unmatched writer is kept, so returning readers can recover messages
+# s between checks whether any downsampled stream of a vehicle has subscribers
+_CHECK: Final = 0.005
+# ns for which an unmatched writer is kept, so returning readers can recover messages
+_LINGER: Final = 60_000_000_000
 
 
 class MatchingListener:
@@ -34,12 +36,15 @@ class MatchingListener:
         with translate_zenoh_errors():
             self._probe = session.declare_publisher(key_expr)
             try:  # the listener reports the current status first
-                self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
+                self._listener = self._probe.declare_matching_listener(
+                    zenoh.handlers.RingChannel(1)
+                )
             except BaseException:
                 self._probe.undeclare()
                 raise
         self.matched = False
-        self._lock = threading.RLock()  # all publishers of a vehicle share one listener; reentrant for signal handlers
+        # all publishers of a vehicle share one listener; reentrant for signal handlers
+        self._lock = threading.RLock()
         self._try_recv = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
@@ -66,7 +71,9 @@ class Downsampler:
     `checks_at`: monotonic time before which `put` has nothing to do unless `listener` is known to be matched [s].
     """
 
-    def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, listener: MatchingListener) -> None:
+    def __init__(
+        self, heartbeats: Heartbeats, address: Address, *, prefix: str, listener: MatchingListener
+    ) -> None:
         self.vehicle_listener, self._heartbeats = listener, heartbeats
         self._key = partial(address.rate_key, prefix=prefix)
         self._topic = get_topic(address.topic)
@@ -82,10 +89,13 @@ class Downsampler:
                 return
             self.checks_at = 0.0
             self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
-        now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
+        # not the message's timestamp: a replay at 10 times the speed would exceed the rate
+        now = time.monotonic_ns()
         is_matched = self._address_listener.is_matched()
         if is_matched and not self._streams:
-            self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES]
+            self._streams = [
+                _Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES
+            ]
         for stream in self._streams:
             if is_matched or stream.writer is not None:
                 stream.put(now, message)

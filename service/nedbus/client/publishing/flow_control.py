@@ -21,15 +21,19 @@ from .writer import Writer
 
 _log = logging.getLogger(__name__)
 
-WINDOW: Final = 2000  # unacknowledged messages of a session; this many fit into the queues of a link and of a reader
+# unacknowledged messages of a session; this many fit into the queues of a link and of a reader
+WINDOW: Final = 2000
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
 _MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; at this limit even the trickle stops
 _MIN_WINDOW: Final = 100  # messages per publisher, however many publishers share the window
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
-_RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have dropped, is repeated; doubles each time
-_QUERY_TIMEOUT: Final = 10.0  # s, timeout of each query, and the longest pause before a request is repeated
-_STALE_POLL: Final = 1.0  # s without a poll after which replies are too old to show which readers exist
+# s until a request, which a full queue may have dropped, is repeated; doubles each time
+_RETRY_PAUSE: Final = 0.5
+# s, timeout of each query, and the longest pause before a request is repeated
+_QUERY_TIMEOUT: Final = 10.0
+# s without a poll after which replies are too old to show which readers exist
+_STALE_POLL: Final = 1.0
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
 _POLL_EVERY: Final = 64  # messages between polls for replies
 _MATCH_EVERY: Final = 16  # messages between checks for the first subscriber
@@ -42,12 +46,15 @@ class SharedWindow:
 
     def __init__(self) -> None:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key
-        self._lock = threading.RLock()  # publishers call `share` on their own threads; a signal handler may close one
+        # publishers call `share` on their own threads; a signal handler may close one
+        self._lock = threading.RLock()
 
     def share(self, key: str, unread: int, *, now: float) -> int:
         """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
         with self._lock:
-            recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
+            recent = {
+                other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL
+            }
             self._unread = recent | {key: (unread, now)}
             others = sum(number for number, _ in self._unread.values()) - unread
             return max(_MIN_WINDOW, WINDOW // len(self._unread), WINDOW - others)
@@ -59,7 +66,8 @@ class ReaderProxies:
     def __init__(self) -> None:
         self._matched: set[str] = set()
         self.away: dict[str, float] = {}  # deadline of each reader that the publisher waits for
-        self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown reader froze
+        # readers that replied to the last request, in which an unknown reader froze
+        self._suspects: set[str] = set()
 
     @property
     def is_empty(self) -> bool:
@@ -81,14 +89,18 @@ class ReaderProxies:
         if froze and not gone:
             gone, self._suspects = {_UNKNOWN}, set(replies)
         self._matched = {reader for reader, is_closed in replies.items() if not is_closed}
-        self.away = {reader: end for reader, end in self.away.items() if end > now and reader not in replies}
+        self.away = {
+            reader: end for reader, end in self.away.items() if end > now and reader not in replies
+        }
         self.away |= dict.fromkeys(gone, until)
 
     def wait_for_link(self, now: float) -> None:
         """Extend all deadlines while the publisher has no router, or after its routers change. `now` in seconds."""
         if self.is_empty:
             self.away[_UNKNOWN] = now
-        self.away = {reader: max(until, now + TIMINGS.return_wait) for reader, until in self.away.items()}
+        self.away = {
+            reader: max(until, now + TIMINGS.return_wait) for reader, until in self.away.items()
+        }
 
 
 class _Request:
@@ -125,7 +137,12 @@ class FlowControl:
     """
 
     def __init__(
-        self, writer: Writer, window: SharedWindow, *, needs_router: bool, listener: MatchingListener | None = None
+        self,
+        writer: Writer,
+        window: SharedWindow,
+        *,
+        needs_router: bool,
+        listener: MatchingListener | None = None,
     ) -> None:
         self._writer = writer
         self._shared = window
@@ -136,8 +153,10 @@ class FlowControl:
         self._readers = ReaderProxies()
         self._request: _Request | None = None
         self._next_request = self._polled = 0.0  # monotonic times [s]
-        self._acknowledged = {False: 0, True: 0}  # number of messages received (False) and read by scripts (True)
-        self._window, self._due = WINDOW, WINDOW // _REQUESTS_PER_WINDOW  # messages; number at which a request is due
+        # number of messages received (False) and read by scripts (True)
+        self._acknowledged = {False: 0, True: 0}
+        # messages; number at which a request is due
+        self._window, self._due = WINDOW, WINDOW // _REQUESTS_PER_WINDOW
         self._logged = False
         self.check_at = 0
 
@@ -147,7 +166,12 @@ class FlowControl:
         Call it after each message from number `check_at` on.
         Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
         """
-        if self._listener and not self._listener.is_matched() and self._readers.is_empty and self._request is None:
+        if (
+            self._listener
+            and not self._listener.is_matched()
+            and self._readers.is_empty
+            and self._request is None
+        ):
             self._acknowledged[True] = published
             self._due = published
             self.check_at = published + _MATCH_EVERY
@@ -189,17 +213,25 @@ class FlowControl:
     def _send_request(self, published: int, *, read: bool, now: float) -> None:
         """Request an acknowledgement of the first `published` messages, or repeat the open request."""
         if self._request is None:
-            self._window = self._shared.share(self._writer.key, published - self._acknowledged[True], now=now)
+            self._window = self._shared.share(
+                self._writer.key, published - self._acknowledged[True], now=now
+            )
             self._due = published + self._window // _REQUESTS_PER_WINDOW
             self._request = _Request(published, self._routers(), read=read, now=now)
         request, writer = self._request, self._writer
         self._next_request = now + min(_RETRY_PAUSE + now - request.sent, _QUERY_TIMEOUT)
         number = (request.number - 1) % 2**32
-        selector = f"{ack_key(writer.key)}?publisher={writer.name};number={number};read={request.read:d}"
+        selector = (
+            f"{ack_key(writer.key)}?publisher={writer.name};number={number};read={request.read:d}"
+        )
         session = writer.session
         priority = writer.priority
         timeout = _QUERY_TIMEOUT
-        request.queries.add(send_query(session, selector, timeout=timeout, priority=priority, congestion_control=_DROP))
+        request.queries.add(
+            send_query(
+                session, selector, timeout=timeout, priority=priority, congestion_control=_DROP
+            )
+        )
 
     def _poll(self, now: float) -> None:
         request = self._request
@@ -215,9 +247,12 @@ class FlowControl:
             self._readers.wait_for_link(now)
         self._request, self._next_request = None, now
         if self._readers.away:
-            self._next_request += 0.0 if froze else _AWAY_PAUSE  # at once, before the frozen reader can return
+            # at once, before the frozen reader can return
+            self._next_request += 0.0 if froze else _AWAY_PAUSE
         else:
             self._acknowledged[request.read] = request.number
 
     def _routers(self) -> list[str]:
-        return sorted(map(str, self._writer.session.info.routers_zid())) if self._needs_router else []
+        return (
+            sorted(map(str, self._writer.session.info.routers_zid())) if self._needs_router else []
+        )

@@ -21,7 +21,8 @@ MAX_HOLD: Final = 0.005
 """Seconds for which a lossless publisher waits for more messages of a group; longer on a busy machine only."""
 
 _QUICK: Final = 0.0002  # s between two messages of a quick succession
-_AT_ONCE: Final = 16  # messages of a succession that are handed over at once, before the first group
+# messages of a succession that are handed over at once, before the first group
+_AT_ONCE: Final = 16
 
 Outgoing = tuple[bytes, zenoh.Timestamp, zenoh.Encoding]
 """Payload, time of publication and encoding of a message."""
@@ -33,15 +34,19 @@ class Group:
     `put`: puts messages in order, with `writer`. One thread calls `add` and `begin`; the other methods are thread-safe.
     """
 
-    def __init__(self, writer: Writer, put: Callable[[Sequence[Outgoing]], object], heartbeats: Heartbeats) -> None:
+    def __init__(
+        self, writer: Writer, put: Callable[[Sequence[Outgoing]], object], heartbeats: Heartbeats
+    ) -> None:
         self._writer = writer
         self._put = put
         self._heartbeats = heartbeats
         self._held: list[Outgoing] = []  # each until it has been put
         self._left = 1  # messages until the group is complete
-        self._successive, self._last = 0, 0.0  # messages since a pause; monotonic time of the last one [s]
+        # messages since a pause; monotonic time of the last one [s]
+        self._successive, self._last = 0, 0.0
         self._lock = threading.RLock()  # held while messages are put, so their order is kept
-        self._is_putting = False  # by the thread that holds the lock; True for a signal handler that interrupts it
+        # by the thread that holds the lock; True for a signal handler that interrupts it
+        self._is_putting = False
         self.is_watched = False  # by `heartbeats`
 
     def __len__(self) -> int:
@@ -61,7 +66,8 @@ class Group:
         self._last = now
         self._held.append(message)
         self._successive += 1
-        self._left -= 1  # also if the last messages were handed over meanwhile: flow control must be asked in time
+        # also if the last messages were handed over meanwhile: flow control must be asked in time
+        self._left -= 1
         return self._left <= 0 or not (self.is_watched or self._heartbeats.watch(self))
 
     def begin(self, room: int) -> None:
@@ -82,7 +88,8 @@ class Group:
                 self._lock.release()
 
     def _put_held(self) -> None:
-        if self._is_putting:  # this is a signal handler; the interrupted call puts what it has added
+        # this is a signal handler; the interrupted call puts what it has added
+        if self._is_putting:
             return
         try:
             self._is_putting = True
@@ -90,7 +97,8 @@ class Group:
                 before = self._writer.published
                 try:
                     self._put(tuple(self._held))
-                finally:  # Ctrl-C may have interrupted it; Python handles no signal between here and the deletion
+                finally:
+                    # Ctrl-C may have interrupted it; Python handles no signal between here and the deletion
                     del self._held[: self._writer.published - before]
         except NedbusError:
             self._held.clear()

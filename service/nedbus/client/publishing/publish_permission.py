@@ -6,7 +6,15 @@ from functools import partial
 from typing import Final
 
 from nedbus.errors import RefusedError
-from nedbus.transport import Session, Tls, Verdict, is_refused, probe_at_router, routers_of, secure_endpoints
+from nedbus.transport import (
+    Session,
+    Tls,
+    Verdict,
+    is_refused,
+    probe_at_router,
+    routers_of,
+    secure_endpoints,
+)
 
 _MAX_KNOWN: Final = 10_000  # vehicles whose permission is remembered
 
@@ -14,13 +22,16 @@ _MAX_KNOWN: Final = 10_000  # vehicles whose permission is remembered
 class PublishPermission:
     """The write permissions of a session with a client certificate, probed once per vehicle and link to a router."""
 
-    def __init__(self, session: Session, endpoints: Sequence[str], *, tls: Tls, prefix: str) -> None:
+    def __init__(
+        self, session: Session, endpoints: Sequence[str], *, tls: Tls, prefix: str
+    ) -> None:
         self._session = session
         self._endpoints = endpoints
         self._tls = tls
         self._prefix = prefix
         self._lock = threading.Lock()
-        self._routers = frozenset[str]()  # for which the permissions below hold: rules change only with a restart
+        # for which the permissions below hold: rules change only with a restart
+        self._routers = frozenset[str]()
         self._refused: dict[str, bool] = {}  # by vehicle
 
     @classmethod
@@ -54,5 +65,7 @@ class PublishPermission:
             raise RefusedError(vehicle, self._tls.certificate)
 
     def _probe(self, vehicle: str) -> Verdict | None:
-        verdicts = probe_at_router(self._session, self._endpoints, [vehicle], tls=self._tls, prefix=self._prefix)
+        verdicts = probe_at_router(
+            self._session, self._endpoints, [vehicle], tls=self._tls, prefix=self._prefix
+        )
         return verdicts.get(vehicle)

@@ -75,10 +75,14 @@ class Publisher(AbstractContextManager["Publisher"]):
             if lossless and not registry.is_client:
                 self._listener = MatchingListener(heartbeats.session, self.key)
             self._flow_control = FlowControl(
-                self._writer, registry.window, needs_router=registry.is_client, listener=self._listener
+                self._writer,
+                registry.window,
+                needs_router=registry.is_client,
+                listener=self._listener,
             )
             self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
-            with translate_zenoh_errors():  # last: readers may use all of the above once they see the token
+            # last: readers may use all of the above once they see the token
+            with translate_zenoh_errors():
                 token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
                 self._token = heartbeats.session.liveliness().declare_token(token)
         except BaseException:
@@ -100,7 +104,10 @@ class Publisher(AbstractContextManager["Publisher"]):
     def relabel(self, source: str) -> None:
         """Set the source of all subsequent messages, which readers see in `sample.source`."""
         if source != self.source:
-            self.source, self._encoding = source, zenoh.Encoding(encoding_of(self.definition, source))
+            self.source, self._encoding = (
+                source,
+                zenoh.Encoding(encoding_of(self.definition, source)),
+            )
             self._partial = self._all, self._encoding
 
     def publish(self, message: Message | Mapping[str, object]) -> None:
@@ -121,7 +128,9 @@ class Publisher(AbstractContextManager["Publisher"]):
             self.publish_encoded(self._codec.encode_fields(message), message.keys())
         else:
             name, given = self.definition.name, type(message).__name__
-            raise TypeError(f"{self.address} carries {name}: publish a {name} or a dict of its fields, not {given}")
+            raise TypeError(
+                f"{self.address} carries {name}: publish a {name} or a dict of its fields, not {given}"
+            )
 
     def publish_row(self, values: Sequence[object] | Message) -> None:
         """Validate and publish the values of all fields in PX4's order, with arrays such as `delta_xy` as tuples.
@@ -143,7 +152,9 @@ class Publisher(AbstractContextManager["Publisher"]):
         arrays, size = arrays_of(self.definition), self._codec.size
         if getattr(messages, "dtype", None) != arrays.dtype:
             hint = "convert messages with nedbus.to_array, or an array with the same fields with astype"
-            raise TypeError(f"{self.address} needs an array with the dtype of {self.definition.name}: {hint}")
+            raise TypeError(
+                f"{self.address} needs an array with the dtype of {self.definition.name}: {hint}"
+            )
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
         each = [payloads[start : start + size] for start in range(0, len(payloads), size)]
@@ -151,7 +162,9 @@ class Publisher(AbstractContextManager["Publisher"]):
             self._group.hand_over()
         sent = 0
         while sent < len(each):
-            room = self._flow_control.check_at - self._writer.published if self.lossless else MAX_GROUP
+            room = (
+                self._flow_control.check_at - self._writer.published if self.lossless else MAX_GROUP
+            )
             group = each[sent : sent + max(1, min(MAX_GROUP, room))]
             self._put([(payload, self._new_timestamp(), self._encoding) for payload in group])
             self._wait_for_credit()
@@ -203,7 +216,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         encoding = self._encoding
         if len(provided) != len(self._all):
             known = self._partial[0]
-            if provided is not known and provided != known:  # rare: usually the same fields are missing
+            # rare: usually the same fields are missing
+            if provided is not known and provided != known:
                 text = encoding_of(self.definition, self.source, frozenset(provided))
                 self._partial = frozenset(provided), zenoh.Encoding(text)
             encoding = self._partial[1]

@@ -17,7 +17,16 @@ from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import LivelinessTokens, Session, VehicleDirectory, translate_zenoh_errors
-from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
+from nedbus_msgs import (
+    ANY,
+    BY_TOPIC,
+    Address,
+    AddressError,
+    Definition,
+    Selection,
+    schema_key,
+    short_hash,
+)
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
@@ -28,8 +37,10 @@ from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-_MAX_UNUSED: Final = 64  # definitions kept after their publisher closed, for readers with unread messages
-_FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
+# definitions kept after their publisher closed, for readers with unread messages
+_MAX_UNUSED: Final = 64
+# s between acknowledgement requests: time for three round trips over a radio link
+_FLUSH_POLL: Final = 2.0
 
 
 class PublisherRegistry:
@@ -56,9 +67,12 @@ class PublisherRegistry:
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
         self.publishers: dict[Address, Publisher] = {}  # open publishers
-        self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
-        self._former = ""  # a vehicle without publishers that still answers schema queries, for messages in transit
-        self._rate_listeners: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
+        # by name and hash, oldest first
+        self._definitions: dict[tuple[str, str], Definition[Any]] = {}
+        # a vehicle without publishers that still answers schema queries, for messages in transit
+        self._former = ""
+        # by vehicle, for all its downsampled streams
+        self._rate_listeners: dict[str, MatchingListener] = {}
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
         self._shared: set[str] = set()  # vehicles that another process also publishes
         self._lock = threading.Lock()
@@ -96,10 +110,14 @@ class PublisherRegistry:
                 source=source, owner=owner,
             )  # fmt: skip
             undo.pop_all()
-            self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
+            self._definitions[definition.name, short_hash(definition.name, definition.types)] = (
+                definition
+            )
             if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
                 used = {each.definition for each in self.publishers.values()}
-                del self._definitions[next(key for key, each in self._definitions.items() if each not in used)]
+                del self._definitions[
+                    next(key for key, each in self._definitions.items() if each not in used)
+                ]
         return publisher
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
@@ -112,7 +130,9 @@ class PublisherRegistry:
         """Return the vehicles that another process also publishes; log new ones."""
         with self._lock:  # several threads call this, and `forget` closes directories
             counts = {name: each.publishers(timeout=0) for name, each in self._directories.items()}
-            shared = {name for name, numbers in counts.items() if max(numbers.values(), default=0) > 1}
+            shared = {
+                name for name, numbers in counts.items() if max(numbers.values(), default=0) > 1
+            }
             known, self._shared = self._shared, shared
         for name in shared - known:
             text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
@@ -125,10 +145,16 @@ class PublisherRegistry:
             keys = (address.key(prefix=self.prefix) for address in addresses)
             probes = [opened.enter_context(self._session.declare_publisher(key)) for key in keys]
             # Zenoh's stubs declare the status as a bool, but the status is an object, which is always true.
-            return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
+            return any(
+                cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes
+            )
 
     def flush(
-        self, publishers: Iterable[Publisher], *, timeout: float = FLUSH_TIMEOUT, stop: threading.Event | None = None
+        self,
+        publishers: Iterable[Publisher],
+        *,
+        timeout: float = FLUSH_TIMEOUT,
+        stop: threading.Event | None = None,
     ) -> None:
         """Wait until readers have received all messages of these publishers; end after `timeout` s or on `stop`."""
         end = time.monotonic() + timeout
@@ -140,7 +166,11 @@ class PublisherRegistry:
                     _log.warning(text, address, extra=about("slow_reader", address))
                     return
                 if not logged:
-                    _log.info("%s: waiting for a slow reader", address, extra=about("slow_reader", address))
+                    _log.info(
+                        "%s: waiting for a slow reader",
+                        address,
+                        extra=about("slow_reader", address),
+                    )
                 logged = True
 
     def forget(self, address: Address) -> None:
@@ -155,9 +185,12 @@ class PublisherRegistry:
         schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
         self._on_vehicle(vehicle)
         self._directories[vehicle] = VehicleDirectory(
-            partial(LivelinessTokens, self._session, *selection.alive_key_exprs(prefix=prefix)), prefix=prefix
+            partial(LivelinessTokens, self._session, *selection.alive_key_exprs(prefix=prefix)),
+            prefix=prefix,
         )
-        self._rate_listeners[vehicle] = MatchingListener(self._session, *selection.rate_key_exprs(ANY, prefix=prefix))
+        self._rate_listeners[vehicle] = MatchingListener(
+            self._session, *selection.rate_key_exprs(ANY, prefix=prefix)
+        )
         self._queries.answer(f"{prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
         # One key per vehicle, for the access rules: a vehicle may answer for its own messages only.
         self._queries.answer(schema(ANY), partial(_reply_schemas, schema, self._definitions))
@@ -190,10 +223,14 @@ def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.
 
 
 def _reply_schemas(
-    key_of: Callable[[str], str], definitions: Mapping[tuple[str, str], Definition[Any]], query: zenoh.Query
+    key_of: Callable[[str], str],
+    definitions: Mapping[tuple[str, str], Definition[Any]],
+    query: zenoh.Query,
 ) -> None:
     """Reply with the schemas of the queried messages, or only with the one whose hash the query names."""
     requested = query.parameters.get("hash")
     for (name, short), definition in tuple(definitions.items()):
         if requested in (None, short) and query.key_expr.intersects(key_of(name)):
-            query.reply(key_of(name), json.dumps({**definition.schema(), "hash": short}), encoding=JSON)
+            query.reply(
+                key_of(name), json.dumps({**definition.schema(), "hash": short}), encoding=JSON
+            )

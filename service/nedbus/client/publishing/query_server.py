@@ -21,7 +21,8 @@ _POLL: Final = 0.01  # s between polls; TICK after _BUSY seconds without a query
 _BUSY: Final = 1.0
 JSON: Final = "application/json"
 
-_replies = CallThread("nedbus-replies")  # a report on many vehicles would block the I/O thread for too long
+# a report on many vehicles would block the I/O thread for too long
+_replies = CallThread("nedbus-replies")
 
 # Replies to a query; must not reference the server's owner, which may be garbage-collected while the server is open.
 Reply = Callable[[zenoh.Query], object]
@@ -42,7 +43,9 @@ class QueryServer:
         if key_expr not in self._queryables:
             self._queryables[key_expr] = _Queryable(self._session, key_expr, reply)
 
-    def answer_json(self, key: str, parts: Callable[[Callable[[str], str | None]], Iterable[bytes]]) -> None:
+    def answer_json(
+        self, key: str, parts: Callable[[Callable[[str], str | None]], Iterable[bytes]]
+    ) -> None:
         """Reply to queries on a key with the JSON documents of `parts(get)`; `get` returns a parameter of the query."""
 
         def reply(query: zenoh.Query) -> None:
@@ -65,20 +68,25 @@ class QueryServer:
 class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
         with translate_zenoh_errors():
-            self._queryable = session.declare_queryable(key_expr, zenoh.handlers.RingChannel(_MAX_PENDING))
+            self._queryable = session.declare_queryable(
+                key_expr, zenoh.handlers.RingChannel(_MAX_PENDING)
+            )
         self._try_recv, self._reply = self._queryable.handler.try_recv, reply
         self._query: zenoh.Query | None = None  # the next one to reply to
         self._busy_until = 0.0
         self._replying = threading.Lock()
         self._closed = False
-        self._errors = UnexpectedErrors(_log, "%s: unexpected error in a query reply (logged once)", key_expr)
+        self._errors = UnexpectedErrors(
+            _log, "%s: unexpected error in a query reply (logged once)", key_expr
+        )
         _replies.start()
         self._job = Job(self._poll)
 
     def close(self) -> None:
         self._closed = True
         self._job.end()
-        with self._replying, suppress(zenoh.ZError):  # a thread still in Zenoh at interpreter exit aborts the process
+        # a thread still in Zenoh at interpreter exit aborts the process
+        with self._replying, suppress(zenoh.ZError):
             self._queryable.undeclare()
 
     def _poll(self, now: float) -> float:

@@ -14,40 +14,61 @@ from zenoh import Priority
 
 from nedbus.client.io_thread import TICK, Job
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payload, translate_zenoh_errors
+from nedbus.transport import (
+    Session,
+    entity_name,
+    heartbeat_key,
+    heartbeat_payload,
+    translate_zenoh_errors,
+)
 from nedbus_msgs import Topic
 
 from .group import MAX_HOLD, Group, Outgoing
 
-_PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
+# s of silence before the first heartbeat, and between the following ones
+_PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)
 _TURN: Final = 256  # heartbeats per call; more would delay other jobs
-HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # maximum time [s] until readers detect the loss of the last message
+# maximum time [s] until readers detect the loss of the last message
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK
 
 
 class Writer:
     """Put payloads of one topic on one key, with a history cache of `cache` messages."""
 
     def __init__(
-        self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: zenoh.Encoding | None = None
+        self,
+        heartbeats: Heartbeats,
+        key: str,
+        topic: Topic,
+        *,
+        cache: int,
+        encoding: zenoh.Encoding | None = None,
     ) -> None:
         self.session = heartbeats.session
         self.key = key
         self.published = 0
         self.priority = Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
         self.last_put = 0.0  # monotonic time of the last message [s]
-        self.is_silent = True  # before the first message, and once a heartbeat has followed the last one
-        self.silent_since, self.sent_heartbeats = 0.0, 0  # time of the last message [s], and heartbeats since then
-        self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a check of `last_put` [s]
+        # before the first message, and once a heartbeat has followed the last one
+        self.is_silent = True
+        # time of the last message [s], and heartbeats since then
+        self.silent_since, self.sent_heartbeats = 0.0, 0
+        # monotonic time of the next heartbeat, or of a check of `last_put` [s]
+        self.heartbeat_due = math.inf
         self._heartbeats, self._encoding = heartbeats, encoding
         with translate_zenoh_errors():
-            self._publisher: zenoh.ext.AdvancedPublisher | None = zenoh.ext.declare_advanced_publisher(
-                self.session,
-                key,
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=self.priority,
-                cache=zenoh.ext.CacheConfig(cache),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            self._publisher: zenoh.ext.AdvancedPublisher | None = (
+                zenoh.ext.declare_advanced_publisher(
+                    self.session,
+                    key,
+                    encoding=encoding,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=self.priority,
+                    cache=zenoh.ext.CacheConfig(cache),
+                    sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                        heartbeat=None, sporadic_heartbeat=None
+                    ),
+                )
             )
             self.name = entity_name(self._publisher.id)
             try:
@@ -165,7 +186,8 @@ class Heartbeats:
         for writer in tuple(self.writers):
             if writer.heartbeat_due > now or not left:
                 continue
-            writer.is_silent = True  # before `last_put` is read: a message after that calls `resume`
+            # before `last_put` is read: a message after that calls `resume`
+            writer.is_silent = True
             if writer.silent_since != writer.last_put:
                 writer.silent_since, writer.sent_heartbeats = writer.last_put, 0
                 writer.heartbeat_due = writer.silent_since + _PAUSES[0]

@@ -16,7 +16,8 @@ from nedbus_msgs import Address, Codec, Provenance
 if TYPE_CHECKING:
     from .writer_proxy import WriterProxy
 
-_MAX_ENCODING: Final = 512  # characters kept of an encoding; nedbus's own encodings have at most 250
+# characters kept of an encoding; nedbus's own encodings have at most 250
+_MAX_ENCODING: Final = 512
 
 Layouts = Mapping[int, Sequence[str]]  # names of the fields by layout
 NO_LAYOUTS: Final[Layouts] = {}
@@ -29,17 +30,21 @@ class Stream:
     key: str  # key of the full-rate stream
     wire_key: str  # key on which messages arrive, perhaps downsampled
     address: Address
-    codec: Codec[Any] | None = None  # None for messages not built in: each encoding identifies a definition
+    # None for messages not built in: each encoding identifies a definition
+    codec: Codec[Any] | None = None
     size: int = -1  # bytes of a payload with all fields
-    encoding: tuple[object, str] = None, ""  # last encoding: Zenoh's object and its text; accessed by two threads
+    # last encoding: Zenoh's object and its text; accessed by two threads
+    encoding: tuple[object, str] = None, ""
     provenance: tuple[str, Provenance] = "", Provenance()  # last provenance, with its encoding
     writers: dict[str, WriterProxy] = field(default_factory=dict)  # by name
     writer: WriterProxy | None = None  # publisher of the last message
     last_active: float = 0.0  # monotonic time of the last message or heartbeat [s]
     gap: int = 0  # messages lost before the next delivery
-    unreported: int = 0  # messages lost before one that was dropped or invalid; the next sample read reports them
+    # messages lost before one that was dropped or invalid; the next sample read reports them
+    unreported: int = 0
     gate: RateGate | None = None  # set with a maximum rate, once a downsampled message has arrived
-    last_sent: float = -math.inf  # with a maximum rate, time of sending of the retained message [ns]
+    # with a maximum rate, time of sending of the retained message [ns]
+    last_sent: float = -math.inf
 
 
 class DetachedSample(NamedTuple):
@@ -74,7 +79,9 @@ def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:
     if isinstance(raw, DetachedSample):
         return arrival
     return arrival._replace(
-        raw=DetachedSample(raw.timestamp, raw.source_info, encoding_of(arrival.stream, raw), retained)
+        raw=DetachedSample(
+            raw.timestamp, raw.source_info, encoding_of(arrival.stream, raw), retained
+        )
     )
 
 
@@ -86,5 +93,6 @@ def encoding_of(stream: Stream, raw: RawSample | DetachedSample) -> str:
     known, text = stream.encoding
     if encoding != known:
         text = str(encoding)[:_MAX_ENCODING]
-        stream.encoding = zenoh.Encoding(text), text  # a copy: the original keeps its receive buffer in memory
+        # a copy: the original keeps its receive buffer in memory
+        stream.encoding = zenoh.Encoding(text), text
     return text

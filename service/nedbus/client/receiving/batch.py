@@ -30,7 +30,9 @@ class ReceivedBatch(Batch):
     def sent(self) -> npt.NDArray[np.int64]:
         """Time of sending of each message, ns since the epoch by the publisher's clock; 0 without a timestamp."""
         stamps = (arrival.raw.timestamp for arrival in self._arrivals)
-        return np.array([stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps], np.int64)
+        return np.array(
+            [stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps], np.int64
+        )
 
     @cached_property
     def sequence(self) -> npt.NDArray[np.int64]:
@@ -42,7 +44,9 @@ class ReceivedBatch(Batch):
     def provenances(self) -> list[Provenance]:
         """Provenance of each message: its source and the fields that the source did not provide."""
         definition = self.message.DEFINITION
-        return [provenance_of(definition, encoding_of(each.stream, each.raw)) for each in self._arrivals]
+        return [
+            provenance_of(definition, encoding_of(each.stream, each.raw)) for each in self._arrivals
+        ]
 
 
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> ReceivedBatch:
@@ -56,7 +60,9 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> R
     if messages is None:
         own, blank = codec_of(definition).size, bytes(codec_of(definition).size)
         # Payloads of other layouts are replaced by an invalid placeholder, and decoded below.
-        messages, valid = arrays.decode(b"".join([each if len(each) == own and codec else blank for each in payloads]))
+        messages, valid = arrays.decode(
+            b"".join([each if len(each) == own and codec else blank for each in payloads])
+        )
         if not valid.all():
             for index in np.flatnonzero(~valid).tolist():
                 sample = decoder.decode(arrivals[index], rows=True)

@@ -16,14 +16,24 @@ from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
 from nedbus.samples import Sample
 from nedbus.transport import RawSample
-from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, codec_of, identity_of, provenance_of
+from nedbus_msgs import (
+    BY_TOPIC,
+    PAYLOAD_LIMIT,
+    RATE,
+    Address,
+    Codec,
+    codec_of,
+    identity_of,
+    provenance_of,
+)
 
 from .arrival import NO_LAYOUTS, Arrival, DetachedSample, Layouts, Stream, encoding_of
 from .layout_lookup import LayoutLookup, Sender
 
 _log = logging.getLogger(__name__)
 
-WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
+# encoding of a session-local sample that wakes a reader blocked on the ring
+WAKE_UP: Final = "nedbus/wake-up"
 _MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
@@ -40,7 +50,8 @@ class Decoder:
         self._layouts = layouts
         self.reasons: dict[Address, str] = {}
         self._warned: set[int] = set()  # hashes, because keys may be long
-        self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject
+        # guards `invalid` and `_warned`: receiving and reading threads reject
+        self._counting = threading.Lock()
 
     def open(self, key: str) -> Stream:
         """Return the state of a new stream; raise AddressError if the key has no address."""
@@ -73,7 +84,9 @@ class Decoder:
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     yield sample
 
-    def inspect(self, stream: Stream, payload: bytes, raw: RawSample) -> tuple[Codec[Any] | None, Layouts]:
+    def inspect(
+        self, stream: Stream, payload: bytes, raw: RawSample
+    ) -> tuple[Codec[Any] | None, Layouts]:
         """Return the codec of a sample's definition, and its layout if that is newer than those built in.
 
         The codec is None while a lookup is in progress, which this may start; it does not wait.
@@ -111,7 +124,11 @@ class Decoder:
         if raw.encoding != known:  # rare
             encoding = encoding_of(stream, raw)
         if codec is None:
-            self.reject(stream.key, DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"), stream)
+            self.reject(
+                stream.key,
+                DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"),
+                stream,
+            )
             return None
         decode = codec.decode_row if rows else codec.decode
         try:
@@ -141,22 +158,38 @@ class Decoder:
             if len(self._warned) >= _MAX_LOGGED_KEYS or hash(key) in self._warned:
                 return
             self._warned.add(hash(key))
-            last = "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
+            last = (
+                "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
+            )
             reason = str(error)[:_MAX_TEXT]
             if stream is not None:
                 self.reasons[stream.address] = reason
         extra = about("invalid", stream.address if stream else None, reason=reason)
-        _log.warning("ignored an invalid message on %r (%s)%s", key[:_MAX_TEXT], reason, last, extra=extra)
+        _log.warning(
+            "ignored an invalid message on %r (%s)%s", key[:_MAX_TEXT], reason, last, extra=extra
+        )
 
-    def _find_layout(self, error: UnknownLayoutError, stream: Stream, raw: RawSample | DetachedSample) -> Layouts:
+    def _find_layout(
+        self, error: UnknownLayoutError, stream: Stream, raw: RawSample | DetachedSample
+    ) -> Layouts:
         """Return the fields of an unknown layout, which the hash in the encoding identifies; {} if it is not known."""
         if stream.codec is None:
             return NO_LAYOUTS  # a definition that was looked up has a single layout
-        codec, name = self._find_codec(stream, raw, unknown=f"layout {error.layout}"), stream.codec.definition.name
-        return {error.layout: codec.definition.names} if codec and codec.definition.name == name else NO_LAYOUTS
+        codec = self._find_codec(stream, raw, unknown=f"layout {error.layout}")
+        name = stream.codec.definition.name
+        return (
+            {error.layout: codec.definition.names}
+            if codec and codec.definition.name == name
+            else NO_LAYOUTS
+        )
 
     def _find_codec(
-        self, stream: Stream, raw: RawSample | DetachedSample, *, wait: bool = False, unknown: str = "message"
+        self,
+        stream: Stream,
+        raw: RawSample | DetachedSample,
+        *,
+        wait: bool = False,
+        unknown: str = "message",
     ) -> Codec[Any] | None:
         """Return the codec of the definition in the encoding, from its publisher; None if no publisher has it.
 

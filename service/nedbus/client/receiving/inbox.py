@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, get_args
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.errors import ArgumentError, ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
 from nedbus.samples import Counts, Mode, Sample
@@ -29,7 +29,7 @@ from . import streams
 from .arrival import NO_LAYOUTS, Arrival, Stream
 from .decoder import WAKE_UP, Decoder
 from .reorder import Reorder
-from .unread import CAPACITY, Unread
+from .unread import Unread
 from .writer_proxy import LossCounters, WriterProxy
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ class AckRequest:
     number: int
     read: bool
     reply: Callable[[], object]  # sends the acknowledgement; called once
-    read_target: int | None = None  # samples to be read before answering; None until the message has arrived
+    # samples to be read before answering; None until the message has arrived
+    read_target: int | None = None
 
 
 class Inbox:
@@ -78,7 +79,8 @@ class Inbox:
         self._discards = False  # closed: nothing can be read any more
         self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
-        self.on_wake: Callable[[], object] | None = None  # wakes a reader on an event loop; called on any thread
+        # wakes a reader on an event loop; called on any thread
+        self.on_wake: Callable[[], object] | None = None
         self.key_exprs, self.name, self.decoder = key_exprs, ", ".join(key_exprs), decoder
         self._warned: set[str] = set()
         self._clock = clock
@@ -87,14 +89,17 @@ class Inbox:
         self._counters = LossCounters()
         self.streams = streams.Streams(decoder.open, self._on_evict)
         recovers = not self.newest_only
-        self._reorder = Reorder(self.streams, self._admit, self._counters, recovers=recovers, clock=clock)
+        self._reorder = Reorder(
+            self.streams, self._admit, self._counters, recovers=recovers, clock=clock
+        )
         self.gaps = self._reorder.gaps
-        limit = limit or (streams.MAX_KEYS if self.newest_only else CAPACITY)
+        limit = limit or (streams.MAX_KEYS if self.newest_only else limits.UNREAD_MESSAGES)
         more_keys = f"more keys than the limit of {limit:,} have an unread message, so the oldest messages are dropped"
         self._max_before_recovery = limit // 2
         self._limited = more_keys if self.newest_only else _SLOW
         self._unread = Unread(self._counters, newest_only=self.newest_only, limit=limit)
-        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # the oldest may go unanswered
+        # the oldest may go unanswered
+        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)
 
     @property
     def counts(self) -> Counts:
@@ -156,7 +161,9 @@ class Inbox:
         with self._lock:
             received = clock.utc_ns()
             admitted = {number: self._admit(raw, received) for number, raw in found.items()}
-            arrivals = {number: arrival for number, arrival in admitted.items() if arrival is not None}
+            arrivals = {
+                number: arrival for number, arrival in admitted.items() if arrival is not None
+            }
             writer.on_retransmission(arrivals, ended=ended, now=now)
             return self._queue() > 0
 
@@ -173,7 +180,11 @@ class Inbox:
         """
         with self._lock:
             self._ack_requests += requests
-            ready = [request for request in self._ack_requests if self._can_answer(request, drained=drained)]
+            ready = [
+                request
+                for request in self._ack_requests
+                if self._can_answer(request, drained=drained)
+            ]
             for request in ready:
                 self._ack_requests.remove(request)
         for request in ready:
@@ -256,7 +267,8 @@ class Inbox:
                 if len(batch):
                     self._counters.received += len(batch)
                     return batch
-                for stream, lost in losses.items():  # the next valid message of each stream reports them
+                # the next valid message of each stream reports them
+                for stream, lost in losses.items():
                     stream.unreported += lost
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
@@ -265,7 +277,9 @@ class Inbox:
             stream, request.publisher, request.number, drained=drained
         ):
             request.read_target = arrived if request.read else 0
-        return self.ended or (request.read_target is not None and arrived - self.waiting >= request.read_target)
+        return self.ended or (
+            request.read_target is not None and arrived - self.waiting >= request.read_target
+        )
 
     def _admit(self, raw: RawSample, received: int) -> Arrival | None:
         """Return the arrival of a sample, without its payload if it is rejected; None if its key has no address.
@@ -306,7 +320,12 @@ class Inbox:
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            _log.warning("%s: %s", self.name, text, extra=about("dropped" if "dropped" in text else "incomplete"))
+            _log.warning(
+                "%s: %s",
+                self.name,
+                text,
+                extra=about("dropped" if "dropped" in text else "incomplete"),
+            )
 
 
 def _take_losses(arrivals: Iterable[Arrival]) -> Counter[Stream]:

@@ -26,13 +26,16 @@ _MAX_FIELDS: Final = 65_536  # of all definitions from publishers; PX4's message
 _IN_USE: Final = 60.0  # s after its last message during which a definition is not evicted
 _BASE: Final = 48  # memory of an empty definition, in units of one field
 _MAX_UNKNOWN: Final = 64  # definitions per query; as many more may wait for the next one
-_MAX_FAILED: Final = 1024  # definitions with a failed query; beyond that the oldest backoff is discarded
-_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s, backoff after failed queries for a definition
+# definitions with a failed query; beyond that the oldest backoff is discarded
+_MAX_FAILED: Final = 1024
+# s, backoff after failed queries for a definition
+_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
 _QUERY_PAUSE: Final = 0.2  # s between a query without a result and the next one
 _MAX_REPLY_FIELDS: Final = 256  # per layout
 _MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait longer
+# s of wait budget regained per second; peers cannot make readers wait longer
+_BUDGET_RATE: Final = 0.1
 
 SchemaId = tuple[str, str]  # message name, and hash of the definition
 Schemas = Mapping[SchemaId, Mapping[str, str]]  # definitions from publishers: field types by name
@@ -63,20 +66,29 @@ class LayoutLookup:
     """
 
     def __init__(
-        self, find: Callable[[Mapping[SchemaId, Sender]], Schemas], *, now: Callable[[], float] = time.monotonic
+        self,
+        find: Callable[[Mapping[SchemaId, Sender]], Schemas],
+        *,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._find, self._now = find, now
         self._known: dict[SchemaId, _Known] = {}
         self._full = False
-        self._errors = UnexpectedErrors(_log, "unexpected error in a lookup of definitions (logged once)")
+        self._errors = UnexpectedErrors(
+            _log, "unexpected error in a lookup of definitions (logged once)"
+        )
         self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
         self._open: dict[SchemaId, Sender] = {}  # sender of each open lookup, queried lookups first
-        self._failed: dict[SchemaId, tuple[int, float, Sender]] = {}  # failures, time of the next query, sender
-        self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last failed wait
+        # failures, time of the next query, sender
+        self._failed: dict[SchemaId, tuple[int, float, Sender]] = {}
+        # [s], at the last failed wait
+        self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")
 
-    def codec(self, name: str, identity: str, *, sender: Sender = _ANYONE, wait: bool = False) -> Codec[Any] | None:
+    def codec(
+        self, name: str, identity: str, *, sender: Sender = _ANYONE, wait: bool = False
+    ) -> Codec[Any] | None:
         """Return the codec of the definition with this hash; None if it is unknown, which starts a lookup.
 
         `sender`: after a failed lookup, a lookup for another sender starts at once, without backoff.
@@ -97,8 +109,14 @@ class LayoutLookup:
         with self._changed:
             start, longest = time.monotonic(), TIMINGS.definition_timeout
             budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
-            is_pending = self._open.__len__ if schema_id is None else partial(self._open.__contains__, schema_id)
-            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if schema_id is None else budget)
+            is_pending = (
+                self._open.__len__
+                if schema_id is None
+                else partial(self._open.__contains__, schema_id)
+            )
+            self._changed.wait_for(
+                lambda: self._closed or not is_pending(), longest if schema_id is None else budget
+            )
             if schema_id is not None and schema_id not in self._known:
                 self._budget_time = time.monotonic()
                 self._wait_budget = max(0.0, budget - (self._budget_time - start))
@@ -116,11 +134,18 @@ class LayoutLookup:
         with self._changed:
             _, due, failed = self._failed.get(schema_id, (0, float("-inf"), None))
             is_due = self._now() >= due or sender != failed
-            if self._closed or schema_id in self._known or not is_due or len(self._open) >= 2 * _MAX_UNKNOWN:
+            if (
+                self._closed
+                or schema_id in self._known
+                or not is_due
+                or len(self._open) >= 2 * _MAX_UNKNOWN
+            ):
                 return
             self._open[schema_id] = sender
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="nedbus-layouts", daemon=True)
+                self._thread = threading.Thread(
+                    target=self._run, name="nedbus-layouts", daemon=True
+                )
                 self._thread.start()
 
     def _run(self) -> None:
@@ -133,10 +158,14 @@ class LayoutLookup:
             added: list[SchemaId] = []
             with self._errors, suppress(NedbusError):  # the session is closed
                 found = self._find(queried)
-                added = [each for each in queried if each in found and self._add(*each, found[each])]
+                added = [
+                    each for each in queried if each in found and self._add(*each, found[each])
+                ]
             self._finish_query(queried, added)
 
-    def _finish_query(self, queried: Mapping[SchemaId, Sender], added: Collection[SchemaId]) -> None:
+    def _finish_query(
+        self, queried: Mapping[SchemaId, Sender], added: Collection[SchemaId]
+    ) -> None:
         with self._changed:
             for schema_id, queried_sender in queried.items():
                 sender = self._open.pop(schema_id)
@@ -163,11 +192,21 @@ class LayoutLookup:
         try:
             definition = define(name, ((field, field_type(kind)) for field, kind in fields.items()))
         except ValueError as exc:
-            _log.warning("ignored a peer's definition of %s: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
+            _log.warning(
+                "ignored a peer's definition of %s: %s",
+                name,
+                str(exc)[:_MAX_TEXT],
+                extra=about("invalid"),
+            )
             return False
         self._known[name, identity] = _Known(codec_of(definition), size, self._now())
         if name in MESSAGES:
-            unknown = ", ".join(field for field in fields if field not in MESSAGES[name].types)[:_MAX_TEXT] or "nothing"
+            unknown = (
+                ", ".join(field for field in fields if field not in MESSAGES[name].types)[
+                    :_MAX_TEXT
+                ]
+                or "nothing"
+            )
             text = "a layout of %s is newer than this reader; ignored fields: %s"
             _log.warning(text, name, unknown, extra=about("newer_layout", reason=reason))
         else:
@@ -191,7 +230,8 @@ class _Field:
 
 
 _FIELDS: Final = TypeAdapter(
-    Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)], config=ConfigDict(defer_build=True)
+    Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)],
+    config=ConfigDict(defer_build=True),
 )
 
 
@@ -211,7 +251,11 @@ def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: st
         queries = [send_query(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
         replies = islice(wait_for_replies(queries), MAX_REPLIES)
         for key, content in parse_replies(reply.ok for reply in replies if reply.ok is not None):
-            found |= {each: fields for each, fields in _parse(key.rpartition("/")[2], content) if each in ids}
+            found |= {
+                each: fields
+                for each, fields in _parse(key.rpartition("/")[2], content)
+                if each in ids
+            }
             if len(found) == len(ids):
                 return found
     return found
@@ -222,7 +266,10 @@ def _parse(name: str, reply: object) -> Iterator[tuple[SchemaId, dict[str, str]]
     layouts = reply.get("layouts") if isinstance(reply, dict) else None
     for layout in layouts[:_MAX_REPLY_LAYOUTS] if isinstance(layouts, list) else ():
         with suppress(ValueError):
-            parsed = _FIELDS.validate_python(layout.get("fields") if isinstance(layout, dict) else None)
+            parsed = _FIELDS.validate_python(
+                layout.get("fields") if isinstance(layout, dict) else None
+            )
             fields = {field.name: field.type for field in parsed}
             if len(fields) == len(parsed):
-                yield (name, short_hash(name, {field: field_type(kind) for field, kind in fields.items()})), fields
+                types = {field: field_type(kind) for field, kind in fields.items()}
+                yield (name, short_hash(name, types)), fields

@@ -35,7 +35,8 @@ _CHECK: Final = 1.0  # s between checks for publishers that do not downsample
 _LAST_POLL: Final = 0.02  # s between polls for last messages
 _MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
 
-_checks = CallThread("nedbus-publishers")  # listing publishers may open a session, which would block the I/O thread
+# listing publishers may open a session, which would block the I/O thread
+_checks = CallThread("nedbus-publishers")
 
 
 class MaxRateInbox(Inbox):
@@ -101,10 +102,13 @@ class MaxRateInbox(Inbox):
 class MaxRateReceiver(Receiver):
     """Put downsampled and last messages into a MaxRateInbox until closed; `open_session`: as in FleetTokens."""
 
-    def __init__(self, session: Session, inbox: MaxRateInbox, open_session: Callable[[], Session]) -> None:
+    def __init__(
+        self, session: Session, inbox: MaxRateInbox, open_session: Callable[[], Session]
+    ) -> None:
         self._rate_inbox, prefix = inbox, inbox.decoder.prefix
         self._directory = VehicleDirectory.of_fleet(open_session, inbox.selection, prefix=prefix)
-        self._since: dict[Address, float] = {}  # when a publisher was first seen [s]; infinity once it was checked
+        # when a publisher was first seen [s]; infinity once it was checked
+        self._since: dict[Address, float] = {}
         self._next_check = 0.0
         _checks.start()
         keys = inbox.selection.key_exprs(prefix=prefix)
@@ -116,9 +120,15 @@ class MaxRateReceiver(Receiver):
     def _poll(self, now: float) -> float:
         pause = super()._poll(now)
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
-            found = [reply.ok for each in self._last for reply in each.poll() if reply.ok is not None]
+            found = [
+                reply.ok for each in self._last for reply in each.poll() if reply.ok is not None
+            ]
             # Only from live publishers: a vehicle that has only a stored message is gone.
-            if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
+            if live := [
+                raw
+                for raw in found
+                if raw.attachment is not None and raw.attachment.to_bytes() == LIVE
+            ]:
                 self._rate_inbox.put_last(live)
         if now >= self._next_check:
             self._next_check = math.inf
@@ -129,9 +139,16 @@ class MaxRateReceiver(Receiver):
         now, found = time.monotonic(), Publishers()
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
             found = self._directory.publishers(timeout=0.0)
-        regular = (each for each in found if (topic := get_topic(each.topic)).rate and not topic.on_change)
-        self._since = {each: self._since.get(each, now) for each in regular}  # other topics may pause for long
-        due = [each for each, since in self._since.items() if now - since >= TIMINGS.downsampled_timeout]
+        regular = (
+            each for each in found if (topic := get_topic(each.topic)).rate and not topic.on_change
+        )
+        # other topics may pause for long
+        self._since = {each: self._since.get(each, now) for each in regular}
+        due = [
+            each
+            for each, since in self._since.items()
+            if now - since >= TIMINGS.downsampled_timeout
+        ]
         self._since.update(dict.fromkeys(due, math.inf))
         if missing := [each for each in due if not self._rate_inbox.has_downsampled(each)]:
             key = missing[0].key(prefix=self._rate_inbox.decoder.prefix)

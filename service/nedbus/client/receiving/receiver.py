@@ -39,7 +39,8 @@ _MAX_DECLARATIONS: Final = 8  # keys declared per poll; with 5,000 keys, one tak
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
-_MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
+# samples; after such a batch a short pause makes the next one larger and cheaper
+_MIN_BUSY_BATCH: Final = 64
 _BUSY_PAUSE: Final = 0.0003  # s
 _MAX_DIGITS: Final = 10  # digits of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
@@ -50,7 +51,8 @@ class _Ring:
 
     def __init__(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
         self.handler = handler  # a blocking receive on the subscriber would prevent undeclaring it
-        self.lock = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
+        # held by the thread that drains the ring; a Ctrl-C may leave it held
+        self.lock = threading.RLock()
         self.idle = False  # the holder is blocked on an empty ring
         self.busy = False
         self.pump: threading.Thread | None = None
@@ -65,14 +67,17 @@ class Receiver:
 
     def __init__(self, session: Session, inbox: Inbox, *, history: bool = True) -> None:
         self._session, self._inbox = session, inbox
-        self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", inbox.name)
+        self._errors = UnexpectedErrors(
+            _log, "%s: unexpected error, discarded a batch (logged once)", inbox.name
+        )
         self._changing = threading.Lock()
         self._closed = False
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         self._rings: list[_Ring] = []
         self._undeclares: list[Callable[[], object]] = []
-        self._take_queries: list[Callable[[], zenoh.Query | None]] = []  # this and the next two: mode `every` only
+        # this and the next two: mode `every` only
+        self._take_queries: list[Callable[[], zenoh.Query | None]] = []
         self._take_link: Callable[[], zenoh.TransportEvent | None] = lambda: None
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
@@ -80,17 +85,25 @@ class Receiver:
         with translate_zenoh_errors(), ExitStack() as undo:
             undo.callback(self._undeclare)
             for key_expr in inbox.key_exprs:
-                ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
-                subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
+                ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(
+                    RING_CAPACITY
+                )
+                subscriber = zenoh.ext.declare_advanced_subscriber(
+                    session, key_expr, ring, history=last
+                )
                 self._rings.append(_Ring(subscriber.handler))
                 self._undeclares.append(subscriber.undeclare)
                 if not inbox.newest_only:
-                    channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
+                    channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(
+                        MAX_ACK_REQUESTS
+                    )
                     queryable = session.declare_queryable(ack_key(key_expr), channel)
                     self._undeclares.append(queryable.undeclare)
                     self._take_queries.append(queryable.handler.try_recv)
             if not inbox.newest_only:
-                links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
+                links = session.info.declare_transport_events_listener(
+                    zenoh.handlers.RingChannel(1), history=False
+                )
                 self._undeclares.append(links.undeclare)
                 self._take_link = links.handler.try_recv
                 self._retransmission = Retransmission(session, inbox)
@@ -120,7 +133,8 @@ class Receiver:
             return self._inbox.wait(timeout)
         if ring.busy:
             time.sleep(_BUSY_PAUSE)
-        if not ring.lock.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds the lock for a shorter time
+        # the I/O thread holds the lock for a shorter time
+        if not ring.lock.acquire(timeout=_BUSY_PAUSE):
             return self._inbox.wait(None)
         try:
             self._receive(ring, if_empty=True)
@@ -133,7 +147,9 @@ class Receiver:
         with self._changing:
             for ring in self._rings:
                 if ring.pump is None and not self._closed:
-                    ring.pump = threading.Thread(target=self._run, args=(ring,), name="nedbus-pump", daemon=True)
+                    ring.pump = threading.Thread(
+                        target=self._run, args=(ring,), name="nedbus-pump", daemon=True
+                    )
                     ring.pump.start()
 
     def close(self, *, discard: bool = True) -> None:
@@ -153,7 +169,8 @@ class Receiver:
             self._retransmission.close()
         self._undeclare()
         for ring in self._rings:
-            if ring.pump is not None:  # a thread still in Zenoh at interpreter exit aborts the process
+            # a thread still in Zenoh at interpreter exit aborts the process
+            if ring.pump is not None:
                 join_thread(ring.pump, _JOIN_TIMEOUT)
             if ring.lock.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
                 ring.lock.release()
@@ -174,7 +191,9 @@ class Receiver:
                 with ring.lock:
                     self._receive(ring)
         except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
-            _log.exception("%s: unexpected error, subscription ended", self._inbox.name, extra=about("error"))
+            _log.exception(
+                "%s: unexpected error, subscription ended", self._inbox.name, extra=about("error")
+            )
             self._inbox.end(f"unexpected {type(exc).__name__}: {exc}")
 
     def _receive(self, ring: _Ring, *, if_empty: bool = False) -> None:
@@ -226,7 +245,9 @@ class Receiver:
             ):  # only a session-local sample, which the decoder discards, ends a blocking receive
                 here = zenoh.Locality.SESSION_LOCAL
                 with suppress(zenoh.ZError):  # the session is closed
-                    self._session.put(recovered_key, b"", encoding=WAKE_UP, allowed_destination=here)
+                    self._session.put(
+                        recovered_key, b"", encoding=WAKE_UP, allowed_destination=here
+                    )
         return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
     def _take_events(self) -> None:
@@ -237,7 +258,8 @@ class Receiver:
             while self._take_link() is not None:
                 self._inbox.on_link_change()
             for take in self._take_queries:
-                for query in islice(iter(take, None), MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
+                # a flood must not hold the I/O thread
+                for query in islice(iter(take, None), MAX_ACK_REQUESTS):
                     self._on_ack_request(query)
         except zenoh.ZError:  # undeclared
             pass

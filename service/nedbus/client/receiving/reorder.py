@@ -21,8 +21,10 @@ MAX_REQUESTING: Final = 10_000
 """Publishers with open gaps; beyond that, the heartbeat of an unknown publisher opens none."""
 
 _MAX_WRITERS_OF_KEY: Final = 8  # beyond that the oldest writer without a gap is evicted
-_LONG_RUN: Final = 8  # messages in order on one key, of which only the first and the last sender are compared
-_SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
+# messages in order on one key, of which only the first and the last sender are compared
+_LONG_RUN: Final = 8
+# s after a link change; a new publisher may have sent messages during the outage
+_SETTLING: Final = 10.0
 
 
 class Reorder:
@@ -59,7 +61,8 @@ class Reorder:
         delivered = self.gaps.delivered
         new_arrival = tuple.__new__
         received, now = clock.utc_ns(), self._clock()
-        last, count = None, 0  # the writer of the current run, and its messages; in a small batch each is a run
+        # the writer of the current run, and its messages; in a small batch each is a run
+        last, count = None, 0
         has_runs = len(batch) >= _LONG_RUN
         for raw in batch:
             stream, payload = known(str(raw.key_expr)), raw.payload.to_bytes()
@@ -68,7 +71,9 @@ class Reorder:
                 arrival = self._admit(raw, received)
             else:
                 # Without a call of the class, which takes 0.07 us more.
-                arrival = new_arrival(Arrival, (stream, payload, raw, stream.codec, 0, received, NO_LAYOUTS))
+                arrival = new_arrival(
+                    Arrival, (stream, payload, raw, stream.codec, 0, received, NO_LAYOUTS)
+                )
                 writer, info = stream.writer, raw.source_info
                 if (
                     writer is not None
@@ -76,7 +81,13 @@ class Reorder:
                     and info.source_sn == writer.expected
                     and writer.request is None
                     and not stream.gap
-                    and (writer is last or ((source := info.source_id).eid == writer.eid and source.zid == writer.zid))
+                    and (
+                        writer is last
+                        or (
+                            (source := info.source_id).eid == writer.eid
+                            and source.zid == writer.zid
+                        )
+                    )
                 ):
                     if writer is last:
                         count += 1
@@ -104,7 +115,9 @@ class Reorder:
         stream.last_active = self._clock()
         writer = stream.writers.get(publisher)
         if writer is None and len(self.gaps.requesting) < MAX_REQUESTING:
-            writer = self._add_writer(stream, publisher, 0 if self._settling else number, history_end=number + 1)
+            writer = self._add_writer(
+                stream, publisher, 0 if self._settling else number, history_end=number + 1
+            )
         if writer is not None:
             writer.on_heartbeat(number)
 
@@ -128,7 +141,9 @@ class Reorder:
         stream.writers.clear()
         stream.writer = None
 
-    def is_settled(self, stream: Stream | None, publisher: str, number: int, *, drained: bool) -> bool:
+    def is_settled(
+        self, stream: Stream | None, publisher: str, number: int, *, drained: bool
+    ) -> bool:
         """Return True if a message of a publisher has arrived or counts as lost, or none was sent to this reader."""
         writer = stream and stream.writers.get(publisher)
         return writer.is_settled(number) if writer else drained and not self._settling
@@ -169,7 +184,10 @@ class Reorder:
             stream.writer = writer
             if writer is not None:
                 # Only replies to queries use BLOCK, such as those to Zenoh's history query; nedbus publishers use DROP.
-                is_live = isinstance(raw, DetachedSample) or raw.congestion_control != zenoh.CongestionControl.BLOCK
+                is_live = (
+                    isinstance(raw, DetachedSample)
+                    or raw.congestion_control != zenoh.CongestionControl.BLOCK
+                )
                 if not is_live and writer.eid is None:
                     arrival = detach(arrival, retained=True)
                 writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
@@ -179,14 +197,21 @@ class Reorder:
             return
         writer.on_sample(info.source_sn, arrival, recovers=recovers, overflowed=overflowed)
 
-    def _add_writer(self, stream: Stream, name: str, expected: int, *, history_end: int) -> WriterProxy | None:
+    def _add_writer(
+        self, stream: Stream, name: str, expected: int, *, history_end: int
+    ) -> WriterProxy | None:
         """Add a writer proxy, evicting one without a gap if necessary; None if all writers of the key have gaps."""
         if len(stream.writers) >= _MAX_WRITERS_OF_KEY:
             writers = stream.writers.values()
-            first = next((each for each in writers if each is not stream.writer and each.request is None), None)
+            first = next(
+                (each for each in writers if each is not stream.writer and each.request is None),
+                None,
+            )
             if first is None:
                 return None
             del stream.writers[first.name]
-        writer = WriterProxy(stream, name, expected, self._counters, self.gaps, history_end=history_end)
+        writer = WriterProxy(
+            stream, name, expected, self._counters, self.gaps, history_end=history_end
+        )
         stream.writers[name] = writer
         return writer

@@ -51,7 +51,9 @@ class Retransmission:
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._inbox.on_heartbeat(key, publisher, number)
-            self._heartbeats = {at: number for take, _ in self._followed for at, number in take().items()}
+            self._heartbeats = {
+                at: number for take, _ in self._followed for at, number in take().items()
+            }
         recovered_key = ""
         for writer, answers in list(self._open.items()):
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
@@ -64,7 +66,9 @@ class Retransmission:
                 if (numbers := self._inbox.next_request(writer, now)) is not None:
                     key, name = writer.stream.wire_key, writer.name
                     with suppress(NedbusError):  # the session is closed
-                        self._open[writer] = RetransmitRequest(self._session, key, name, numbers, timeout=_TIMEOUT)
+                        self._open[writer] = RetransmitRequest(
+                            self._session, key, name, numbers, timeout=_TIMEOUT
+                        )
         return recovered_key, _ANSWER_POLL if self._open else _POLL
 
     def close(self) -> None:
@@ -75,7 +79,11 @@ class Retransmission:
                 undeclare()
 
     def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
-        found = {number: raw for number, raw in answers.poll().items() if len(raw.payload) <= PAYLOAD_LIMIT}
+        found = {
+            number: raw
+            for number, raw in answers.poll().items()
+            if len(raw.payload) <= PAYLOAD_LIMIT
+        }
         ended, key = answers.ended, writer.stream.wire_key
         if ended:
             del self._open[writer]
@@ -84,7 +92,9 @@ class Retransmission:
         with self._errors:
             return key if self._inbox.on_retransmission(writer, found, ended=ended, now=now) else ""
         self._open.pop(writer, None)
-        return key if self._inbox.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
+        return (
+            key if self._inbox.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
+        )
 
     def _may_open(self, writer: WriterProxy) -> bool:
         share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]

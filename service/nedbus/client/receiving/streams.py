@@ -26,12 +26,16 @@ class Streams:
     and True if it was evicted because of MAX_KEYS.
     """
 
-    def __init__(self, open_stream: Callable[[str], Stream], on_evict: Callable[[Stream, bool], object]) -> None:
+    def __init__(
+        self, open_stream: Callable[[str], Stream], on_evict: Callable[[Stream, bool], object]
+    ) -> None:
         self._open_stream, self._on_evict = open_stream, on_evict
         self._streams: dict[str, Stream] = {}
-        self._by_activity: list[tuple[float, str]] = []  # heap: each key, with a time at which it was active
+        # heap: each key, with a time at which it was active
+        self._by_activity: list[tuple[float, str]] = []
         self.get = self._streams.get
-        self.opened: deque[str] = deque(maxlen=MAX_KEYS)  # keys for the receiver to declare to Zenoh
+        # keys for the receiver to declare to Zenoh
+        self.opened: deque[str] = deque(maxlen=MAX_KEYS)
         self.evicted: deque[str] = deque(maxlen=MAX_KEYS)
 
     def __iter__(self) -> Iterator[Stream]:
@@ -52,7 +56,9 @@ class Streams:
     def _evict(self, now: float) -> None:
         """Evict silent keys above KEPT_KEYS, and the least recently active at MAX_KEYS; keys with requests are last."""
         order = self._by_activity
-        while len(order) >= MAX_KEYS or (len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE):
+        while len(order) >= MAX_KEYS or (
+            len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE
+        ):
             since, key = order[0]
             stream = self._streams[key]
             if any(writer.request for writer in stream.writers.values()):

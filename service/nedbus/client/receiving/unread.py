@@ -6,21 +6,14 @@ from collections import deque
 from operator import attrgetter
 from typing import Final
 
+from nedbus import limits
 from nedbus_msgs import identity_of
 
 from .arrival import Arrival, detach, encoding_of
 from .writer_proxy import LossCounters
 
-CAPACITY: Final = 65_536
-"""Unread messages of a subscription in mode `every`, unless `limit` is set; beyond that the oldest are dropped."""
-
-MAX_UNREAD_BYTES: Final = 64 * 2**20
-"""Bytes of payload in the unread messages of a subscription; beyond that the oldest are dropped."""
-
-MAX_BATCH: Final = 4096
-"""Messages in a batch in mode `every`, unless `max_messages` is set."""
-
-_MAX_FRESH: Final = 1024  # messages queued with Zenoh's receive buffer; later ones are detached from it
+# messages queued with Zenoh's receive buffer; later ones are detached from it
+_MAX_FRESH: Final = 1024
 _PAYLOAD: Final = attrgetter("payload")
 
 
@@ -59,7 +52,11 @@ class Unread:
         else:
             every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
         excess = 0
-        while len(every) > self._limit or len(newest) > self._limit or self._bytes > MAX_UNREAD_BYTES:
+        while (
+            len(every) > self._limit
+            or len(newest) > self._limit
+            or self._bytes > limits.UNREAD_BYTES
+        ):
             self._drop_oldest()
             excess += 1
         return excess
@@ -78,12 +75,18 @@ class Unread:
     def pop_batch(self, max_messages: int | None) -> list[Arrival]:
         """Remove and return the messages of the same type as the oldest; the others stay in order."""
         every, newest = self._every, self._newest
-        count = min(len(self), max_messages or (len(newest) if self.newest_only else MAX_BATCH))
+        count = min(
+            len(self), max_messages or (len(newest) if self.newest_only else limits.BATCH_MESSAGES)
+        )
         taken = list(newest.values())[:count] or [every.popleft() for _ in range(count)]
         if len({arrival.stream.codec for arrival in taken}) > 1 or taken[0].stream.codec is None:
             kinds = [each.codec if each.stream.codec else _identity(each) for each in taken]
-            others = [arrival for arrival, kind in zip(taken, kinds, strict=True) if kind != kinds[0]]
-            taken = [arrival for arrival, kind in zip(taken, kinds, strict=True) if kind == kinds[0]]
+            others = [
+                arrival for arrival, kind in zip(taken, kinds, strict=True) if kind != kinds[0]
+            ]
+            taken = [
+                arrival for arrival, kind in zip(taken, kinds, strict=True) if kind == kinds[0]
+            ]
             if not self.newest_only:
                 every.extendleft(reversed(others))
         for arrival in taken if self.newest_only else ():

@@ -21,7 +21,8 @@ MAX_GAP: Final = 2**30
 """Largest gap; a larger step means that the publisher restarted or the message is late."""
 
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
-_MAX_REORDERED: Final = 2**16  # a step back up to this size is a late message or a duplicate; a larger one is a restart
+# a step back up to this size is a late message or a duplicate; a larger one is a restart
+_MAX_REORDERED: Final = 2**16
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
 
 
@@ -43,7 +44,8 @@ class Gaps:
     held: int = 0  # messages held back behind gaps
     opened: int = 0  # gaps so far
     delivered: list[Arrival] = field(default_factory=list)  # messages to be queued, in order
-    requesting: dict[WriterProxy, None] = field(default_factory=dict)  # proxies with a gap, oldest request first
+    # proxies with a gap, oldest request first
+    requesting: dict[WriterProxy, None] = field(default_factory=dict)
 
 
 @dataclass(slots=True, eq=False)
@@ -55,9 +57,11 @@ class Request:
     deadline: float | None = None  # when the gap counts as lost; each delivery resets it
     attempts: int = 0
     requested: range | None = None  # numbers of the open query
-    first_available: int | None = None  # lowest number answered; the publisher caches everything from this one on
+    # lowest number answered; the publisher caches everything from this one on
+    first_available: int | None = None
     last_answered: bool = False  # the highest requested number was answered
-    probe: int | None = None  # number requested again; an answer proves that `candidate` is the lowest in the cache
+    # number requested again; an answer proves that `candidate` is the lowest in the cache
+    probe: int | None = None
     candidate: int | None = None
 
 
@@ -72,12 +76,15 @@ class WriterProxy:
     gaps: Gaps
     zid: object = None  # `zid` and `eid` are set by the first message
     eid: int | None = None
-    history_end: int = 0  # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
+    # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
+    history_end: int = 0
     unresponsive: bool = False  # it left a request unanswered; later gaps get a single attempt
     request: Request | None = None
     held: dict[int, Arrival] = field(default_factory=dict)
 
-    def on_sample(self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False) -> None:
+    def on_sample(
+        self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False
+    ) -> None:
         """Accept a message and deliver what is in order.
 
         With `recovers`, messages behind a gap are held back until it is filled.
@@ -90,7 +97,9 @@ class WriterProxy:
                 return
             self.give_up()
             self.expected = number
-        elif step and (self.request is not None or recovers) and self.expected + step < _LAST_NUMBER:
+        elif (
+            step and (self.request is not None or recovers) and self.expected + step < _LAST_NUMBER
+        ):
             self._hold(number, arrival)
             self._extend_request(number + 1)
             return
@@ -139,8 +148,11 @@ class WriterProxy:
         if found:
             lowest = request.first_available
             request.first_available = min(found) if lowest is None else min(lowest, *found)
-            request.last_answered |= request.requested is not None and request.requested[-1] in found
-        if self.history_end <= self.expected:  # else wait for the end, which reveals the lowest number available
+            request.last_answered |= (
+                request.requested is not None and request.requested[-1] in found
+            )
+        # else wait for the end, which reveals the lowest number available
+        if self.history_end <= self.expected:
             self._release()
         if ended and request.requested is not None:
             last, request.requested = request.requested[-1], None
@@ -206,7 +218,9 @@ class WriterProxy:
         self.expected = (self.expected + 1) % NUMBERS
         self.history_end = 0
         if arrival.payload:
-            self.gaps.delivered.append(arrival._replace(lost=self.stream.gap) if self.stream.gap else arrival)
+            self.gaps.delivered.append(
+                arrival._replace(lost=self.stream.gap) if self.stream.gap else arrival
+            )
             self.stream.gap = 0
 
     def _release(self) -> None:

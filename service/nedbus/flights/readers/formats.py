@@ -54,7 +54,9 @@ def format_of(path: str | PurePath) -> str:
     if found is None and (reason := _why_unreadable(head)):
         raise SourceError(str(path), reason)
     if found is None:
-        raise ConfigError(str(path), f"not a flight file; its name must end with {' or '.join(SUFFIXES)}")
+        raise ConfigError(
+            str(path), f"not a flight file; its name must end with {' or '.join(SUFFIXES)}"
+        )
     return found
 
 
@@ -66,9 +68,13 @@ def open_reader(path: Path, options: ReadOptions = ReadOptions()) -> FlightReade
     """
     kind = _FORMATS[format_of(path)]
     if options.layout is not None and kind.extra != "mcap":
-        raise ArgumentError("layout", options.layout, f"none, because a {kind.suffix} file defines its own layouts")
+        raise ArgumentError(
+            "layout", options.layout, f"none, because a {kind.suffix} file defines its own layouts"
+        )
     if options.layout not in (known := (None, *RELEASES, *DEFAULT.layouts)):
-        raise ArgumentError("layout", options.layout, f"one of {', '.join(dict.fromkeys(map(str, known[1:])))}")
+        raise ArgumentError(
+            "layout", options.layout, f"one of {', '.join(dict.fromkeys(map(str, known[1:])))}"
+        )
     module = import_optional(kind.extra, f"{__package__}.{kind.module}")
     reader: FlightReader = getattr(module, kind.reader)(path, options)
     return reader
@@ -77,14 +83,19 @@ def open_reader(path: Path, options: ReadOptions = ReadOptions()) -> FlightReade
 def check_recording(path: Path) -> None:
     """Raise ConfigError unless the name of a recording ends with .mcap."""
     if SUFFIXES.get(path.suffix.lower()) != "mcap":
-        raise ConfigError(str(path), "its name must end with .mcap; for CSV, see nedbus.read in docs/recordings.md")
+        raise ConfigError(
+            str(path),
+            "its name must end with .mcap; for CSV, see nedbus.read in docs/recordings.md",
+        )
 
 
 def open_file(path: Path) -> BinaryIO:
     """Open a file for reading; raise SourceError if that fails, or for a pipe, which cannot be read twice."""
     try:
         if path.is_dir():
-            raise SourceError(str(path), "not a regular file, but a folder; only a bag of MCAP files can be read")
+            raise SourceError(
+                str(path), "not a regular file, but a folder; only a bag of MCAP files can be read"
+            )
         if path.exists() and not path.is_file():
             raise SourceError(str(path), "not a regular file; save the data to a file first")
         if path.is_file() and (reason := _why_unreadable(_head_of(path))):
@@ -100,9 +111,16 @@ def recording_files(path: Path) -> tuple[list[Path], list[str]]:
         return [path], []
     found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
     if not found:
-        reason = next(filter(None, (_why_unreadable(_head_of(each)) for each in sorted(path.glob("*.db3")))), "")
+        reason = next(
+            filter(None, (_why_unreadable(_head_of(each)) for each in sorted(path.glob("*.db3")))),
+            "",
+        )
         raise SourceError(str(path), reason or "no .mcap file in this folder")
-    found.sort(key=lambda each: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", each.name)])
+    found.sort(
+        key=lambda each: [
+            int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", each.name)
+        ]
+    )
     metadata = path / "metadata.yaml"
     text = metadata.read_text(errors="replace") if metadata.exists() else ""
     listed = re.findall(r"^\s*- (?:\S*/)?([^\s/]+\.mcap)\b", text, re.MULTILINE)
@@ -122,5 +140,9 @@ def _head_of(path: Path) -> bytes:
 
 def _why_unreadable(head: bytes) -> str:
     """Return why a file with these first bytes is not a flight file, and the remedy; "" if it may be one."""
-    known = (text for first, text in _UNREADABLE.items() if head.startswith(first) and bool(head) == bool(first))
+    known = (
+        text
+        for first, text in _UNREADABLE.items()
+        if head.startswith(first) and bool(head) == bool(first)
+    )
     return next(known, "")

@@ -37,9 +37,11 @@ from .reader import FlightReader, ReadOptions, Record
 
 _MAX_PAYLOAD: Final = 2**16  # decompressed size of a message compressed by rosbag2
 _SCHEMA_BUDGET: Final = 2**25  # bytes of the schemas of a file
-_DEFINITION_BUDGET: Final = 16_000  # for all definitions of a file: 32 per message, 1 per field, 1 per 256 characters
+# for all definitions of a file: 32 per message, 1 per field, 1 per 256 characters
+_DEFINITION_BUDGET: Final = 16_000
 _INPUT: Final = "mcap-input"  # `sample.source` of messages to a vehicle
-_OWN_TOPIC: Final = re.compile(r"/([^/]+)/([^/]+)/(\d{1,3})")  # of nedbus's recordings, for an instance
+# of nedbus's recordings, for an instance
+_OWN_TOPIC: Final = re.compile(r"/([^/]+)/([^/]+)/(\d{1,3})")
 _VERSION: Final = re.compile(r"_v(\d{1,3})$")  # of a topic of PX4's translation node
 
 
@@ -51,21 +53,30 @@ class RecordedStream:
     head = b"\x00\x01"  # little-endian XCDR1
 
     def __init__(
-        self, ros2_topic: str, address: Address, definition: Definition[Any], layout: Layout, missing: frozenset[str]
+        self,
+        ros2_topic: str,
+        address: Address,
+        definition: Definition[Any],
+        layout: Layout,
+        missing: frozenset[str],
     ) -> None:
         self.ros2_topic = ros2_topic
         self.address = address
         self.definition = definition
         self.layout = layout
         self.lacking = missing  # by the metadata of the channel
-        self.strict_bools = frozenset(name for name, kind in layout.types.items() if kind.base == "bool")
+        self.strict_bools = frozenset(
+            name for name, kind in layout.types.items() if kind.base == "bool"
+        )
         self.cdr = cdr_layout(layout)
 
     @cached_property
     def dtype(self) -> Any:
         """Argument for `numpy.dtype` that describes a payload; a bool is a uint8."""
         types = [
-            f"S{kind.size}" if kind.is_text else (f"<{kind.form.replace('?', 'B')}"[-1], kind.length or ())
+            f"S{kind.size}"
+            if kind.is_text
+            else (f"<{kind.form.replace('?', 'B')}"[-1], kind.length or ())
             for kind in self.layout.types.values()
         ]
         names, offsets = [*self.cdr.offsets], [*self.cdr.offsets.values()]
@@ -79,7 +90,11 @@ class RecordedStream:
         try:
             decode_with(self.definition, payload, self.layout)
         except DecodeError as exc:
-            return f'{exc}, or read it with layout="{fits.name}"' if fits and fits is not self.layout else str(exc)
+            return (
+                f'{exc}, or read it with layout="{fits.name}"'
+                if fits and fits is not self.layout
+                else str(exc)
+            )
         return None
 
     def decode(self, payload: bytes) -> dict[str, Any]:
@@ -129,12 +144,16 @@ class McapReader(FlightReader):
             if not self.counts:
                 reasons = [*self.warnings[:3]] or ["no channel has a type of px4_msgs"]
                 problem = (
-                    "no message can be read" if self._is_damaged else "this recording has no messages of PX4 topics"
+                    "no message can be read"
+                    if self._is_damaged
+                    else "this recording has no messages of PX4 topics"
                 )
                 raise SourceError(str(path), f"{problem}; {'; '.join(reasons)}")
             if not self.definitions:
                 found = ", ".join(sorted({stream.address.topic for stream in self.counts}))
-                raise SourceError(str(path), f"this recording has none of the requested topics; it has {found}")
+                raise SourceError(
+                    str(path), f"this recording has none of the requested topics; it has {found}"
+                )
         except BaseException:
             self.close()
             raise
@@ -150,7 +169,10 @@ class McapReader(FlightReader):
     def warnings(self) -> list[str]:
         """Damage found and channels skipped so far."""
         where = {file: f"{file.name}: " if len(self._files) > 1 else "" for file in self._files}
-        return [*self._lacking, *(f"{where[file]}{text}" for file in self._files for text in file.chunks.warnings)]
+        return [
+            *self._lacking,
+            *(f"{where[file]}{text}" for file in self._files for text in file.chunks.warnings),
+        ]
 
     @property
     def _is_damaged(self) -> bool:
@@ -211,13 +233,21 @@ class _RecordedFile:
         for kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
             for record in records_of(self.chunks.summary, kind):
                 # A summary may repeat channels but not schemas, which are then in the chunks.
-                if not isinstance(record, Channel) or record.schema_id in self._schemas or not record.schema_id:
+                if (
+                    not isinstance(record, Channel)
+                    or record.schema_id in self._schemas
+                    or not record.schema_id
+                ):
                     self._register(record)
                 if isinstance(record, Statistics):
                     totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
         if self._all_known:
-            self.counts = {stream: total for number, total in totals.items() if (stream := self._streams[number])}
+            self.counts = {
+                stream: total
+                for number, total in totals.items()
+                if (stream := self._streams[number])
+            }
         else:
             self.counts = Counter(stream for stream, _, _ in self._messages())
         self._is_open = True
@@ -235,7 +265,11 @@ class _RecordedFile:
         only = None
         if self._all_known:
             chosen = self._reader.definitions
-            only = [number for number, stream in self._streams.items() if stream and stream.address in chosen]
+            only = [
+                number
+                for number, stream in self._streams.items()
+                if stream and stream.address in chosen
+            ]
         for block in self.chunks.blocks(only):
             try:
                 for record in records_of(block):
@@ -256,11 +290,16 @@ class _RecordedFile:
         if isinstance(record, Schema) and record.id not in self._schemas:
             self._schema_budget -= len(record.name) + len(record.data)
             if self._schema_budget < 0:
-                self.chunks.warn(f"skipped channels: the schemas in this file exceed {_SCHEMA_BUDGET} bytes", lost=True)
+                self.chunks.warn(
+                    f"skipped channels: the schemas in this file exceed {_SCHEMA_BUDGET} bytes",
+                    lost=True,
+                )
             else:
                 self._schemas[record.id] = record
         elif isinstance(record, Channel) and record.id not in self._streams:
-            self._streams[record.id] = stream = self._describe(self._schemas.get(record.schema_id), record)
+            self._streams[record.id] = stream = self._describe(
+                self._schemas.get(record.schema_id), record
+            )
             if stream is not None and self._is_newest(record.id, stream) and self._is_open:
                 self._reader.add(stream)
 
@@ -271,7 +310,11 @@ class _RecordedFile:
         self._versions[stream.address] = max(version, known)
         if known in (-1, version):
             return True
-        same = {number: each for number, each in self._streams.items() if each and each.address == stream.address}
+        same = {
+            number: each
+            for number, each in self._streams.items()
+            if each and each.address == stream.address
+        }
         is_newest = version > known
         older = [number for number in same if number != channel] if is_newest else [channel]
         for number in older:
@@ -285,22 +328,37 @@ class _RecordedFile:
         if schema is None or not schema.name.startswith(("px4_msgs/", "px4_msgs_old/")):
             return None
         try:
-            if schema.encoding and (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
-                encodings = f"{channel.message_encoding} with {schema.encoding}, not cdr with ros2msg"
-                raise ValueError(f"its encoding is {encodings}; record it where px4_msgs is installed")
+            if schema.encoding and (channel.message_encoding, schema.encoding) != (
+                "cdr",
+                "ros2msg",
+            ):
+                encodings = (
+                    f"{channel.message_encoding} with {schema.encoding}, not cdr with ros2msg"
+                )
+                raise ValueError(
+                    f"its encoding is {encodings}; record it where px4_msgs is installed"
+                )
             if not schema.data:
-                raise ValueError(f"the file has no definition of {schema.name}; record it where px4_msgs is installed")
+                raise ValueError(
+                    f"the file has no definition of {schema.name}; record it where px4_msgs is installed"
+                )
             definition, layout = self._layout(schema, channel.topic)
             own = _address_of(channel, self._reader.options.default_vehicle)
             if (expected := BY_TOPIC.get(own.topic, definition)) is not definition:
-                raise ValueError(f"its messages are {definition.name}, but {own.topic} has {expected.name}")
+                raise ValueError(
+                    f"its messages are {definition.name}, but {own.topic} has {expected.name}"
+                )
         except AddressError:
-            self.chunks.warn(f"skipped {channel.topic} (its name does not end with a topic of PX4)", lost=True)
+            self.chunks.warn(
+                f"skipped {channel.topic} (its name does not end with a topic of PX4)", lost=True
+            )
             return None
         except ValueError as exc:
             self.chunks.warn(f"skipped {channel.topic} ({exc})", lost=True)
             return None
-        vehicle = self._reader.vehicle_of(own.vehicle) if self._reader.reads(own.topic) else own.vehicle
+        vehicle = (
+            self._reader.vehicle_of(own.vehicle) if self._reader.reads(own.topic) else own.vehicle
+        )
         address, metadata = Address(vehicle, own.topic, own.instance), channel.metadata
         if (boot := metadata.get("boot_time_utc_us", "")[:20]).isdecimal():
             self._reader.add_boot_time(int(boot))
@@ -316,10 +374,14 @@ class _RecordedFile:
         """Return the definition and layout of a schema; raise ValueError if they do not match the message."""
         if schema.id not in self._layouts:
             if self._definition_budget < 0:
-                raise ValueError("the definitions in this file exceed the limit, which is the size of 250 PX4 topics")
+                raise ValueError(
+                    "the definitions in this file exceed the limit, which is the size of 250 PX4 topics"
+                )
             self._definition_budget -= len(schema.data) // 256
             text = schema.data.decode(errors="replace")
-            own = Layout("of the file", "", types={field.name: field.type for field in read_msg(text)})
+            own = Layout(
+                "of the file", "", types={field.name: field.type for field in read_msg(text)}
+            )
             self._definition_budget -= 32 + len(own.types)
             name = schema.name.rpartition("/")[2]
             try:
@@ -327,19 +389,34 @@ class _RecordedFile:
             except ValueError as exc:
                 definition = define_msg(name, text.replace("@range", "range"))
                 self.chunks.warn(f"ignored the ranges in the definition of {topic} ({exc})")
-            if (release := self._reader.options.layout) and (forced := definition.layout_of_release(release)):
+            if (release := self._reader.options.layout) and (
+                forced := definition.layout_of_release(release)
+            ):
                 own = forced
-            same = (each for each in definition.layouts.values() if [*each.types.items()] == [*own.types.items()])
-            self._layouts[schema.id] = definition, next(same, None) or self._check_layout(own, definition, topic)
+            same = (
+                each
+                for each in definition.layouts.values()
+                if [*each.types.items()] == [*own.types.items()]
+            )
+            self._layouts[schema.id] = (
+                definition,
+                next(same, None) or self._check_layout(own, definition, topic),
+            )
         return self._layouts[schema.id]
 
     def _check_layout(self, own: Layout, known: Definition[Any], topic: str) -> Layout:
         """Return a layout that is in no PX4 release; warn about unknown fields, which are left out."""
-        wrong = [name for name, kind in own.types.items() if kind not in known.known_types.get(name, {kind})]
+        wrong = [
+            name
+            for name, kind in own.types.items()
+            if kind not in known.known_types.get(name, {kind})
+        ]
         if lacking := sorted({*wrong, *(known.always - own.types.keys())}):
             raise ValueError(f"its definition of {', '.join(lacking)} matches no PX4 release")
         if unknown := sorted(own.types.keys() - known.known_types.keys()):
-            self.chunks.warn(f"left out {', '.join(unknown)} of {topic}, unknown to nedbus in {known.name}")
+            self.chunks.warn(
+                f"left out {', '.join(unknown)} of {topic}, unknown to nedbus in {known.name}"
+            )
         return own
 
 
@@ -347,7 +424,9 @@ def _address_of(channel: Channel, default_vehicle: str) -> Address:
     """Return the address of a channel by its metadata, or by its topic; raise AddressError for an invalid one."""
     metadata, number = channel.metadata, channel.metadata.get("instance")
     if {"vehicle", "topic"} <= metadata.keys():
-        return Address(metadata["vehicle"], metadata["topic"], None if number is None else int(number))
+        return Address(
+            metadata["vehicle"], metadata["topic"], None if number is None else int(number)
+        )
     if own := _OWN_TOPIC.fullmatch(channel.topic):  # a copy of nedbus's recording, without metadata
         return Address(own[1], own[2], int(own[3]))
     namespace, topic, instance = split_ros2_topic(channel.topic)

@@ -28,22 +28,36 @@ from nedbus.timeline import utc_text
 
 from .formats import open_file
 
-READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryError, OverflowError, RuntimeError)
+READ_ERRORS: Final = (
+    McapError,
+    ValueError,
+    struct.error,
+    ZstdError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,
+)
 """Errors that the mcap package and the decompressors raise for a damaged file."""
 
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
-_SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that may follow a record's known fields: too few for another record
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of the compression name
+# bytes that may follow a record's known fields: too few for another record
+_SURPLUS: Final = range(_RECORD_HEAD.size)
+# start, end, uncompressed size, CRC, length of the compression name
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
-_FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, start of summary and summary offsets, CRC, magic
+# opcode, length, start of summary and summary offsets, CRC, magic
+_FOOTER: Final = struct.Struct("<BQQQI8s")
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
 }  # fmt: skip
-_MAX_BLOCK: Final = 2**26  # bytes of a chunk, also uncompressed, and of a summary; ROS 2 and nedbus write up to 8 MiB
-_MAX_DESCRIPTION: Final = 2**20  # bytes of a record in _DESCRIPTIONS; statistics of all possible channels have 655 kB
-_MAX_RATIO: Final = 100  # compression ratio of files above _MAX_BLOCK, and of all chunks of a file together
+# bytes of a chunk, also uncompressed, and of a summary; ROS 2 and nedbus write up to 8 MiB
+_MAX_BLOCK: Final = 2**26
+# bytes of a record in _DESCRIPTIONS; statistics of all possible channels have 655 kB
+_MAX_DESCRIPTION: Final = 2**20
+# compression ratio of files above _MAX_BLOCK, and of all chunks of a file together
+_MAX_RATIO: Final = 100
 _MAX_WARNINGS: Final = 100
 _MAX_WARNING: Final = 1000  # characters
 
@@ -96,7 +110,9 @@ class ChunkFile:
         `only`: channels of interest; chunks without any of them may be skipped.
         """
         unpacked, limit = 0, max(_MAX_BLOCK, _MAX_RATIO * self.size)
-        for opcode, offset, end in self._listed(only) if self._chunks else self._scan(len(MCAP0_MAGIC), self.size):
+        for opcode, offset, end in (
+            self._listed(only) if self._chunks else self._scan(len(MCAP0_MAGIC), self.size)
+        ):
             self.position = end
             if end - offset > _MAX_BLOCK:
                 text = f"skipped {end - offset} bytes from byte {offset}, above the limit of {_MAX_BLOCK} for a chunk"
@@ -112,7 +128,10 @@ class ChunkFile:
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
             except READ_ERRORS:
-                self.warn(f"the chunk {_describe(record, offset)} is damaged; its messages are skipped", lost=True)
+                self.warn(
+                    f"the chunk {_describe(record, offset)} is damaged; its messages are skipped",
+                    lost=True,
+                )
 
     def _listed(self, only: Collection[int] | None) -> Iterator[tuple[int, int, int]]:
         """Yield opcode, begin and end of the chunks in the index, and of what lies between and behind them."""
@@ -130,7 +149,9 @@ class ChunkFile:
         self.damaged |= lost
         warning = warning[:_MAX_WARNING]
         if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
-            self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed")
+            self.warnings.append(
+                warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed"
+            )
 
     def _decompress(self, packed: BinaryIO) -> BinaryIO:
         """Return a temporary file with the decompressed contents, up to the first damage."""
@@ -158,7 +179,11 @@ class ChunkFile:
         if end < len(MCAP0_MAGIC):
             return
         opcode, length, start, _, checksum, magic = _FOOTER.unpack(self._read(end, _FOOTER.size))
-        if (opcode, length, magic) != (Opcode.FOOTER, _LENGTHS[Opcode.FOOTER], MCAP0_MAGIC) or not start:
+        if (opcode, length, magic) != (
+            Opcode.FOOTER,
+            _LENGTHS[Opcode.FOOTER],
+            MCAP0_MAGIC,
+        ) or not start:
             return
         if not len(MCAP0_MAGIC) <= start <= end:
             raise ValueError(start)
@@ -166,9 +191,12 @@ class ChunkFile:
             self.warn(f"the index is larger than {_MAX_BLOCK} bytes; reading without it")
             return
         summary = self._read(start, end - start)
-        if checksum and crc32(self._read(end, _FOOTER.size - len(MCAP0_MAGIC) - 4), crc32(summary)) != checksum:
+        footer = self._read(end, _FOOTER.size - len(MCAP0_MAGIC) - 4)
+        if checksum and crc32(footer, crc32(summary)) != checksum:
             raise ValueError(checksum)
-        chunks = sorted(_place_of(each) for each in records_of(summary) if isinstance(each, ChunkIndex))
+        chunks = sorted(
+            _place_of(each) for each in records_of(summary) if isinstance(each, ChunkIndex)
+        )
         previous = len(MCAP0_MAGIC)
         for begin, stop, _ in (*chunks, (start, start, ())):
             if begin < previous:
@@ -178,7 +206,9 @@ class ChunkFile:
         self._end = start
         self.summary = summary
 
-    def _scan(self, offset: int, stop: int, *, is_listed: bool = False) -> Iterator[tuple[int, int, int]]:
+    def _scan(
+        self, offset: int, stop: int, *, is_listed: bool = False
+    ) -> Iterator[tuple[int, int, int]]:
         """Scan a range; yield opcode, begin and end of chunks, and of schemas, channels and messages between them.
 
         `is_listed`: the range is between chunks of the index, where damage usually costs only copies of the index.
@@ -186,18 +216,25 @@ class ChunkFile:
         after_chunk = is_listed and offset > len(MCAP0_MAGIC)
         while not is_listed or offset < stop:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
-            opcode, length = _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
+            opcode, length = (
+                _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
+            )
             end = offset + _RECORD_HEAD.size + length
             surplus = length - _expected_length(opcode, begin[_RECORD_HEAD.size :], length)
             if opcode == 0 or end > stop or surplus not in _SURPLUS:
                 if is_listed:
                     return
-                self.warn(f"skipped truncated or damaged data from byte {offset} of {self.size} to the end", lost=True)
+                self.warn(
+                    f"skipped truncated or damaged data from byte {offset} of {self.size} to the end",
+                    lost=True,
+                )
                 return
             if opcode in _LENGTHS:
                 return
             # The message index after a chunk has no CRC: one flipped bit turns its opcode into that of a message.
-            is_index = length == _expected_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length)
+            is_index = length == _expected_length(
+                Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length
+            )
             if after_chunk and opcode == Opcode.MESSAGE and is_index:
                 opcode = Opcode.MESSAGE_INDEX
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
@@ -213,7 +250,9 @@ def _expected_length(opcode: int, body: bytes, length: int) -> int:
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:
-        before = _CHUNK_HEAD.size + int.from_bytes(body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size], "little")
+        before = _CHUNK_HEAD.size + int.from_bytes(
+            body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size], "little"
+        )
         return before + 8 + int.from_bytes(body[before : before + 8], "little")
     return _LENGTHS.get(opcode, length)
 
@@ -234,7 +273,9 @@ def records_of(block: bytes, *opcodes: int) -> Iterator[McapRecord]:
             continue
         if opcode == Opcode.MESSAGE:
             channel, sequence, logged, published = _MESSAGE_HEAD.unpack_from(block, start)
-            yield Message(channel, logged, block[start + _MESSAGE_HEAD.size : offset], published, sequence)
+            yield Message(
+                channel, logged, block[start + _MESSAGE_HEAD.size : offset], published, sequence
+            )
         elif opcode in _DESCRIPTIONS:
             if length > _MAX_DESCRIPTION:
                 raise ValueError(length)
@@ -254,7 +295,8 @@ def _unpack_chunk(record: bytes) -> bytes:
     body = ReadDataStream(BytesIO(record[_RECORD_HEAD.size :]))
     chunk = Chunk.read(body)
     opcode, length = _RECORD_HEAD.unpack_from(record)
-    if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:  # zeros would parse as an empty chunk
+    # zeros would parse as an empty chunk
+    if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:
         raise ValueError(len(record))
     size, packed = chunk.uncompressed_size, chunk.data
     if size > _MAX_BLOCK:
@@ -266,7 +308,9 @@ def _unpack_chunk(record: bytes) -> bytes:
         records = ZstdDecompressor().decompress(packed, max_output_size=size)
     elif chunk.compression == "lz4":
         records = LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-    if len(records) != size or (chunk.uncompressed_crc and crc32(records) != chunk.uncompressed_crc):
+    if len(records) != size or (
+        chunk.uncompressed_crc and crc32(records) != chunk.uncompressed_crc
+    ):
         raise ValueError(size)
     return records
 

@@ -15,7 +15,8 @@ from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import TOPICS, Address, Definition
 
 _PART: Final = 256  # records from which runs are formed
-_LOOKAHEAD: Final = 1000  # messages that show the first streams of a file and the start of its clocks
+# messages that show the first streams of a file and the start of its clocks
+_LOOKAHEAD: Final = 1000
 
 
 class FileStream(RecordStream, Protocol):
@@ -132,7 +133,12 @@ class FlightReader(ABC):
                 found.append(f"timestamps of {address} are out of order ({count})")
         return found + self.order.remarks
 
-    def begin(self, *, watch: Callable[[Iterator[Record]], Iterator[Record]] = iter, whole: Axis | None = None) -> None:
+    def begin(
+        self,
+        *,
+        watch: Callable[[Iterator[Record]], Iterator[Record]] = iter,
+        whole: Axis | None = None,
+    ) -> None:
         """Read the first messages; raise SourceError, with the file closed, if there are none of these topics.
 
         `watch`: passes on the records, for another use of them. `whole`: the axis of all topics of the file.
@@ -168,13 +174,28 @@ class FlightReader(ABC):
         dropout, self._dropout = self._dropout, 0.0
         definition, kind = stream.definition, self.kind
         return SourceMessage(
-            0.0, stream.address, given, 0, False, error, definition, kind, dropout, stream, payload, time
+            0.0,
+            stream.address,
+            given,
+            0,
+            False,
+            error,
+            definition,
+            kind,
+            dropout,
+            stream,
+            payload,
+            time,
         )
 
     def shrinkage(self) -> list[str]:
         """Return a list of at most one warning at the end of a file: it has fewer bytes than when it was opened."""
         self.damaged |= (is_shorter := self.position < self.total)
-        return [f"the file has shrunk from {self.total} to {self.position} bytes"] if is_shorter else []
+        return (
+            [f"the file has shrunk from {self.total} to {self.position} bytes"]
+            if is_shorter
+            else []
+        )
 
     def start_of(self, vehicle: str) -> int:
         """Return when the recording of a vehicle began, on the clock of its timestamps [us]; 0 if unknown."""
@@ -206,7 +227,9 @@ class FlightReader(ABC):
         self._vehicles.add(own)
         if len(self._vehicles) > 1:
             known = ", ".join(sorted(self._vehicles))
-            raise ConfigError("vehicle", f"{self.path} has several vehicles ({known}); remove this option")
+            raise ConfigError(
+                "vehicle", f"{self.path} has several vehicles ({known}); remove this option"
+            )
         return self.options.vehicle
 
     def reads(self, topic: str) -> bool:

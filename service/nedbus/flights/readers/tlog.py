@@ -21,7 +21,8 @@ from .reader import FlightReader, ReadOptions, Record
 
 _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
 _MAX_RECORD: Final = _HEAD.size + 290  # bytes of a record
-_OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}  # bytes of a frame without payload
+# bytes of a frame without payload
+_OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}
 _SIGNATURE: Final = 13  # bytes
 _MARKERS: Final = re.compile(b"[%c%c]" % (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2))
 _BLOCK: Final = 2**16  # bytes per read
@@ -65,7 +66,8 @@ class TlogReader(FlightReader):
         self._file, self.total = open_file(path), path.stat().st_size
         self._resources.append(self._file)
         self._boots: set[int] = set()  # Unix times [us]
-        self._foreign = self._lost = 0  # bytes that are not MAVLink; messages lost before the next one
+        # bytes that are not MAVLink; messages lost before the next one
+        self._foreign = self._lost = 0
         self._end = self.total  # the rest of the file is zeros
         self._is_cut = False  # the file ends within a record, or in zeros
         self._rebooted = False
@@ -87,7 +89,9 @@ class TlogReader(FlightReader):
             warnings.append("truncated (the file ends within a message)")
         copies = sum(vehicle.copies for vehicle, _ in self._senders.values())
         if copies:
-            warnings.append(f"{copies} {'copy' if copies == 1 else 'copies'} from a second link left out")
+            warnings.append(
+                f"{copies} {'copy' if copies == 1 else 'copies'} from a second link left out"
+            )
         return warnings
 
     def records(self) -> Iterator[Record]:
@@ -167,9 +171,13 @@ class TlogReader(FlightReader):
                     self.position += length
                     yield _HEAD.unpack_from(data, at)[0], data[at + 8 : at + length]
                     at += length
-                elif self.position >= self._end or (is_synchronised and _is_cut(data[at:], self._end - self.position)):
+                elif self.position >= self._end or (
+                    is_synchronised and _is_cut(data[at:], self._end - self.position)
+                ):
                     self._is_cut = True
-                    self.position = self.total if self._end < self.total else self.position + len(data) - at
+                    self.position = (
+                        self.total if self._end < self.total else self.position + len(data) - at
+                    )
                     break
                 else:
                     is_synchronised = False
@@ -199,7 +207,11 @@ def _record_length(data: bytes, at: int) -> int:
     if len(data) - at < _HEAD.size + 1:
         return 0
     marker, payload, flags = data[at + 8 : at + 11]
-    signature = _SIGNATURE if marker == dialect.PROTOCOL_MARKER_V2 and flags & dialect.MAVLINK_IFLAG_SIGNED else 0
+    signature = (
+        _SIGNATURE
+        if marker == dialect.PROTOCOL_MARKER_V2 and flags & dialect.MAVLINK_IFLAG_SIGNED
+        else 0
+    )
     return 8 + _OVERHEAD[marker] + payload + signature if marker in _OVERHEAD else 0
 
 

@@ -37,28 +37,37 @@ class UlogReader(FlightReader):
         self._warnings: list[str] = []
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
-        self._subscribers: Counter[tuple[str, int]] = Counter()  # subscriptions of each topic and instance
-        self._plain: dict[ulog.Subscription, ulog.LoggedStream] = {}  # whose messages need no further checks
-        self._repeated: dict[ulog.LoggedStream, _Repetitions] = {}  # of addresses with several subscriptions
+        # subscriptions of each topic and instance
+        self._subscribers: Counter[tuple[str, int]] = Counter()
+        # whose messages need no further checks
+        self._plain: dict[ulog.Subscription, ulog.LoggedStream] = {}
+        # of addresses with several subscriptions
+        self._repeated: dict[ulog.LoggedStream, _Repetitions] = {}
         self._firsts: dict[Address, ulog.LoggedStream] = {}
 
     @property
     def warnings(self) -> list[str]:
         """Damage found, and parts and fields skipped so far; counts are listed once the log has been read."""
         streams = [each for each in self._streams.values() if each is not None]
-        warnings = self._warnings + [reason for stream in streams for reason in stream.omitted.values()]
+        warnings = self._warnings + [
+            reason for stream in streams for reason in stream.omitted.values()
+        ]
         counts = {
             "further damaged locations": self._damages - _MAX_NAMED,
             "skipped messages without a definition": self._parser.undecodable,
             "left out log messages above 100 per second": self._texts.limit.omitted,
             **{ulog.UNSET_BOOLS.format(topic): count for topic, count in self._unset_bools.items()},
         }
-        warnings += [f"{text} ({count})" for text, count in counts.items() if count > 0 and self._is_read]
+        warnings += [
+            f"{text} ({count})" for text, count in counts.items() if count > 0 and self._is_read
+        ]
         warnings += [text for each in set(self._repeated.values()) for text in each.warnings]
         for stream in self._firsts.values():
             unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
             if unknown and _is_newer(stream):
-                warnings.append(f"left out unknown fields of {stream.address} ({', '.join(unknown)}); update nedbus")
+                warnings.append(
+                    f"left out unknown fields of {stream.address} ({', '.join(unknown)}); update nedbus"
+                )
         return [*warnings, *filter(None, [self._texts.problem])]
 
     def records(self) -> Iterator[Record]:
@@ -83,7 +92,8 @@ class UlogReader(FlightReader):
                     found[record.subscription].payloads.append(record.payload)
                     continue
                 selected = [Run(each.stream, [each.payload], []) for each in self._select(record)]
-                if len(self._plain) != len(found):  # the messages of a stream that needs checks now come first
+                # the messages of a stream that needs checks now come first
+                if len(self._plain) != len(found):
                     yield from self._take_runs(found)
                     found = {
                         each: found.get(each) or Run(stream, self._parser.collect(each), [])
@@ -94,7 +104,9 @@ class UlogReader(FlightReader):
 
     def layouts(self, definition: Definition[Any]) -> set[str]:
         """Return the names of the layouts of a definition so far."""
-        return {_layout_name(each) for each in self._firsts.values() if each.definition is definition}
+        return {
+            _layout_name(each) for each in self._firsts.values() if each.definition is definition
+        }
 
     def _read(self) -> Iterator[list[ulog.Record]]:
         try:
@@ -113,7 +125,13 @@ class UlogReader(FlightReader):
             raise SourceError(str(self.path), (exc.strerror or str(exc)).lower()) from exc
         if not self.definitions:
             topics = self.options.topics
-            what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
+            what = (
+                "any topic"
+                if topics is None
+                else "these topics"
+                if len(topics) < len(TOPICS)
+                else "built-in topics"
+            )
             reason = f"this log has no message of {what}"
             if topics is not None and self._subscribed:
                 names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
@@ -141,14 +159,21 @@ class UlogReader(FlightReader):
         if subscription not in self._streams:
             self._streams[subscription] = self._open(subscription)
         stream = self._streams[subscription]
-        if stream is None or (stream in self._repeated and self._repeated[stream].add(stream, payload)):
+        if stream is None or (
+            stream in self._repeated and self._repeated[stream].add(stream, payload)
+        ):
             return None
         self._count_unset_bools(subscription, (payload,))
-        if stream not in self._repeated and subscription.name not in (*self._texts.TOPICS, ulog.LOG_MESSAGE.name):
+        if stream not in self._repeated and subscription.name not in (
+            *self._texts.TOPICS,
+            ulog.LOG_MESSAGE.name,
+        ):
             self._plain[subscription] = stream
         return stream
 
-    def _count_unset_bools(self, subscription: ulog.Subscription, payloads: Iterable[bytes]) -> None:
+    def _count_unset_bools(
+        self, subscription: ulog.Subscription, payloads: Iterable[bytes]
+    ) -> None:
         layout, to_int = subscription.layout, int.from_bytes
         if mask := layout.bool_mask:
             for payload in payloads:
@@ -163,19 +188,27 @@ class UlogReader(FlightReader):
                 self.boot_utc = record.value
         elif isinstance(record, ulog.Dropout):
             self._dropout += record.duration / 1e3
-        elif isinstance(record, ulog.Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
+        elif (
+            isinstance(record, ulog.Parameter)
+            and record.key == "MAV_SYS_ID"
+            and record.value in range(1, 256)
+        ):
             self._system_id = str(record.value)
         elif isinstance(record, ulog.Subscription):
             self._subscribed[record.name] += 1
             self._subscribers[_instance_of(record)] += 1
-            for first in [each for each in self._plain if _instance_of(each) == _instance_of(record)]:
+            for first in [
+                each for each in self._plain if _instance_of(each) == _instance_of(record)
+            ]:
                 stream = self._plain.pop(first)
                 self._repeated[stream] = _Repetitions(stream)
         elif isinstance(record, ulog.Damage):
             self._damages += not record.is_end
             self.damaged |= not record.is_end
             if self._damages <= _MAX_NAMED:
-                self._warnings.append(f"{'truncated' if record.is_end else 'damaged'} ({record.reason})")
+                self._warnings.append(
+                    f"{'truncated' if record.is_end else 'damaged'} ({record.reason})"
+                )
 
     def _open(self, subscription: ulog.Subscription) -> ulog.LoggedStream | None:
         """Return the stream of a subscription at its first message, None if it is not selected or not usable."""
@@ -189,7 +222,9 @@ class UlogReader(FlightReader):
             self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
             return None
         if lacking := ", ".join(sorted(stream.definition.always.difference(stream.names))):
-            self._warnings.append(f"the definition of {lacking} in {topic} [{subscription.multi_id}] is damaged")
+            self._warnings.append(
+                f"the definition of {lacking} in {topic} [{subscription.multi_id}] is damaged"
+            )
             self.damaged = True
         if "timestamp" not in stream.names:
             return None

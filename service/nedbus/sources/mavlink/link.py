@@ -20,22 +20,28 @@ from nedbus.errors import ConfigError, SourceError
 
 Peer = Any  # remote address, as returned by the socket
 
-_CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect causes 1, a reordered packet 2 more
+# address changes per window that mean two senders; a reconnect causes 1, a reordered packet 2 more
+_CHANGES: Final = 5
 _WINDOW: Final = 5.0  # s
 _PEER_TIMEOUT: Final = 3.0  # s without a message from an address until another one replaces it
 _PEER_RUN: Final = 20  # messages in a row from another address that replace it earlier
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
-_MAX_UNSENT: Final = 4096  # bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
-_RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
+# bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
+_MAX_UNSENT: Final = 4096
+# bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
+_RECEIVE_BUFFER: Final = 2**22
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _TIMESTAMPS: Final = 35  # Linux's SO_TIMESTAMPNS: the arrival of a datagram
 _DROPS: Final = 40  # Linux's SO_RXQ_OVFL: the number of datagrams dropped before it
 _TIME: Final = struct.Struct("qq")  # s and ns since the epoch
 _MAX_CONTROL: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
-_LINK: Final = re.compile(r"(udpin|tcp):(.+):(\d{1,5})|(udpout):(.+):(\d{1,5})(?:@(\d{1,5}))?|(serial):(/.+)")
+_LINK: Final = re.compile(
+    r"(udpin|tcp):(.+):(\d{1,5})|(udpout):(.+):(\d{1,5})(?:@(\d{1,5}))?|(serial):(/.+)"
+)
 _FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
-_LOCAL_PORTS: Final = range(20_000, 30_000)  # below those that Linux gives to sockets without a port
+# below those that Linux gives to sockets without a port
+_LOCAL_PORTS: Final = range(20_000, 30_000)
 
 
 class Packet(NamedTuple):
@@ -65,7 +71,9 @@ class _UdpLink:
     stream, baud = False, None
 
     def __init__(self, link: LinkAddress) -> None:
-        family, _, _, _, address = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)[0]
+        family, _, _, _, address = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)[
+            0
+        ]
         listens = link.kind == "udpin"
         local = address if listens else ("", link.local_port)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -194,7 +202,8 @@ def open_link(text: str, *, baud: int) -> Link:
             return _StreamLink(Serial(host, baud, timeout=0), host, baud)
         if link.kind == "tcp":
             with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
-                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps the socket open
+                # keeps the socket open
+                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))
         return _UdpLink(link)
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
@@ -231,7 +240,8 @@ class PeerChoice:
     def __init__(self, peer: Peer, now: float) -> None:
         self.peer, self.second = peer, None
         self._last = now  # time of the last message from the chosen address
-        self._other: tuple[Peer, float] | None = None  # last message from another address since then, and its time
+        # last message from another address since then, and its time
+        self._other: tuple[Peer, float] | None = None
         self._run = 0  # messages from that address since then
 
     def add(self, peer: Peer, now: float) -> None:
@@ -256,7 +266,9 @@ class DuplicateIds:
     """Detect system ids with two senders, whose messages arrive alternately from two addresses."""
 
     def __init__(self) -> None:
-        self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(lambda: deque(maxlen=_CHANGES))
+        self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(
+            lambda: deque(maxlen=_CHANGES)
+        )
         self._found: set[int] = set()
 
     def add(self, system: int, peer: Peer, now: float) -> str:

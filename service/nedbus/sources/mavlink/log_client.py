@@ -13,11 +13,14 @@ COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_C
 
 _TRIES: Final = 3  # transmissions of an unanswered command
 _RESTARTS: Final = 2  # after START was accepted, but no data arrived
-_PINGS: Final = 3  # TIMESYNC requests of a measurement; the shortest round trip counts, the others may have been queued
+# TIMESYNC requests of a measurement; the shortest round trip counts, the others may have been queued
+_PINGS: Final = 3
 _MEASUREMENTS: Final = 3  # before the stream is refused, because a vehicle that boots answers late
-_MIN_COUNT: Final = 32  # messages of a header before its duration is estimated, or fewer if they took `_MIN_TIME`
+# messages of a header before its duration is estimated, or fewer if they took `_MIN_TIME`
+_MIN_COUNT: Final = 32
 _MIN_TIME: Final = 1.0  # s
-_STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
+# consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
+_STOP_TAIL: Final = 10
 _DECAY: Final = 0.98  # decay of the longest interval between messages, per message
 
 LogReason = Literal[
@@ -54,7 +57,15 @@ _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_UNSUPPORTED: "unsupported",
 }
 LogState = Literal[
-    "idle", "waiting_for_disarm", "starting", "header", "streaming", "refused", "ended", "stopping", "stopped"
+    "idle",
+    "waiting_for_disarm",
+    "starting",
+    "header",
+    "streaming",
+    "refused",
+    "ended",
+    "stopping",
+    "stopped",
 ]
 
 
@@ -90,7 +101,12 @@ class LogStreamClient:
     """
 
     def __init__(
-        self, log: Set[Literal["1", "armed", "take"]], *, system: int, component: int, header: float | None = None
+        self,
+        log: Set[Literal["1", "armed", "take"]],
+        *,
+        system: int,
+        component: int,
+        header: float | None = None,
     ) -> None:
         self._log = log
         self._ids = (system, component)
@@ -113,8 +129,10 @@ class LogStreamClient:
         self._has_sent_command = self._took_over = False
         self._has_header = False  # definitions of the current stream have arrived, at least in part
         self._header_messages = self._acked_in_row = 0
-        self._header_start = self._interval = 0.0  # `_interval`: longest recent time between messages
-        self._header_pause = 0.0  # longest pause in the header, not part of the round trip: it may be a burst of losses
+        # `_interval`: longest recent time between messages
+        self._header_start = self._interval = 0.0
+        # longest pause in the header, not part of the round trip: it may be a burst of losses
+        self._header_pause = 0.0
         self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 
@@ -195,7 +213,8 @@ class LogStreamClient:
         self, command: int, result: int, target_system: int, target_component: int, now: float
     ) -> list[Command]:
         """Handle a COMMAND_ACK of the autopilot; ignore it unless it answers this client's command."""
-        is_for_us = (target_system, target_component) in (self._ids, (0, 0))  # 0, 0: without target ids
+        # 0, 0: without target ids
+        is_for_us = (target_system, target_component) in (self._ids, (0, 0))
         if not is_for_us or self._awaited is None or command != COMMANDS.get(self._awaited):
             return []
         if result == dialect.MAV_RESULT_IN_PROGRESS:
@@ -224,7 +243,8 @@ class LogStreamClient:
         state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
         is_lost = silence > TIMINGS.log_link
         if is_lost and state in ("header", "streaming"):
-            self._awaited, self._has_header = None, state == "streaming"  # PX4 gave up on the header
+            # PX4 gave up on the header
+            self._awaited, self._has_header = None, state == "streaming"
             self._enter("ended", "link_lost" if self._has_header else "stalled", now, silence)
         elif self._awaited is not None:
             return self._on_timeout(now, is_lost=is_lost) if now >= self._due else []
@@ -258,15 +278,26 @@ class LogStreamClient:
     def _may_start(self) -> bool:
         return not self._armed or "armed" in self._log
 
-    def _enter(self, state: LogState, reason: LogReason | None, now: float, *values: object) -> None:
+    def _enter(
+        self, state: LogState, reason: LogReason | None, now: float, *values: object
+    ) -> None:
         """Change the state, and set the time of the next START unless an answer is awaited."""
         if (state, reason) != self.status[:2]:
             values = (self._owner,) if reason == "taken" else values
             self.status = LogStatus(state, reason, _TEXTS[reason].format(*values) if reason else "")
         if self._awaited is None:
-            is_slow = reason in ("bandwidth", "unsupported", "slow_link", "stalled", "no_data", "unreadable")
+            is_slow = reason in (
+                "bandwidth",
+                "unsupported",
+                "slow_link",
+                "stalled",
+                "no_data",
+                "unreadable",
+            )
             is_over = state in ("refused", "ended")
-            self._due = now + (TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0)
+            self._due = now + (
+                TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0
+            )
 
     def _send(self, kind: Literal["start", "stop"], now: float, *, tries: int = 0) -> list[Command]:
         self._awaited = kind
@@ -322,9 +353,22 @@ class LogStreamClient:
         if expected <= limit:
             return True
         topics = int((limit / interval - FIXED_COUNT) / COUNT_PER_TOPIC) if interval else 0
-        fit = f"the header of {topics} topics" if topics > 0 else "none, because of the vehicle's parameters alone"
+        fit = (
+            f"the header of {topics} topics"
+            if topics > 0
+            else "none, because of the vehicle's parameters alone"
+        )
         self._has_header = False
-        self._enter("refused", "slow_link", now, expected, 1e3 * interval, limit, fit, math.ceil(1.2 * expected))
+        self._enter(
+            "refused",
+            "slow_link",
+            now,
+            expected,
+            1e3 * interval,
+            limit,
+            fit,
+            math.ceil(1.2 * expected),
+        )
         return False
 
     def _end_stop(self, now: float) -> None:
@@ -371,16 +415,23 @@ class LogStreamClient:
             self._due = now + TIMINGS.log_answer
         elif state == "stopping":
             self._enter("stopped", None, now)
-        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:  # the stream exists, but is slow
+        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:
+            # the stream exists, but is slow
             if state == "header":
                 self._end_header(now)
             elif state != "streaming":
                 self._resume(now)
             self._due = now + self._silence_limit()
-        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and "take" in self._log and not self._took_over:
+        elif (
+            result == dialect.MAV_RESULT_TEMPORARILY_REJECTED
+            and "take" in self._log
+            and not self._took_over
+        ):
             return self._take_over(now)
         else:
-            self._enter("refused", _REFUSALS.get(result, "failed"), now, _name("MAV_RESULT", result))
+            self._enter(
+                "refused", _REFUSALS.get(result, "failed"), now, _name("MAV_RESULT", result)
+            )
         return []
 
     def _on_timeout(self, now: float, *, is_lost: bool) -> list[Command]:
@@ -411,7 +462,9 @@ class LogStreamClient:
         elif is_repeated:
             return self._send("start", now, tries=self._tries)
         elif state in ("header", "streaming"):
-            self._enter("ended", "stalled" if state == "header" else "silent", now, now - self._last_data)
+            self._enter(
+                "ended", "stalled" if state == "header" else "silent", now, now - self._last_data
+            )
         else:
             self._enter("refused", "no_answer", now)
         return []
@@ -424,10 +477,18 @@ class LogStreamClient:
         """Probe a silent stream with START: PX4 rejects it and continues, or begins a new stream."""
         state, limit = self.status.state, self._silence_limit()
         silence, since_acked = now - self._last_data, now - self._last_acked
-        if state == "header" and since_acked > TIMINGS.log_timeout and since_acked - silence > TIMINGS.log_silence:
+        if (
+            state == "header"
+            and since_acked > TIMINGS.log_timeout
+            and since_acked - silence > TIMINGS.log_silence
+        ):
             self._has_header = False  # only retransmissions arrived
             self._enter("ended", "stalled", now, since_acked)
-        elif state == "streaming" and self._acked_in_row >= _STOP_TAIL and silence > TIMINGS.log_silence:
+        elif (
+            state == "streaming"
+            and self._acked_in_row >= _STOP_TAIL
+            and silence > TIMINGS.log_silence
+        ):
             self._has_header = False
             again = f"in {TIMINGS.log_retry:.0f} s" if self._may_start() else "after disarming"
             self._enter("ended", "stopped_elsewhere", now, again)

@@ -25,7 +25,8 @@ from .saved_stream import StreamFile
 
 _log = logging.getLogger(__name__)
 
-_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted messages have `mavlink`
+# `sample.source` of the stream's messages; converted messages have `mavlink`
+_SOURCE: Final = "mavlink-ulog"
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
@@ -49,7 +50,11 @@ class LogStream:
     """
 
     def __init__(
-        self, name: str, options: MavlinkOptions, client: LogStreamClient, state: StreamFile | None = None
+        self,
+        name: str,
+        options: MavlinkOptions,
+        client: LogStreamClient,
+        state: StreamFile | None = None,
     ) -> None:
         self.state = state or StreamFile(None, 0)
         self._name = name
@@ -58,8 +63,10 @@ class LogStream:
         self._topics = options.chosen_topics
         self._folder = Path(options.save).expanduser() if options.save else None
         self._file: LogFile | None = None
-        self._next_file = -math.inf  # time of the next file, because a vehicle may send one header after another
-        self._pending: deque[tuple[float, bytes]] = deque()  # the stream before its file: gaps [s], and what follows
+        # time of the next file, because a vehicle may send one header after another
+        self._next_file = -math.inf
+        # the stream before its file: gaps [s], and what follows
+        self._pending: deque[tuple[float, bytes]] = deque()
         self._pending_size = self._unsaved = 0  # bytes
         self._is_pending = False
         self._logged = LogStatus("idle")
@@ -69,7 +76,8 @@ class LogStream:
         self._lost_messages = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
-        self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)  # times of unanswered TIMESYNC requests [ns]
+        # times of unanswered TIMESYNC requests [ns]
+        self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)
         self._window_start = self._rate = self._delays = 0.0
         self._window_bytes = self._delayed = 0
         self._delay: float | None = None
@@ -83,7 +91,8 @@ class LogStream:
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()  # reasons for rejected records
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
-        self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
+        # vehicle clock minus host clock [s]; how it was measured [s]
+        self._offset, self._round_trip = 0.0, math.inf
         self._new_header = True  # not yet logged
 
     def serves(self, client: LogStreamClient) -> bool:
@@ -97,7 +106,9 @@ class LogStream:
 
     def delivers(self, address: Address) -> bool:
         """Return whether the stream has messages of an address, which replace those converted from MAVLink."""
-        return self.is_streaming and (address in self._streamed or address.topic == ulog.LOG_MESSAGE.name)
+        return self.is_streaming and (
+            address in self._streamed or address.topic == ulog.LOG_MESSAGE.name
+        )
 
     def add(self, chunk: Chunk, now: float) -> Iterator[SourceMessage | Rejection]:
         """Yield the messages that a chunk completes."""
@@ -120,11 +131,14 @@ class LogStream:
             self._client.reject(str(exc))
             return
         self._undecodable += self._parser.undecodable - undecodable
-        sizes = [len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)]
+        sizes = [
+            len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)
+        ]
         was_known = self._sizes.is_known
         self._sizes.add(sizes)
         if self._gaps and self._sizes.is_known and not was_known:
-            self._estimate_lost()  # a stream that continues that of an earlier process begins with a gap
+            # a stream that continues that of an earlier process begins with a gap
+            self._estimate_lost()
         yield from self._check_definitions(is_first=not undecodable)
         self._save_definitions(records, now, others=len(records) - len(sizes))
         for record in self._texts.merge(records):
@@ -159,7 +173,9 @@ class LogStream:
         """Return the rejection of a damaged record; all beyond the first 100 reasons have the same one."""
         if len(self._damages) < _MAX_REASONS:
             self._damages.add(reason)
-        return Rejection(f"{self._name} ULog stream", reason if reason in self._damages else "further damage")
+        return Rejection(
+            f"{self._name} ULog stream", reason if reason in self._damages else "further damage"
+        )
 
     def _check_definitions(self, *, is_first: bool) -> Iterator[Rejection]:
         """Report messages without a definition once; reject a continued stream if a definition does not match."""
@@ -211,7 +227,9 @@ class LogStream:
             extra = about("log_stream", self._address)
             _log.info("vehicle %s: receiving the ULog stream%s", self._name, text, extra=extra)
         elif status.reason == "left":
-            _log.info("vehicle %s: %s", self._name, status.text, extra=about("log_stream", self._address))
+            _log.info(
+                "vehicle %s: %s", self._name, status.text, extra=about("log_stream", self._address)
+            )
         elif status.reason is not None:
             extra = about("log_stream", self._address, reason=status.text)
             _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)
@@ -268,7 +286,11 @@ class LogStream:
         self._streams[subscription] = stream
 
     def _message(
-        self, stream: ulog.LoggedStream, payload: bytes, given: Mapping[str, object] | None, now: float
+        self,
+        stream: ulog.LoggedStream,
+        payload: bytes,
+        given: Mapping[str, object] | None,
+        now: float,
     ) -> SourceMessage:
         address, definition = stream.address, stream.definition
         self._streamed.add(address)
@@ -277,7 +299,18 @@ class LogStream:
         dropout = self._dropout
         self._dropout = 0.0
         return SourceMessage(
-            0.0, address, given, lost, False, None, definition, _SOURCE, dropout, stream, payload, arrived=now
+            0.0,
+            address,
+            given,
+            lost,
+            False,
+            None,
+            definition,
+            _SOURCE,
+            dropout,
+            stream,
+            payload,
+            arrived=now,
         )
 
     def _decode(
@@ -305,7 +338,8 @@ class LogStream:
         The number never decreases, so the others count only once the mean size is known.
         """
         covered = _CHUNK_SIZE * self._lost / self._sizes.mean if self._sizes.is_known else 0.0
-        before, self._lost_messages = self._lost_messages, max(self._lost_messages, round(self._gaps + covered))
+        before = self._lost_messages
+        self._lost_messages = max(self._lost_messages, round(self._gaps + covered))
         self._unreported += self._lost_messages - before
 
     def _save(self, chunk: Chunk, now: float) -> None:
@@ -316,7 +350,9 @@ class LogStream:
             self._pending.append((gap, chunk.data))
             self._pending_size += len(chunk.data)
             if self._pending_size > _MAX_PENDING:
-                self._stop_saving(f"the stream has more than {_MAX_PENDING} bytes before its first message")
+                self._stop_saving(
+                    f"the stream has more than {_MAX_PENDING} bytes before its first message"
+                )
         elif self._file is not None:
             self._write(self._file, [(gap, chunk.data)])
         elif self._folder is not None:
@@ -365,13 +401,17 @@ class LogStream:
             self._stop_saving(str(OutputError(Path(exc.filename), exc)))
             return
         extra = about("log_stream", self._address)
-        _log.info("vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=extra)
+        _log.info(
+            "vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=extra
+        )
         self._write(self._file, pending)
 
     def _stop_saving(self, reason: str) -> None:
         self.close()
         extra = about("log_stream", self._address, reason=reason)
-        _log.error("vehicle %s: stopped saving the ULog stream: %s", self._name, reason, extra=extra)
+        _log.error(
+            "vehicle %s: stopped saving the ULog stream: %s", self._name, reason, extra=extra
+        )
 
 
 class _MeanSize:
@@ -433,7 +473,9 @@ class LogFile:
         """Discard the record that the gap truncated, and write a dropout of this duration."""
         self._partial.clear()
         if not self._begins:
-            self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+            self._append(
+                _DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000))))
+            )
 
     def _append(self, records: bytes) -> None:
         """Write complete records; if only a part can be written, remove it again."""

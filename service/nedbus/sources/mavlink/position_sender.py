@@ -30,7 +30,8 @@ TIMESYNC_TOPIC: Final = "timesync_status"
 _CONNECT_TIMEOUT: Final = 0.5  # s
 _DOWNSAMPLED: Final = "rate"  # kind of refusal that is no fault of the publisher
 _MAX_ENCODING: Final = 512  # characters of an encoding; those of nedbus have at most 250
-_TARGET_INTERVAL: Final = 0.1  # s between two looks for the vehicle, whose address changes after 3 s of silence
+# s between two looks for the vehicle, whose address changes after 3 s of silence
+_TARGET_INTERVAL: Final = 0.1
 _SHORT_ID: Final = 8  # characters of the id of a session
 _FOREIGN_CLOCK: Final = (
     "another client answers TIMESYNC: if it does so on this link, PX4 stamps positions with its clock; stop it, or give"
@@ -99,10 +100,22 @@ class PositionSender:
         self._target, self._target_due = Target(), -math.inf
         self._sender = SenderName(self._address.topic)
         self._stop, self._reader = threading.Event(), cast("KeyReader | None", None)
-        self._errors = UnexpectedErrors(_log, "%s: unexpected error, left out a position (logged once)", name)
-        text = "PX4 stamps them on arrival" if self._clock == "arrival" else "PX4's TIMESYNC is answered"
+        self._errors = UnexpectedErrors(
+            _log, "%s: unexpected error, left out a position (logged once)", name
+        )
+        text = (
+            "PX4 stamps them on arrival"
+            if self._clock == "arrival"
+            else "PX4's TIMESYNC is answered"
+        )
         extra = about("position", source=name)
-        _log.info("%s: positions of %s are sent into the vehicle; %s", name, self._address, text, extra=extra)
+        _log.info(
+            "%s: positions of %s are sent into the vehicle; %s",
+            name,
+            self._address,
+            text,
+            extra=extra,
+        )
         self._thread = threading.Thread(target=self._run, name="nedbus-position", daemon=True)
         self._thread.start()
 
@@ -142,7 +155,9 @@ class PositionSender:
         for kind, count in (counts - self._reported).items():
             if kind != _DOWNSAMPLED:
                 yield Rejection(
-                    f"{self._name} position of {self._address}, {kind}", reasons.get(kind, kind), count=count
+                    f"{self._name} position of {self._address}, {kind}",
+                    reasons.get(kind, kind),
+                    count=count,
                 )
         self._reported = counts
         for kind, text in warnings.items():
@@ -192,12 +207,17 @@ class PositionSender:
             try:
                 position = self._decode(raw.payload.to_bytes())
             except DecodeError as exc:
-                core.refuse("invalid", f"the message cannot be decoded: {exc}; use the same version of nedbus")
+                core.refuse(
+                    "invalid",
+                    f"the message cannot be decoded: {exc}; use the same version of nedbus",
+                )
                 return
             outcome = core.add(position, self._sender.of(raw), now)
         if outcome.odometry is None:
             return
-        frame = outcome.odometry.frame(outcome.time_usec, system=target.system, sequence=self._sequence)
+        frame = outcome.odometry.frame(
+            outcome.time_usec, system=target.system, sequence=self._sequence
+        )
         self._sequence = (self._sequence + 1) % 256
         if not self._send(frame, target.peer):
             with self._lock:
@@ -230,6 +250,8 @@ def choose_target(vehicles: Mapping[int, tuple[str, Peer]]) -> Target:
         return Target(obstacle="no vehicle has been received on this link: check the link")
     if len(vehicles) > 1:
         names = ", ".join(name for name, _ in vehicles.values())
-        return Target(obstacle=f"this link has several vehicles ({names}): give each its own link and position=")
+        return Target(
+            obstacle=f"this link has several vehicles ({names}): give each its own link and position="
+        )
     [(system, (name, peer))] = vehicles.items()
     return Target(system, name, peer)

@@ -33,10 +33,13 @@ SYSTEM: Final = 245
 COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 _MAX_VEHICLES: Final = 100  # per link
-_MIN_SILENCE: Final = 5.0  # s without a message until a vehicle can be removed in favour of another one
+# s without a message until a vehicle can be removed in favour of another one
+_MIN_SILENCE: Final = 5.0
 _TICK: Final = 0.05  # s, the longest wait of the thread
-_PAUSE: Final = 0.02  # s between two reads during a stream: several messages at once need less processor time
-_ANSWER_PAUSE: Final = 0.002  # ... while TIMESYNC is answered: PX4 discards answers that take over 10 ms
+# s between two reads during a stream: several messages at once need less processor time
+_PAUSE: Final = 0.02
+# ... while TIMESYNC is answered: PX4 discards answers that take over 10 ms
+_ANSWER_PAUSE: Final = 0.002
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
@@ -56,7 +59,8 @@ class LinkReader:
             yield from parse(self._parser, data, self.name, peer, now)
             if not self.link.stream and self._parser.buf_len():
                 yield Rejection(self.name, f"truncated message ({self._parser.buf_len()} B)")
-                self._parser = new_parser(self._parser.senders)  # the next datagram may be from another sender
+                # the next datagram may be from another sender
+                self._parser = new_parser(self._parser.senders)
 
 
 @dataclass(slots=True)
@@ -86,7 +90,9 @@ class LogReceiver:
     Without the option `log`, no stream is requested.
     """
 
-    def __init__(self, reader: LinkReader, options: MavlinkOptions, send: Callable[[Any, Peer], object]) -> None:
+    def __init__(
+        self, reader: LinkReader, options: MavlinkOptions, send: Callable[[Any, Peer], object]
+    ) -> None:
         self._reader = reader
         self._options = options
         self._send = send
@@ -142,7 +148,9 @@ class LogReceiver:
                 return Rejection(f"{self._reader.name} further vehicles", reason)
             ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
             client = LogStreamClient(options.log, **ids, header=options.header)
-            vehicle = self.vehicles[system] = _Vehicle(system, client, PeerChoice(received.peer, now), now)
+            vehicle = self.vehicles[system] = _Vehicle(
+                system, client, PeerChoice(received.peer, now), now
+            )
         vehicle.last = now
         vehicle.peers.add(received.peer, now)
         if self._answers_timesync:
@@ -190,26 +198,40 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
         elif kind == "COMMAND_ACK":
             target = message.target_system, message.target_component
-            self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
+            self._execute(
+                vehicle,
+                vehicle.client.on_command_ack(message.command, message.result, *target, now),
+            )
         elif kind == "TIMESYNC" and message.tc1:
             self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
-        elif (reading := read_time(vehicle.clock, message, now)) and reading.kind is TimeKind.REBOOT:
+        elif (
+            reading := read_time(vehicle.clock, message, now)
+        ) and reading.kind is TimeKind.REBOOT:
             vehicle.client.on_reboot()
             vehicle.reassembly, vehicle.refusal = Reassembly(), ""
         return received
 
-    def _process_data(self, received: Received, vehicle: _Vehicle, kind: str) -> Received | Rejection:
+    def _process_data(
+        self, received: Received, vehicle: _Vehicle, kind: str
+    ) -> Received | Rejection:
         """Acknowledge and reassemble data of the ULog stream; see `_process`."""
         message, now = received.message, received.time
         target = message.target_system, message.target_component
         is_ours = target == (SYSTEM, COMPONENT)
-        if is_ours and vehicle.is_known and vehicle.reassembly.is_new and message.sequence and not vehicle.refusal:
+        if (
+            is_ours
+            and vehicle.is_known
+            and vehicle.reassembly.is_new
+            and message.sequence
+            and not vehicle.refusal
+        ):
             if vehicle.client.status.state in ("stopping", "stopped"):
                 return received
             if (adopted := self._adopt(vehicle, now)) or not vehicle.refusal:
                 return received._replace(chunk=adopted)
         if not vehicle.client.accepts(*target):
-            if not (is_ours and vehicle.is_known):  # before a HEARTBEAT, perhaps the stream of an earlier process
+            # before a HEARTBEAT, perhaps the stream of an earlier process
+            if not (is_ours and vehicle.is_known):
                 return received
             where = f"{self._reader.name} system {received.system}"
             if not vehicle.refusal:
@@ -219,11 +241,15 @@ class LogReceiver:
             return Rejection(f"{where}, ULog stream", f"{reason}; {remedy}")
         fields = message.sequence, message.length, message.first_message_offset, message.data
         chunk = vehicle.reassembly.add(*fields, now)
-        received = Received(*received[:-3], chunk, link=received.link)  # takes a third of the time of `_replace`
+        # takes a third of the time of `_replace`
+        received = Received(*received[:-3], chunk, link=received.link)
         if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
             vehicle.clock.confirm()
         is_acked = kind == "LOGGING_DATA_ACKED"
-        self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=chunk.begins))
+        self._execute(
+            vehicle,
+            vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=chunk.begins),
+        )
         return received
 
     def _adopt(self, vehicle: _Vehicle, now: float) -> Chunk | None:
@@ -232,7 +258,9 @@ class LogReceiver:
         The message that shows it is not used: an acknowledged one is repeated, and any other one counts as lost.
         """
         try:
-            saved = read_stream(state_path(self._options, self._reader.name, vehicle.system), vehicle.system)
+            saved = read_stream(
+                state_path(self._options, self._reader.name, vehicle.system), vehicle.system
+            )
             if vehicle.clock.newest is None:
                 return None
             saved.check_boot(vehicle.clock.newest, now)
@@ -246,10 +274,14 @@ class LogReceiver:
     def _execute(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
         for command in commands:
             if command.kind == "acknowledge":
-                message: Any = dialect.MAVLink_logging_ack_message(vehicle.system, AUTOPILOT, command.sequence)
+                message: Any = dialect.MAVLink_logging_ack_message(
+                    vehicle.system, AUTOPILOT, command.sequence
+                )
             elif command.kind == "ping":
                 message = dialect.MAVLink_timesync_message(0, command.sequence)
             else:
                 parameters = [COMMANDS[command.kind], 0, *(0,) * 7]
-                message = dialect.MAVLink_command_long_message(vehicle.system, AUTOPILOT, *parameters)
+                message = dialect.MAVLink_command_long_message(
+                    vehicle.system, AUTOPILOT, *parameters
+                )
             self._send(message, vehicle.peers.peer)

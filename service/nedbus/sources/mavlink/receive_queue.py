@@ -12,19 +12,24 @@ from nedbus.mavlink import Chunk, Received
 from nedbus.sources.source import LinkLoad, Rejection
 from nedbus.timings import TIMINGS
 
-_MAX_WAITING: Final = 16_384  # messages of all vehicles; beyond it the oldest of the longest queue is dropped
-_FRESH: Final = 0.2  # s; of the messages behind one that waited too long, those that waited longer are dropped, too
+# messages of all vehicles; beyond it the oldest of the longest queue is dropped
+_MAX_WAITING: Final = 16_384
+# s; of the messages behind one that waited too long, those that waited longer are dropped, too
+_FRESH: Final = 0.2
 _LATE: Final = 0.5  # s; a longer wait means that the host is overloaded
 _MEMORY: Final = 5.0  # s without a late or dropped message until the overload has ended
 _MAX_READ: Final = 100  # messages per call of `read`
 _MAX_READ_TIME: Final = 0.1  # s per call of `read`
 _MAX_REJECTIONS: Final = 1000  # different ones that wait; further ones count as one of `_FURTHER`
-_FURTHER: Final = Rejection("further places", f"the limit is {_MAX_REJECTIONS} different rejections at a time")
+_FURTHER: Final = Rejection(
+    "further places", f"the limit is {_MAX_REJECTIONS} different rejections at a time"
+)
 
 
 def join_data(items: Iterable[Received | Rejection]) -> list[Received | Rejection]:
     """Join the ULog data of each vehicle as far as it is contiguous; it may overtake other messages."""
-    found, runs = list[Received | Rejection | list[Received]](), dict[int, list[Received]]()  # last run by vehicle
+    # last run by vehicle
+    found, runs = list[Received | Rejection | list[Received]](), dict[int, list[Received]]()
     for item in items:
         if isinstance(item, Rejection) or item.chunk is None:
             found.append(item)
@@ -47,7 +52,9 @@ def _joined(run: list[Received]) -> Received:
         if offset < begin:  # a record begins in this one
             break
     data = b"".join(chunk.data for chunk in chunks)
-    return first._replace(message=run[-1].message, chunk=chunks[0]._replace(data=data, offset=offset), parts=len(run))
+    return first._replace(
+        message=run[-1].message, chunk=chunks[0]._replace(data=data, offset=offset), parts=len(run)
+    )
 
 
 @dataclass(slots=True)
@@ -87,7 +94,8 @@ class _VehicleQueue:
         elif self.is_undefined:
             chunk = Chunk("no_definitions")
         if chunk.verdict in ("delivered", "unsynchronised"):
-            chunk, self.lost_chunks = chunk._replace(lost=0 if chunk.begins else chunk.lost + self.lost_chunks), 0
+            chunk = chunk._replace(lost=0 if chunk.begins else chunk.lost + self.lost_chunks)
+            self.lost_chunks = 0
         return received._replace(lost=lost, chunk=chunk)
 
 
@@ -134,7 +142,9 @@ class ReceiveQueue:
             self._error = error
             self._changed.notify()
 
-    def read(self, timeout: float, *, lost_by_host: int) -> Iterator[Received | Rejection | LinkLoad]:
+    def read(
+        self, timeout: float, *, lost_by_host: int
+    ) -> Iterator[Received | Rejection | LinkLoad]:
         """Yield messages for a short time, and before them changes of the load; wait up to `timeout` for the first.
 
         `lost_by_host`: datagrams that the operating system has dropped.
@@ -147,7 +157,9 @@ class ReceiveQueue:
         start = now = self._now()
         for _ in range(_MAX_READ):
             vehicle, received = self._take(now)
-            load = self._measure(0.0 if received is None else now - received.time, lost_by_host, now)
+            load = self._measure(
+                0.0 if received is None else now - received.time, lost_by_host, now
+            )
             if load != self._load:
                 self._load = load
                 yield load
@@ -170,7 +182,10 @@ class ReceiveQueue:
                 self._turn = vehicle.used
                 while vehicle.waiting:
                     received = vehicle.waiting.popleft()
-                    if now - received.time <= limit or received.message.get_type() == "LOGGING_DATA_ACKED":
+                    if (
+                        now - received.time <= limit
+                        or received.message.get_type() == "LOGGING_DATA_ACKED"
+                    ):
                         self._count -= received.parts
                         return vehicle, vehicle.resume(received)
                     limit = _FRESH

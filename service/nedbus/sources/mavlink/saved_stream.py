@@ -18,10 +18,13 @@ _log = logging.getLogger(__name__)
 
 MAX_DEFINITIONS: Final = 2**20  # bytes; a real header has 68,000 to 170,000
 _MAGIC: Final = b"nedbusS1"  # the last character is the version
-_HEAD: Final = struct.Struct("<8s16sBII")  # magic, boot of the host, system id, size and CRC of the definitions
-_PROGRESS: Final = struct.Struct("<dQH")  # host time [s], vehicle time [us], sequence of the last LOGGING_DATA
+# magic, boot of the host, system id, size and CRC of the definitions
+_HEAD: Final = struct.Struct("<8s16sBII")
+# host time [s], vehicle time [us], sequence of the last LOGGING_DATA
+_PROGRESS: Final = struct.Struct("<dQH")
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
-_TOLERANCE: Final = 2.0, 0.02  # of the vehicle's clock: seconds, and share of the time since the last message
+# of the vehicle's clock: seconds, and share of the time since the last message
+_TOLERANCE: Final = 2.0, 0.02
 
 
 class SavedStream(NamedTuple):
@@ -43,7 +46,11 @@ class SavedStream(NamedTuple):
 def state_path(options: MavlinkOptions, link: str, system: int) -> Path | None:
     """Return the path of the state file of a vehicle on a link; None if `state=0`."""
     folder = Path(options.state).expanduser() if options.state else state_folder() / "ulog-streams"
-    return None if options.state == "0" else folder / f"{sha256(link.encode()).hexdigest()[:16]}-{system}"
+    return (
+        None
+        if options.state == "0"
+        else folder / f"{sha256(link.encode()).hexdigest()[:16]}-{system}"
+    )
 
 
 def read_stream(path: Path | None, system: int) -> SavedStream:
@@ -89,7 +96,9 @@ class StreamFile:
         self._definitions, self._progress = definitions, progress
         if self._path is None or len(definitions) > MAX_DEFINITIONS:
             return
-        head = _HEAD.pack(_MAGIC, _host_boot(), self._system, len(definitions), zlib.crc32(definitions))
+        head = _HEAD.pack(
+            _MAGIC, _host_boot(), self._system, len(definitions), zlib.crc32(definitions)
+        )
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with atomic_write(self._path, replace=True) as temporary:

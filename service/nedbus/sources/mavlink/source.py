@@ -45,10 +45,18 @@ class MavlinkSource:
     """
 
     def __init__(
-        self, link: str, options: MavlinkOptions, _: str, routers: tuple[str, ...], tls: Tls | None, prefix: str
+        self,
+        link: str,
+        options: MavlinkOptions,
+        _: str,
+        routers: tuple[str, ...],
+        tls: Tls | None,
+        prefix: str,
     ) -> None:
         if parse_link(link).kind != "serial" and "baud" in options.model_fields_set:
-            raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
+            raise ConfigError(
+                f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud"
+            )
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
@@ -64,7 +72,9 @@ class MavlinkSource:
         access = BusAccess(router, self._routers, self._tls, self._prefix)
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                with closing(_LinkSession(link, self._options, name=self._link, access=access)) as session:
+                with closing(
+                    _LinkSession(link, self._options, name=self._link, access=access)
+                ) as session:
                     yield from session.run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
@@ -74,7 +84,9 @@ class MavlinkSource:
 class _LinkSession:
     """One open link: request and convert messages, send heartbeats; with `log=`, decode the ULog streams."""
 
-    def __init__(self, link: Link, options: MavlinkOptions, *, name: str, access: BusAccess | None = None) -> None:
+    def __init__(
+        self, link: Link, options: MavlinkOptions, *, name: str, access: BusAccess | None = None
+    ) -> None:
         self._link = link
         self._options = options
         self._name = name
@@ -84,7 +96,8 @@ class _LinkSession:
         self._vehicles: dict[int, Vehicle] = {}
         self._remarked: set[int] = set()  # system ids whose second address was reported
         self._copied: set[int] = set()  # system ids whose copies were reported
-        self._copies = self._copies_of_removed = 0  # as last reported; those of vehicles that were removed
+        # as last reported; those of vehicles that were removed
+        self._copies = self._copies_of_removed = 0
         self._high_latency: set[int] = set()  # system ids whose satellite link was reported
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
@@ -113,7 +126,9 @@ class _LinkSession:
                 next_status = now + _STATUS_INTERVAL
                 # Routers and vehicles send only to components that have announced themselves.
                 kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
-                heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
+                heartbeat = dialect.MAVLink_heartbeat_message(
+                    kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3
+                )
                 self._remove_evicted()
                 for peer in self._all_peers():
                     self._send(heartbeat, peer)
@@ -151,9 +166,16 @@ class _LinkSession:
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
         yield from self._second_address(system)
-        vehicle.count_lost(received.lost, now, counted=chunk.lost if chunk else None, link=received.link)
+        vehicle.count_lost(
+            received.lost, now, counted=chunk.lost if chunk else None, link=received.link
+        )
         log = self._log_of(system)
-        if log is not None and message.get_type() == "TIMESYNC" and message.tc1 and self._is_chosen(received):
+        if (
+            log is not None
+            and message.get_type() == "TIMESYNC"
+            and message.tc1
+            and self._is_chosen(received)
+        ):
             log.add_timesync(message.tc1, message.ts1, now)
         if chunk is None:
             items: Iterable[SourceMessage | Rejection] = vehicle.handle_all(message, now, log)
@@ -162,7 +184,8 @@ class _LinkSession:
                 yield Rejection(f"{self._name} system {system}", HIGH_LATENCY_LINK, count=0)
         else:
             items = log.add(chunk, now) if log is not None else ()
-        is_measured = log is None or chunk is None  # the delay is that of the first message in each part of a stream
+        # the delay is that of the first message in each part of a stream
+        is_measured = log is None or chunk is None
         for each in items:
             if not isinstance(each, SourceMessage):
                 yield each
@@ -178,14 +201,21 @@ class _LinkSession:
                 extra = about("rebooted", address, source=self._name)
                 _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
             yield item
-        if log and chunk and chunk.verdict in ("delivered", "unsynchronised") and vehicle.clock.newest is not None:
+        if (
+            log
+            and chunk
+            and chunk.verdict in ("delivered", "unsynchronised")
+            and vehicle.clock.newest is not None
+        ):
             log.state.update(message.sequence, vehicle.clock.newest, now)
 
     def _log_unsent(self) -> None:
         with self._sending:
             count, self._unsent = self._unsent, 0
         if count:
-            text = "%s: %d messages to the vehicle were not sent, because the link did not accept them"
+            text = (
+                "%s: %d messages to the vehicle were not sent, because the link did not accept them"
+            )
             _log.warning(text, self._name, count, extra=about("dropped", source=self._name))
 
     def _log_of(self, system: int) -> LogStream | None:
@@ -206,14 +236,22 @@ class _LinkSession:
         for system, vehicle in self._vehicles.items():
             if request := vehicle.next_request(now):
                 number, rate = request
-                command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL if rate else dialect.MAV_CMD_REQUEST_MESSAGE
+                command = (
+                    dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+                    if rate
+                    else dialect.MAV_CMD_REQUEST_MESSAGE
+                )
                 parameters = [number, 1e6 / rate if rate else 0, 0, 0, 0, 0, 0]
-                message = dialect.MAVLink_command_long_message(system, AUTOPILOT, command, 0, *parameters)
+                message = dialect.MAVLink_command_long_message(
+                    system, AUTOPILOT, command, 0, *parameters
+                )
                 self._send_to(system, message)
 
     def _all_peers(self) -> set[Peer]:
         """Return the addresses of all vehicles, or the only address of the link; none that are behind a satellite."""
-        reached = {system for system, vehicle in self._vehicles.items() if not vehicle.is_high_latency}
+        reached = {
+            system for system, vehicle in self._vehicles.items() if not vehicle.is_high_latency
+        }
         if self._link.peer is not None:
             return {self._link.peer} if reached or not self._vehicles else set()
         known = [*self._receiver.vehicles.values()]  # changed on another thread
@@ -240,7 +278,9 @@ class _LinkSession:
                 self._copied.add(system)
                 text = "its messages come again, or late, over a second link: each is used once, the first time"
                 yield Rejection(f"{self._name} system {system}, second link", text, count=0)
-        copies = self._copies_of_removed + sum(vehicle.copies for vehicle in self._vehicles.values())
+        copies = self._copies_of_removed + sum(
+            vehicle.copies for vehicle in self._vehicles.values()
+        )
         if copies != self._copies:
             self._copies = copies
             yield LinkCopies(copies)
@@ -267,7 +307,9 @@ class _LinkSession:
     def _find_target(self) -> Target:
         """Return the vehicle for positions; called on the thread of PositionSender."""
         known = [*self._receiver.vehicles.values()]  # changed on another thread
-        return choose_target({each.system: (self._name_of(each.system), each.peers.peer) for each in known})
+        return choose_target(
+            {each.system: (self._name_of(each.system), each.peers.peer) for each in known}
+        )
 
     def _send_position(self, frame: bytes, peer: Peer) -> bool:
         try:

@@ -21,7 +21,16 @@ from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Rejection, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session, Tls, TopicKey
-from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
+from nedbus_msgs import (
+    Address,
+    Definition,
+    bases_of_msg,
+    dds_type,
+    decode_with,
+    define_msg,
+    hash_of_msg,
+    ros2_type,
+)
 
 from .streams import Definitions, NotAcceptedError, StreamRegistry
 
@@ -36,14 +45,23 @@ _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
 _INPUT: Final = "px4-zenoh-input"  # `sample.source` of messages to a vehicle
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
-_TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes, or a key that is too long"
+_TOO_LARGE: Final = (
+    "size",
+    f"a payload of more than {_MAX_PENDING_BYTES} bytes, or a key that is too long",
+)
 
 
 class Px4ZenohSource:
     """All publishers of px4_msgs on the router at `endpoint`, by default the service's own router at `routers`."""
 
     def __init__(
-        self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None, *_: str
+        self,
+        endpoint: str,
+        options: Px4ZenohOptions,
+        vehicle: str,
+        routers: tuple[str, ...],
+        tls: Tls | None,
+        *_: str,
     ) -> None:
         if endpoint:
             check_endpoints([endpoint], where="px4-zenoh")
@@ -52,7 +70,9 @@ class Px4ZenohSource:
         self._options, self._tls = options, tls
         self._supplied, self._vehicle = _read_definitions(options.msg), options.vehicle or vehicle
 
-    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
+    def listen(
+        self, router: Session | None
+    ) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
         """Receive; raise SourceError if no router answers."""
         with ExitStack() as closing:
             if router is not None and self._is_own:
@@ -60,7 +80,9 @@ class Px4ZenohSource:
                 session = router
             else:
                 try:
-                    session = transport.open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
+                    session = transport.open_client(
+                        self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls
+                    )
                 except ConnectError as exc:
                     reason = "no Zenoh router answers; start one, or set another one with px4-zenoh:tcp/HOST:7447"
                     raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
@@ -81,7 +103,9 @@ class Px4ZenohNode:
     def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
         self._session, self._streams = session, streams
         self._pending: queue.SimpleQueue[zenoh.Sample | BaseException] = queue.SimpleQueue()
-        self._tokens = transport.LivelinessTokens(session, transport.px4_publishers_key_expr(domain))
+        self._tokens = transport.LivelinessTokens(
+            session, transport.px4_publishers_key_expr(domain)
+        )
         self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
         self._subscriptions: dict[TopicKey, zenoh.LivelinessToken] = {}
@@ -90,9 +114,13 @@ class Px4ZenohNode:
         self._reported = Counter[tuple[str, str]]()
         key_expr = f"{'*' if domain is None else domain}/**/{transport.PX4_TYPES}/*"
         with transport.translate_zenoh_errors():
-            self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
+            self._subscriber = session.declare_subscriber(
+                key_expr, zenoh.handlers.RingChannel(_RING_SIZE)
+            )
         handler = self._subscriber.handler
-        self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
+        self._thread = threading.Thread(
+            target=self._receive, args=[handler], name="nedbus-px4", daemon=True
+        )
         self._thread.start()
 
     def run(self) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
@@ -110,7 +138,8 @@ class Px4ZenohNode:
                 sample = self._pending.get(timeout=TIMINGS.source_tick)
             if isinstance(sample, BaseException):
                 raise sample
-            for token, alive in self._tokens.poll():  # tokens are declared before the sample is sent
+            # tokens are declared before the sample is sent
+            for token, alive in self._tokens.poll():
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
             if (now := time.monotonic()) >= next_report:
@@ -136,24 +165,38 @@ class Px4ZenohNode:
         try:
             stream = self._streams.on_message(key, now)
             if stream.unsupported is not None:
-                is_unannounced = stream.unsupported and not stream.tokens  # announced streams are in the report
+                # announced streams are in the report
+                is_unannounced = stream.unsupported and not stream.tokens
                 reason = f"{stream.unsupported} is not selected by topics= or msg="
                 return Rejection(key, reason) if is_unannounced and not is_bridged else None
             if (form := stream.wire_format) is None:
                 form = self._streams.wire_format_of(stream)
                 if form.unknown:
-                    names, extra = ", ".join(form.unknown), about("newer_layout", stream.address, source="px4-zenoh")
-                    _log.warning("%s: left out unknown fields %s; update nedbus", stream.key, names, extra=extra)
+                    names = ", ".join(form.unknown)
+                    extra = about("newer_layout", stream.address, source="px4-zenoh")
+                    _log.warning(
+                        "%s: left out unknown fields %s; update nedbus",
+                        stream.key,
+                        names,
+                        extra=extra,
+                    )
                 if form.is_literal:
-                    text, extra = "%s: hashed with a literal char, unlike in ROS 2", about("notice", stream.address)
+                    text = "%s: hashed with a literal char, unlike in ROS 2"
+                    extra = about("notice", stream.address)
                     _log.warning(text, stream.key, extra=extra)
             definition, layout, unknown, _ = form
             address = stream.address
-            attachment = None if sample.attachment is None else transport.Attachment.parse(sample.attachment.to_bytes())
+            attachment = (
+                None
+                if sample.attachment is None
+                else transport.Attachment.parse(sample.attachment.to_bytes())
+            )
             if is_bridged:
                 if not stream.is_bridged:
                     extra = about("bridge_loop", source="px4-zenoh")
-                    _log.info("%s is published by nedbus ros2; ignored to avoid a loop", key, extra=extra)
+                    _log.info(
+                        "%s is published by nedbus ros2; ignored to avoid a loop", key, extra=extra
+                    )
                 stream.is_bridged = True
                 return None
             fields = decode_with(definition, sample.payload.to_bytes(), layout)
@@ -164,9 +207,13 @@ class Px4ZenohNode:
             del fields[name]
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
-            _log.warning("%s: the publisher restarted; counted as a reboot of the vehicle", key, extra=extra)
+            _log.warning(
+                "%s: the publisher restarted; counted as a reboot of the vehicle", key, extra=extra
+            )
         source = _INPUT if stream.is_input else None
-        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
+        return SourceMessage(
+            0.0, stream.address, fields, lost, rebooted, definition=definition, source=source
+        )
 
     def _on_token(self, text: str, *, alive: bool) -> None:
         now = time.monotonic()
@@ -181,10 +228,18 @@ class Px4ZenohNode:
             if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
                 return
             if key.domain not in self._nodes:
-                self._nodes[key.domain] = self._declare(transport.node_token(key.domain, self._zid, self._node))
+                self._nodes[key.domain] = self._declare(
+                    transport.node_token(key.domain, self._zid, self._node)
+                )
             self._entities += 1
-            self._subscriptions[key] = self._declare(key.token("MS", self._zid, self._node, self._entities))
-        elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
+            self._subscriptions[key] = self._declare(
+                key.token("MS", self._zid, self._node, self._entities)
+            )
+        elif (
+            not alive
+            and self._streams.remove_publisher(token, now)
+            and token.key in self._subscriptions
+        ):
             with suppress(zenoh.ZError):  # the session may be closed already
                 self._subscriptions.pop(token.key).undeclare()
                 if all(key.domain != token.key.domain for key in self._subscriptions):
@@ -200,12 +255,16 @@ class Px4ZenohNode:
                 sample = handler.recv()
                 if self._pending.qsize() >= _MAX_PENDING:
                     self._dropped[_TOO_FAST] += 1
-                elif len(sample.payload) > _MAX_PENDING_BYTES or len(str(sample.key_expr)) > transport.LONGEST_TOKEN:
+                elif (
+                    len(sample.payload) > _MAX_PENDING_BYTES
+                    or len(str(sample.key_expr)) > transport.LONGEST_TOKEN
+                ):
                     self._dropped[_TOO_LARGE] += 1
                 else:
                     self._pending.put(sample)
         except BaseException as exc:  # noqa: BLE001 - re-raised by `run`, on the thread of the source
-            ended = SourceError("px4-zenoh", "receiving has stopped unexpectedly")  # the subscriber is undeclared
+            # the subscriber is undeclared
+            ended = SourceError("px4-zenoh", "receiving has stopped unexpectedly")
             self._pending.put(ended if isinstance(exc, zenoh.ZError) else exc)
 
 
@@ -227,9 +286,14 @@ def _read_definitions(paths: str) -> Definitions:
             try:
                 text = _with_nested_messages(file)
                 definition = define_msg(file.stem, text)
-                hashes = hash_of_msg(file.stem, text), hash_of_msg(file.stem, text, literal_char=True)
+                hashes = (
+                    hash_of_msg(file.stem, text),
+                    hash_of_msg(file.stem, text, literal_char=True),
+                )
             except OSError as exc:
-                raise ConfigError(str(file), (exc.strerror or str(exc)).lower(), key="msg") from None
+                raise ConfigError(
+                    str(file), (exc.strerror or str(exc)).lower(), key="msg"
+                ) from None
             except ValueError as exc:  # such as MsgError
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None
@@ -238,7 +302,12 @@ def _read_definitions(paths: str) -> Definitions:
             found.setdefault(dds_type(ros2_type(definition)), {})[hashes] = definition
     if skipped:
         extra = about("damaged", source="px4-zenoh")
-        _log.info("px4-zenoh: skipped unsupported definitions in %s: %.2000s", paths, ", ".join(skipped), extra=extra)
+        _log.info(
+            "px4-zenoh: skipped unsupported definitions in %s: %.2000s",
+            paths,
+            ", ".join(skipped),
+            extra=extra,
+        )
     return found
 
 
@@ -246,7 +315,9 @@ def _with_nested_messages(file: Path) -> str:
     """Return a .msg file followed by its nested messages from the same folder, in ROS 2's format."""
     text = new = _read_text(file)
     added = set[str]()
-    while missing := {base for base in bases_of_msg(new) - added if file.with_name(f"{base}.msg").is_file()}:
+    while missing := {
+        base for base in bases_of_msg(new) - added if file.with_name(f"{base}.msg").is_file()
+    }:
         added |= missing
         files = {base: _read_text(file.with_name(f"{base}.msg")) for base in sorted(missing)}
         new = "".join(f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{each}" for base, each in files.items())

@@ -28,8 +28,10 @@ _MAX_PUBLISHERS: Final = 64  # per key
 _MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a gap
 _TIMEOUT: Final = 3.0  # s without messages after which another publisher may use the address
 _EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
-_SETTLE_TIME: Final = 1.0  # s during which messages may still arrive after a publisher's token is gone
-_SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after which a topic without messages is silent
+# s during which messages may still arrive after a publisher's token is gone
+_SETTLE_TIME: Final = 1.0
+# s, or periods of the nominal rate if longer, after which a topic without messages is silent
+_SILENCE: Final = 5.0
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each vehicle its own namespace or domain"
 
@@ -85,7 +87,9 @@ class Px4Stream:
 
     def is_ambiguous(self) -> bool:
         """Return whether several sessions publish with the same gid."""
-        sessions = {(token.gid, token.session) for token in self.tokens.values() if token.gid is not None}
+        sessions = {
+            (token.gid, token.session) for token in self.tokens.values() if token.gid is not None
+        }
         return len({gid for gid, _ in sessions}) < len(sessions)
 
     def nodes(self) -> set[tuple[str, str]]:
@@ -96,13 +100,17 @@ class Px4Stream:
     def is_silent(self, now: float) -> bool:
         """Return whether messages are overdue; never for topics without a nominal rate, which may pause."""
         rate = get_topic(self.address.topic).rate if self.unsupported is None else 0.0
-        return rate > 0 and now - max(self.since, self.last_message) >= max(_SILENCE, _SILENCE / rate)
+        return rate > 0 and now - max(self.since, self.last_message) >= max(
+            _SILENCE, _SILENCE / rate
+        )
 
 
 class StreamRegistry:
     """All keys with publishers or messages, and the stream that owns each address."""
 
-    def __init__(self, options: Px4ZenohOptions, *, vehicle: str, supplied: Definitions | None = None) -> None:
+    def __init__(
+        self, options: Px4ZenohOptions, *, vehicle: str, supplied: Definitions | None = None
+    ) -> None:
         self._options = options
         self._vehicle = vehicle
         self._supplied = supplied or {}
@@ -142,14 +150,22 @@ class StreamRegistry:
     def wire_format_of(self, stream: Px4Stream) -> WireFormat:
         """Return the format of a stream's messages; raise NotAcceptedError if it is unknown."""
         definition, layout = self._layout_of(stream.key, stream.address.topic)
-        unknown = tuple(name for name, kind in layout.types.items() if kind not in definition.known_types.get(name, ()))
+        unknown = tuple(
+            name
+            for name, kind in layout.types.items()
+            if kind not in definition.known_types.get(name, ())
+        )
         digest, supplied = stream.key.type_hash, self._supplied.get(stream.key.dds_type, {})
-        is_literal = has_char_hash(digest) or any(literal == digest != own for own, literal in supplied)
+        is_literal = has_char_hash(digest) or any(
+            literal == digest != own for own, literal in supplied
+        )
         stream.wire_format = WireFormat(definition, layout, unknown, is_literal)
         stream.reboots = self._reboots.get(stream.address.vehicle, 0)
         return stream.wire_format
 
-    def accept(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
+    def accept(
+        self, stream: Px4Stream, attachment: Attachment | None, now: float
+    ) -> tuple[int, bool]:
         """Return the number of messages lost just before this one, and whether its vehicle rebooted.
 
         Its stream and publisher become the owners of the address.
@@ -187,26 +203,47 @@ class StreamRegistry:
         self._streams = {
             key: each
             for key, each in self._streams.items()
-            if each.tokens or (each.wire_format and now - each.last_message < _EXPIRY) or now < each.ambiguous_until
+            if each.tokens
+            or (each.wire_format and now - each.last_message < _EXPIRY)
+            or now < each.ambiguous_until
         }
         known = {each.address.vehicle for each in self._streams.values()}
-        self._owners = {at: each for at, each in self._owners.items() if self._streams.get(str(each.key)) is each}
-        self._reboots = {vehicle: count for vehicle, count in self._reboots.items() if vehicle in known}
+        self._owners = {
+            at: each
+            for at, each in self._owners.items()
+            if self._streams.get(str(each.key)) is each
+        }
+        self._reboots = {
+            vehicle: count for vehicle, count in self._reboots.items() if vehicle in known
+        }
         nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
         # A node without any message has a broken link, not silent topics.
-        sending = {node for stream, own in nodes if now - stream.last_message < _TIMEOUT for node in own}
-        silent = {str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)}
+        sending = {
+            node for stream, own in nodes if now - stream.last_message < _TIMEOUT for node in own
+        }
+        silent = {
+            str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)
+        }
         unsupported = {stream.unsupported for stream, own in nodes if own and stream.unsupported}
-        return UnavailableTopics(tuple(sorted(unsupported)[:_MAX_NAMES]), tuple(sorted(silent)[:_MAX_NAMES]))
+        return UnavailableTopics(
+            tuple(sorted(unsupported)[:_MAX_NAMES]), tuple(sorted(silent)[:_MAX_NAMES])
+        )
 
     def _find(self, key: TopicKey) -> Px4Stream:
         stream = self._streams.get(str(key))
         if stream is None:
             if len(self._streams) >= _MAX_STREAMS:
-                raise NotAcceptedError(f"more than {_MAX_STREAMS} keys; choose a domain, as in px4-zenoh:?domain=0")
+                raise NotAcceptedError(
+                    f"more than {_MAX_STREAMS} keys; choose a domain, as in px4-zenoh:?domain=0"
+                )
             namespace, topic, instance = split_ros2_topic(key.topic)
             address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
-            stream = Px4Stream(key, address, self._unsupported_name(key, topic), is_input=is_vehicle_input(key.topic))
+            stream = Px4Stream(
+                key,
+                address,
+                self._unsupported_name(key, topic),
+                is_input=is_vehicle_input(key.topic),
+            )
             self._streams[str(key)] = stream
         return stream
 
@@ -222,18 +259,28 @@ class StreamRegistry:
                 raise NotAcceptedError(reason)
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
-            stream.restarted = stream.publisher is not None and stream.publisher.text not in stream.tokens
-            if stream.gid is not None and not stream.restarted and now - stream.last_accepted < _TIMEOUT:
+            stream.restarted = (
+                stream.publisher is not None and stream.publisher.text not in stream.tokens
+            )
+            if (
+                stream.gid is not None
+                and not stream.restarted
+                and now - stream.last_accepted < _TIMEOUT
+            ):
                 raise NotAcceptedError(f"two publishers share this key; {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
-            stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
+            stream.publisher = (
+                next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
+            )
 
     def _unsupported_name(self, key: TopicKey, topic: str) -> str | None:
         options, name = self._options, _message_name(key)
         is_known = key.dds_type in _by_dds_type() or key.dds_type in self._supplied
         if options.chosen_topics is None:
             return None if is_known else name
-        if topic in options.chosen_topics or (not options.topics and key.dds_type in self._supplied):
+        if topic in options.chosen_topics or (
+            not options.topics and key.dds_type in self._supplied
+        ):
             return None
         return "" if options.topics else f"{name} on {topic}" if is_known else name
 

@@ -46,7 +46,11 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
         (5, 1, "tcp/nowhere.invalid:1: cannot resolve host name nowhere.invalid"),
-        (5, 1, f"{closed}: connection refused, probably because nothing listens on this port; start"),
+        (
+            5,
+            1,
+            f"{closed}: connection refused, probably because nothing listens on this port; start",
+        ),
         (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
         (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"),
         (7, 1, "until_done: "),
@@ -67,17 +71,25 @@ def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
     """If the file is unreadable, options and variables are still checked, but no setting is reported as missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
-    for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
+    for file, reason in (
+        (tmp_path / "gone.toml", "there is no such file"),
+        (broken, "Invalid value"),
+    ):
         flags = ("--listen", "tcp/192.0.2.1:1", "--tls-key", "gone.key")
         lines = check(file, *flags, command=("serve", "--check", "--config"))
         assert [reason in lines[0], len(lines)] == [True, 3], lines
         assert lines[1].startswith("tls_key: gone.key cannot be read")
-        assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host")
+        assert lines[2].startswith(
+            "listen: tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"
+        )
 
 
 def test_two_sources_with_the_same_address_are_reported(tmp_path: Path) -> None:
     """If a replay, or a live source with a named vehicle, publishes an address of another source, this is reported."""
-    file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
+    file, log = (
+        tmp_path / "nedbus.toml",
+        write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000)),
+    )
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
         f'source = ["sim:", "ulog:{log}?vehicle=7", "sim:?seed=2", "ulog:{log}?vehicle=7&speed=2", "sim:", "{named}",'
@@ -105,17 +117,26 @@ def test_router_config_named_in_settings_is_checked(tmp_path: Path) -> None:
     )
     file.write_text(f'router_config = "{router}"\nsource = ["foo:"]\n')
     lines = check(file)
-    places = [f"{router}, line {place}" for place in ("1, column 26", "3, column 24", "3, column 60")]
-    assert sorted(line.partition(": ")[0] for line in lines) == [f"{file}, line 2, column 12", *places]
+    places = [
+        f"{router}, line {place}" for place in ("1, column 26", "3, column 24", "3, column 60")
+    ]
+    assert sorted(line.partition(": ")[0] for line in lines) == [
+        f"{file}, line 2, column 12",
+        *places,
+    ]
     assert len(check("--offline", file)) == 1
-    file.write_text(f'router_config = "{router}"\nsource = ["foo:"]\nlisten = "{free_endpoint()}"\n')
+    file.write_text(
+        f'router_config = "{router}"\nsource = ["foo:"]\nlisten = "{free_endpoint()}"\n'
+    )
     assert len(check(file)) == 3
 
 
 def test_mistakes_in_source_tables_are_reported_with_line(tmp_path: Path) -> None:
     """An unknown option is reported at its line, and a missing log at its table unless --offline is given."""
     file = tmp_path / "nedbus.toml"
-    file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
+    file.write_text(
+        '[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n'
+    )
     wrong = f"{file}, line 3, column 1: source 'sim:?sed=1': unknown option 'sed'"
     lines = check(file)
     assert lines[0].startswith(wrong)
@@ -143,8 +164,13 @@ def test_invalid_endpoint_in_router_file_is_reported_with_position(
         f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, connect: {{ endpoints: ["{endpoint}"] }} }}'
     )
     mistakes = [str(each) for each in check_router_file(file)]
-    assert all(each.startswith(f"{file}, line 1, column 42: ") and endpoint in each for each in mistakes), mistakes
-    assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [True, True], mistakes
+    assert all(
+        each.startswith(f"{file}, line 1, column 42: ") and endpoint in each for each in mistakes
+    ), mistakes
+    assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [
+        True,
+        True,
+    ], mistakes
 
 
 def test_router_files_are_parsed_as_by_zenohd(tmp_path: Path, endpoint: str) -> None:
@@ -156,9 +182,13 @@ def test_router_files_are_parsed_as_by_zenohd(tmp_path: Path, endpoint: str) -> 
     assert of_broken.startswith(f"{broken}, line 4, column 1: ")
     assert of_unknown.startswith(f"{unknown}, line ")
     missing = tmp_path / "router.json5"
-    missing.write_text('{\n  transport: { link: { tls: {\n    listen_certificate: "/no/such.crt" } } } }\n')
+    missing.write_text(
+        '{\n  transport: { link: { tls: {\n    listen_certificate: "/no/such.crt" } } } }\n'
+    )
     (line,) = check(missing)
-    assert line.startswith(f"{missing}, line 3, column 26: listen_certificate: /no/such.crt cannot be read")
+    assert line.startswith(
+        f"{missing}, line 3, column 26: listen_certificate: /no/such.crt cannot be read"
+    )
     assert passes("check", "--offline", *sorted((ROOT / "config").glob("*.json5")))
     assert passes("serve", "--check", "--connect", endpoint, "-s", "sim:")
 
@@ -173,7 +203,11 @@ def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
         f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n'
         f'tls_certificate = "{tmp_path}/pki/soon.crt"\ntls_key = "{tmp_path}/pki/soon.key"\n'
     )
-    files = {"listen_certificate": "soon.crt", "listen_private_key": "soon.key", "root_ca_certificate": "ca.crt"}
+    files = {
+        "listen_certificate": "soon.crt",
+        "listen_private_key": "soon.key",
+        "root_ca_certificate": "ca.crt",
+    }
     tls = ",\n".join(f'"{name}": "{tmp_path}/pki/{file}"' for name, file in files.items())
     router.write_text(f"{{ transport: {{ link: {{ tls: {{\n{tls} }} }} }} }}\n")
     lines = check(settings, router)

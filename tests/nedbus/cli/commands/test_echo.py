@@ -68,7 +68,9 @@ def pause_echo(
     def pause(*options: str) -> Iterator[Paused]:
         output, write_end = os.pipe()
         capacity = fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
-        process = fork_command(fork_server, "echo", "-c", endpoint, "--json", *options, out=write_end)
+        process = fork_command(
+            fork_server, "echo", "-c", endpoint, "--json", *options, out=write_end
+        )
         os.close(write_end)
 
         def is_full() -> bool:  # writing another line blocks the process
@@ -109,11 +111,26 @@ def test_echo_prints_one_line_per_message(simulation: str, arguments: list[str])
 
 def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
     """With --json, each line is an object that the model validates, even with "Infinity"; "*" selects all topics."""
-    rows = [json.loads(line) for line in echo(simulation, "--json", "-n", "50", "*").out.splitlines()]
-    has = {each.address.topic: each.fields.keys() for each in open_replay("sim:?duration=15&speed=max").messages}
+    rows = [
+        json.loads(line) for line in echo(simulation, "--json", "-n", "50", "*").out.splitlines()
+    ]
+    has = {
+        each.address.topic: each.fields.keys()
+        for each in open_replay("sim:?duration=15&speed=max").messages
+    }
     assert len(rows) == 50
     for row in rows:
-        assert set(row) == {"vehicle", "topic", "instance", "received", "sent", "lost", "source", "missing", "message"}
+        assert set(row) == {
+            "vehicle",
+            "topic",
+            "instance",
+            "received",
+            "sent",
+            "lost",
+            "source",
+            "missing",
+            "message",
+        }
         assert row["source"] == "sim"
         message = BY_TOPIC[row["topic"]].model.model_validate_json(json.dumps(row["message"]))
         assert set(row["missing"]) == message.DEFINITION.all_fields - has[row["topic"]]
@@ -121,15 +138,21 @@ def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
     assert len({row["topic"] for row in rows}) > 1
 
 
-def test_echo_and_record_select_several_vehicles_and_topics(bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+def test_echo_and_record_select_several_vehicles_and_topics(
+    bus: nedbus.Bus, endpoint: str, tmp_path: Path
+) -> None:
     """`-v` several times and several topics select their product, in `echo` and `record`."""
     for vehicle in ("a", "b", "c"):
         bus.publisher(VLP, vehicle=vehicle).publish(message(1))
         bus.publisher("vehicle_attitude", vehicle=vehicle).publish({"q": (1.0, 0.0, 0.0, 0.0)})
         bus.publisher("battery_status", vehicle=vehicle, instance=0).publish({"voltage_v": 16.0})
-    selected = {f"{vehicle}/{topic}" for vehicle in ("a", "b") for topic in (VLP, "vehicle_attitude")}
+    selected = {
+        f"{vehicle}/{topic}" for vehicle in ("a", "b") for topic in (VLP, "vehicle_attitude")
+    }
     options = [VLP, "vehicle_attitude", "-v", "a", "-v", "b"]
-    assert {line.split()[0] for line in echo(endpoint, "--count", "4", *options).out.splitlines()} == selected
+    assert {
+        line.split()[0] for line in echo(endpoint, "--count", "4", *options).out.splitlines()
+    } == selected
     recording = tmp_path / "two.mcap"
     ended = run_command("record", "-c", endpoint, *options, "-o", str(recording), "--duration", "1")
     assert ended.exit_code == 0, ended.err
@@ -190,14 +213,18 @@ def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> N
     """`nedbus echo | head` ends without an error message."""
     read_end, write_end = os.pipe()
     with Path("err").open("wb") as err, os.fdopen(read_end) as head:
-        process = fork_command(fork_server, "echo", "-c", simulation, out=write_end, err=err.fileno())
+        process = fork_command(
+            fork_server, "echo", "-c", simulation, out=write_end, err=err.fileno()
+        )
         os.close(write_end)
         assert all(head.readline().startswith(f"1/{VLP} ") for _ in range(3))
     assert process.wait(DEADLINE) == 0
     assert Path("err").read_text() == ""
 
 
-def test_echo_prints_counts_at_exit(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_echo_prints_counts_at_exit(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """At exit, stderr reports the numbers of lost messages and invalid payloads."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
@@ -214,7 +241,10 @@ def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Tim
     """`echo` marks a retained message beyond the age limit as old, and `hz` does not count it."""
     timings.old = 0.01
     bus.publisher(VLP, vehicle="1").publish(message(1))
-    wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
+    wait_for(
+        lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()),
+        what="the message to be old",
+    )
     assert "s old]" in echo(endpoint, "-n", "1").out
     hz = run_command("hz", "-c", endpoint, "-d", "0.5")
     assert hz.exit_code == 1
@@ -246,7 +276,9 @@ def test_blocked_echo_does_not_delay_a_replay(
 def test_echo_every_prints_all_messages(run_nedbus: Start, endpoint: str) -> None:
     """--every prints all messages of a replay in order, at any speed; its help warns that the replay waits."""
     assert "a replay at speed=max waits" in run_command("echo", "--help", COLUMNS="300").out
-    run_nedbus("serve", "--connect", endpoint, "-s", f"sim:?duration=10&speed=max&wait=1&topics={VLP}")
+    run_nedbus(
+        "serve", "--connect", endpoint, "-s", f"sim:?duration=10&speed=max&wait=1&topics={VLP}"
+    )
     lines = echo(endpoint, "--json", "--every", "-n", "1000").out.splitlines()
     timestamps = [json.loads(line)["message"]["timestamp"] for line in lines]
     assert len(timestamps) == 1000
@@ -256,18 +288,31 @@ def test_echo_every_prints_all_messages(run_nedbus: Start, endpoint: str) -> Non
 def test_echo_csv_has_a_row_per_message(endpoint: str, bus: nedbus.Bus) -> None:
     """--csv writes a header line and one row per message of all vehicles; arrays have one column per element."""
     with publishing(bus, "1", "2"):
-        lines = echo(endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "10").out.splitlines()
+        lines = echo(
+            endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "10"
+        ).out.splitlines()
         head, row = csv.reader(echo(endpoint, "--csv", "--once").out.splitlines())
     assert len(head) == len(row) == 5 + len(VehicleLocalPosition.model_fields) + 2 + 1
     rows = list(csv.DictReader(lines))
     fields = ["x", "y", "delta_xy[0]", "delta_xy[1]", "xy_valid"]
-    assert list(rows[0]) == ["vehicle", "topic", "instance", "utc", "sent", "timestamp", *fields, "state"]
+    assert list(rows[0]) == [
+        "vehicle",
+        "topic",
+        "instance",
+        "utc",
+        "sent",
+        "timestamp",
+        *fields,
+        "state",
+    ]
     assert len(rows) == 10
     assert {each["vehicle"] for each in rows} == {"1", "2"}
     assert all(int(each["sent"]) > 10**18 and each["timestamp"] == "1" for each in rows)
     assert all(math.isfinite(float(each["x"])) and each["xy_valid"] == "True" for each in rows)
     for each in rows:
-        assert datetime.fromisoformat(each["utc"]).timestamp() == pytest.approx(int(each["sent"]) / 1e9, abs=1e-5)
+        assert datetime.fromisoformat(each["utc"]).timestamp() == pytest.approx(
+            int(each["sent"]) / 1e9, abs=1e-5
+        )
 
 
 def test_echo_offers_derived_fields_by_name(endpoint: str, bus: nedbus.Bus) -> None:
@@ -283,7 +328,9 @@ def test_echo_offers_derived_fields_by_name(endpoint: str, bus: nedbus.Bus) -> N
     assert "height 12.5  speed nan" in echo(endpoint, *names, "--once").out
 
 
-def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
+def test_echo_csv_marks_invalid_positions_and_ends_with_counts(
+    endpoint: str, bus: nedbus.Bus
+) -> None:
     """Every position row includes its state, whatever fields are selected; the message counts follow on stderr."""
     bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
     result = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")

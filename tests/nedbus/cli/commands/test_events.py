@@ -77,19 +77,26 @@ def log(tmp_path: Path) -> Path:
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cache the parsed real log for all tests: only the output of the commands is tested."""
     target = "nedbus.event_sources.read_file_events"
-    monkeypatch.setattr(target, lambda path: (cached_events if path == REAL else read_file_events)(path))
+    monkeypatch.setattr(
+        target, lambda path: (cached_events if path == REAL else read_file_events)(path)
+    )
 
 
 def lines_of(result: CommandResult) -> list[tuple[str, str, str]]:
     """Return time, severity and text of each line."""
-    found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in result.out.splitlines()]
+    found = [
+        re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in result.out.splitlines()
+    ]
     return [(match[1], match[2] or "", match[3]) for match in found if match]
 
 
 def test_each_event_of_a_file_is_one_line_with_evidence(log: Path) -> None:
     """Each event is one line with its evidence, and stderr names the clock of the event times."""
     result = run_command("events", str(log))
-    assert (result.exit_code, result.err) == (0, "times: seconds since boot, because no message contains UTC\n")
+    assert (result.exit_code, result.err) == (
+        0,
+        "times: seconds since boot, because no message contains UTC\n",
+    )
     assert lines_of(result) == EXPECTED_EVENTS
     assert len(result.out.splitlines()) == len(EXPECTED_EVENTS)
 
@@ -113,7 +120,8 @@ def test_json_and_csv_events_have_every_field(log: Path) -> None:
         pytest.fail(f"{constant} is not valid JSON")
 
     events = [
-        json.loads(line, parse_constant=refuse) for line in run_command("events", str(log), "--json").out.splitlines()
+        json.loads(line, parse_constant=refuse)
+        for line in run_command("events", str(log), "--json").out.splitlines()
     ]
     assert [(each["boot"], each["text"]) for each in events] == [
         (float(at), text.partition("  <- ")[0]) for at, _, text in EXPECTED_EVENTS
@@ -127,7 +135,9 @@ def test_json_and_csv_events_have_every_field(log: Path) -> None:
         ],
     }  # fmt: skip
     rows = list(csv.DictReader(io.StringIO(run_command("events", str(log), "--csv").out)))
-    assert [(row["boot"], row["kind"]) for row in rows] == [(str(each["boot"]), each["kind"]) for each in events]
+    assert [(row["boot"], row["kind"]) for row in rows] == [
+        (str(each["boot"]), each["kind"]) for each in events
+    ]
     assert rows[1]["evidence"] == "dead_reckoning 3.0 s"
 
 
@@ -147,7 +157,9 @@ def test_real_flight_has_expected_events() -> None:
     assert run_command("convert", str(REAL), "flight.mcap", "--topics", "*").exit_code == 0
 
     def events_of(file: str) -> list[tuple[str, str, str]]:
-        events = [json.loads(line) for line in run_command("events", file, "--json").out.splitlines()]
+        events = [
+            json.loads(line) for line in run_command("events", file, "--json").out.splitlines()
+        ]
         return sorted((each["time"], each["text"], each["topic"]) for each in events)
 
     events = events_of(str(REAL))
@@ -159,7 +171,9 @@ def test_real_flight_has_expected_events() -> None:
     )
     story = run_command("why", str(REAL), "--all").out
     fault = "xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
-    begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix lost: 3D to none, satellites 10 to 0"
+    begin = (
+        f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix lost: 3D to none, satellites 10 to 0"
+    )
     assert story.startswith(begin)
     assert f"\n\n1: {fault}\n  evidence\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
@@ -168,7 +182,11 @@ def test_real_flight_has_expected_events() -> None:
 def test_why_prints_verdict_and_faults(log: Path) -> None:
     """`why` prints the verdict; --all adds each fault with the events before it, and topics missing from the log."""
     result = run_command("why", str(log))
-    assert (result.exit_code, result.out, result.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
+    assert (result.exit_code, result.out, result.err) == (
+        0,
+        VERDICT,
+        "--all shows 1 fault in detail\n",
+    )
     result = run_command("why", str(log), "--all")
     assert (result.exit_code, result.out, result.err) == (0, WHY, "")
     report = json.loads(run_command("why", str(log), "--json").out)
@@ -189,7 +207,10 @@ def test_why_prints_a_long_reason_in_full(tmp_path: Path) -> None:
         writer.add(VLP, message(timestamp), xy_valid=True, dist_bottom_valid=True)
     [verdict] = run_command("why", str(writer.write(tmp_path / "a.ulg"))).out.splitlines()
     assert verdict.startswith(f"1: {VLP} rejected: x: must be finite while xy_valid is true")
-    assert "; dist_bottom: must be finite while dist_bottom_valid is true (is nan) from +0.000 to +1.900 s" in verdict
+    assert (
+        "; dist_bottom: must be finite while dist_bottom_valid is true (is nan) from +0.000 to +1.900 s"
+        in verdict
+    )
 
 
 def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
@@ -201,7 +222,9 @@ def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
         "1: position valid throughout, but dead reckoning from 5.000 to 12.000 s since boot (7.0 s)."
     )
     result = run_command("why", str(log), "--at", "19").out
-    assert result.startswith("1: no fault at that time; nearest: xy and vxy not valid from 8.000 to 12.000 s")
+    assert result.startswith(
+        "1: no fault at that time; nearest: xy and vxy not valid from 8.000 to 12.000 s"
+    )
 
 
 @pytest.mark.logs
@@ -210,7 +233,10 @@ def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
 def test_why_at_accepts_utc_and_seconds() -> None:
     """`why --at` prints the same for a UTC time and for the same time in seconds since boot or since the start."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
-    assert "GPS fix lost: 3D to none, satellites 10 to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
+    assert (
+        "GPS fix lost: 3D to none, satellites 10 to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)."
+        in by_utc
+    )
     for moment in ("27.557", "+27.325"):
         assert run_command("why", str(REAL), "--at", moment).out == by_utc
 
@@ -221,7 +247,10 @@ def test_flight_without_faults_reports_its_duration(tmp_path: Path) -> None:
     result = run_command("events", log)
     assert (result.exit_code, result.out) == (0, "")
     assert result.err == f"{log}: no events in 20 s\n"
-    assert run_command("events", log, "--severity", "bad").err == f"{log}: no events of severity bad in 20 s\n"
+    assert (
+        run_command("events", log, "--severity", "bad").err
+        == f"{log}: no events of severity bad in 20 s\n"
+    )
     result = run_command("why", log)
     assert (result.exit_code, result.out, result.err) == (0, f"1: no faults in 20 s; {USUAL}\n", "")
 
@@ -244,7 +273,9 @@ def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.Monkey
     writer = UlogWriter()
     writer.define([VLP])
     for second in range(2200):
-        writer.add(VLP, message((second + 1) * 1_000_000, **VALID | {"xy_reset_counter": second % 256}))
+        writer.add(
+            VLP, message((second + 1) * 1_000_000, **VALID | {"xy_reset_counter": second % 256})
+        )
     log = str(writer.write(tmp_path / "long.ulg"))
     result = run_command("events", log)
     assert len(result.out.splitlines()) == 2000
@@ -271,12 +302,18 @@ def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.Monkey
         (("why", "not.ulg"), 1, "nedbus: not.ulg: not a readable ULog file (it does not begin with ULog's magic"),
     ],
 )  # fmt: skip
-def test_error_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ...], code: int, text: str) -> None:
+def test_error_is_one_line(
+    log: Path, tmp_path: Path, arguments: tuple[str, ...], code: int, text: str
+) -> None:
     """An error is one line with a remedy; the exit code is 2 for wrong usage and 1 for a failure."""
     (tmp_path / "note.txt").write_text("no log")
     (tmp_path / "not.ulg").write_text("no log")
     result = run_command(*(str(log) if each == "LOG" else each for each in arguments))
-    text = text.replace("LOG", str(log)).replace("EXPECTED", f"expected {AT}").replace("CWD", str(Path.cwd()))
+    text = (
+        text.replace("LOG", str(log))
+        .replace("EXPECTED", f"expected {AT}")
+        .replace("CWD", str(Path.cwd()))
+    )
     assert result.err.startswith(text)
     assert (result.exit_code, result.out) == (code, "")
     assert len(result.err.splitlines()) == 1
@@ -298,7 +335,10 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
     """Start a service in another process, and wait until all replays have ended."""
     options = [part for source in sources for part in ("-s", source)]
     run_nedbus("serve", "-c", endpoint, *options)
-    wait_for(lambda: sum(len(each.vehicles) for each in bus.accounts()) == len(sources), what="the vehicles")
+    wait_for(
+        lambda: sum(len(each.vehicles) for each in bus.accounts()) == len(sources),
+        what="the vehicles",
+    )
 
     def has_ended() -> bool:
         states = [source.state for service in bus.services() for source in service.sources]
@@ -312,7 +352,9 @@ def test_why_live_uses_service_history(
 ) -> None:
     """`why` uses the history of services, for all vehicles or for one. A vehicle published by a script has none."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
-    start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
+    start_service(
+        run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20"
+    )
     result = run_command("why", "-c", endpoint)
     assert (result.exit_code, result.err) == (0, "--all shows 1 fault in detail\n")
     assert result.out.startswith("1: was not usable: xy and vxy not valid from ")
@@ -330,7 +372,8 @@ def test_why_live_uses_service_history(
     begin = rf"1: was not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
     assert re.match(rf"{begin}\n\n1: {fault}\n  evidence\n", result.out)
     assert "to publish them, add them to PX4's dds_topics.yaml" in result.out
-    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # end of the fault
+    # end of the fault
+    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")
     assert since_boot.out.startswith("1: not usable: xy and vxy not valid")
     assert set(result.out.partition("\n\n")[2].splitlines()) <= set(since_boot.out.splitlines())
     refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")
@@ -345,7 +388,9 @@ def test_why_live_uses_service_history(
     )
 
 
-def test_why_live_reports_initial_faults(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+def test_why_live_reports_initial_faults(
+    run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path
+) -> None:
     """A vehicle whose position has been invalid since the service started is reported as not usable."""
     writer = UlogWriter()
     writer.define([VLP])
@@ -357,7 +402,9 @@ def test_why_live_reports_initial_faults(run_nedbus: Start, bus: nedbus.Bus, end
     assert run_command("why", "-c", endpoint).out.startswith(begin)
 
 
-def test_events_within_shows_the_history(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+def test_events_within_shows_the_history(
+    run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path
+) -> None:
     """--within first shows past events from the history of a service."""
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
     follower = run_nedbus("events", "-c", endpoint, "--within", "600", "--json", "-v", "1")
@@ -370,7 +417,9 @@ def test_events_within_shows_the_history(run_nedbus: Start, bus: nedbus.Bus, end
     assert [each["kind"] for each in events[1]["evidence"]] == ["dead_reckoning"]
 
 
-def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+def test_history_contains_px4_texts(
+    run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path
+) -> None:
     """A service keeps PX4's own texts, and `events --within` and `why` show them as they do for a file."""
     writer = UlogWriter()
     writer.define([VLP])
@@ -388,7 +437,8 @@ def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint
         assert first.endswith('1        WATCH  PX4: "[ekf2] reset"')
         assert second.endswith('PX4: "[failsafe] Failsafe activated"')
     for result in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
-        assert 'PX4: "reset", PX4: "Failsafe activated"' in result  # without the names of PX4's modules
+        # without the names of PX4's modules
+        assert 'PX4: "reset", PX4: "Failsafe activated"' in result
 
 
 def test_events_live_are_printed_as_they_happen(
@@ -405,14 +455,20 @@ def test_events_live_are_printed_as_they_happen(
         follower = run_nedbus("events", "-c", endpoint)
         wait_for_matching(zenoh_session, "nedbus/7/vehicle_local_position")
         with repeating(publish):
-            wait_for(lambda: "7: z not valid, from the start\n" in follower.err, what="the initial condition")
+            wait_for(
+                lambda: "7: z not valid, from the start\n" in follower.err,
+                what="the initial condition",
+            )
             assert follower.out == ""
             fields["xy_valid"] = False
             wait_for(lambda: "xy not valid" in follower.out, what="the event")
             fields["xy_valid"] = True
             wait_for(lambda: "xy valid again after" in follower.out, what="its end")
         wait_for(lambda: "silent: no vehicle_local_position for" in follower.out, what="silence")
-    wait_for(lambda: "gone: no publisher of vehicle_local_position" in follower.out, what="the end of the publisher")
+    wait_for(
+        lambda: "gone: no publisher of vehicle_local_position" in follower.out,
+        what="the end of the publisher",
+    )
     lines = [line.split(None, 2)[1:] for line in follower.out.splitlines()]
     assert [line[0] for line in lines] == ["7"] * len(lines)
     assert lines[0][1].startswith("BAD    xy not valid")
@@ -434,7 +490,12 @@ def test_events_live_filter_by_vehicle_and_severity(
         with repeating(publish):
             subscription = bus.subscribe(VLP, vehicle="8")
             subscription.receive(30)
-            wait_for(lambda: Address("8", VLP) in {each for all_ in bus.vehicles().values() for each in all_}, what="8")
+            wait_for(
+                lambda: (
+                    Address("8", VLP) in {each for all_ in bus.vehicles().values() for each in all_}
+                ),
+                what="8",
+            )
             for _ in range(2):
                 fields["xy_valid"] = False
                 wait_for(lambda: follower.out.count("xy not valid") > 0, what="the event")
@@ -451,7 +512,9 @@ DOCUMENTED = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
 
 
 @pytest.mark.parametrize("command", DOCUMENTED)
-def test_documented_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+def test_documented_command_works(
+    command: str, run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path
+) -> None:
     """Each command of docs/events.md works, on a file or on a live vehicle."""
     assert log.name == "flight.ulg"
     arguments = [str(log) if part == log.name else part for part in command.split()]
@@ -468,7 +531,9 @@ def test_documented_command_works(command: str, run_nedbus: Start, bus: nedbus.B
             1, "".join(f"nedbus: vehicle {name} is missing: it has no publisher; published: 7\n" for name in (1, 2))
         )  # fmt: skip
     else:
-        result = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
+        result = run_command(
+            *arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ())
+        )
         assert (result.exit_code, result.err) == (
             0,
             "times: UTC, from the clocks of the hosts\n" * ("events" in command),
@@ -486,7 +551,11 @@ def test_file_suffix_is_case_insensitive(log: Path, tmp_path: Path) -> None:
     """Every command accepts uppercase suffixes: FLIGHT.ULG, as on a FAT-formatted SD card, and FLIGHT.MCAP."""
     flight, converted = tmp_path / "FLIGHT.ULG", tmp_path / "FLIGHT.MCAP"
     flight.write_bytes(log.read_bytes())
-    for arguments in (["convert", flight, converted], ["plot", flight, "-o", tmp_path / "A.PNG"], ["plot", converted]):
+    for arguments in (
+        ["convert", flight, converted],
+        ["plot", flight, "-o", tmp_path / "A.PNG"],
+        ["plot", converted],
+    ):
         result = run_command(*map(str, arguments))
         assert result.exit_code == 0, result.err
     for path in (flight, converted):

@@ -60,23 +60,34 @@ def test_service_without_vehicles_is_not_healthy(endpoint: str, health: Health) 
     with serving(endpoint, source) as daemon:
         wait_for_state(daemon, "waiting")
         result = health()
-    assert (result.exit_code, result.err) == (1, f"nedbus: no vehicle is published: {source} is waiting\n")
+    assert (result.exit_code, result.err) == (
+        1,
+        f"nedbus: no vehicle is published: {source} is waiting\n",
+    )
 
 
-def test_finished_replay_is_not_healthy(endpoint: str, health: Health, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finished_replay_is_not_healthy(
+    endpoint: str, health: Health, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The newest message must not be older than --max-age, whatever the state of the source."""
     offset = [0.0]
-    monkeypatch.setattr("nedbus.daemon.worker.Clock.now", staticmethod(lambda: time.monotonic() + offset[0]))
+    monkeypatch.setattr(
+        "nedbus.daemon.worker.Clock.now", staticmethod(lambda: time.monotonic() + offset[0])
+    )
     with serving(endpoint, "sim:?duration=0.1") as daemon:
         wait_for_state(daemon, "done")
         offset[0] = 100.0
         result = health()
         assert result.exit_code == 1
-        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", result.err)
+        assert re.search(
+            r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", result.err
+        )
         assert health("--max-age", "3600").exit_code == 0
 
 
-def test_frozen_service_is_not_healthy(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+def test_frozen_service_is_not_healthy(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, health: Health
+) -> None:
     """--services 2 fails if one of two services is frozen (SIGSTOP)."""
     other = run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=2")
     with serving(endpoint, "sim:"):
@@ -93,14 +104,20 @@ def test_frozen_service_is_not_healthy(run_nedbus: Start, endpoint: str, bus: ne
 
 def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
     """--vehicle checks only that vehicle, even if a script publishes it, and fails if nothing publishes it."""
-    with serving(endpoint, "ulog:/gone.ulg", "sim:") as daemon, bus.publisher(VLP, vehicle="script") as publisher:
+    with (
+        serving(endpoint, "ulog:/gone.ulg", "sim:") as daemon,
+        bus.publisher(VLP, vehicle="script") as publisher,
+    ):
         wait_for_state(daemon, "retrying")
         wait_for(lambda: len(bus.vehicles()) == 2, what="both vehicles")
         publisher.publish(message(1))
         assert "ulog:/gone.ulg is retrying: " in health().err
         wait_for(lambda: health("--vehicle", "1").exit_code == 0, what="the simulated vehicle")
         assert health("--vehicle", "script", "--max-age", "60").exit_code == 0
-        assert "vehicle 9 is not published (published: 1, script): ulog:" in health("--vehicle", "9").err
+        assert (
+            "vehicle 9 is not published (published: 1, script): ulog:"
+            in health("--vehicle", "9").err
+        )
         assert health("--vehicle", "a/b").exit_code == 2
 
 
@@ -116,10 +133,15 @@ def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health:
     assert json.loads(missed.out)["reason"].startswith("1 of 5 services answer")
 
 
-def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+def test_missing_expected_vehicles_are_faults(
+    endpoint: str, bus: nedbus.Bus, health: Health
+) -> None:
     """--expect names the required vehicles, --vehicles their number; they may be on any host or come from scripts."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
-        wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
+        wait_for(
+            lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0,
+            what="the simulated vehicle",
+        )
         result = health("--expect", "1,7, 8", "--vehicles", "3")
         assert (result.exit_code, result.out) == (1, "")
         assert result.err.splitlines() == [
@@ -137,7 +159,9 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
         ]
 
 
-def test_valid_and_within_options_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
+def test_valid_and_within_options_report_faults(
+    endpoint: str, tmp_path: Path, health: Health
+) -> None:
     """--valid checks current flags and --within past events; stderr has one line per fault, and --json lists all."""
     writer = UlogWriter()
     writer.define([VLP])
@@ -151,11 +175,19 @@ def test_valid_and_within_options_report_faults(endpoint: str, tmp_path: Path, h
         assert health("--max-age", "600", "--valid", "z,vz").exit_code == 0
         result = health("--max-age", "600", "--valid", "xy,z")
         assert result.exit_code == 1
-        assert re.fullmatch(r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", result.err)
+        assert re.fullmatch(
+            r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", result.err
+        )
         result = health("--max-age", "600", "--valid", "xy", "--within", "600", "--json")
         report = json.loads(result.out)
-        assert (result.exit_code, report["healthy"], report["reason"]) == (1, False, report["faults"][0])
-        texts = [re.sub(r"\d\d:\d\d:\d\d\.\d UTC|[\d.]+ m?s", "T", fault) for fault in report["faults"]]
+        assert (result.exit_code, report["healthy"], report["reason"]) == (
+            1,
+            False,
+            report["faults"][0],
+        )
+        texts = [
+            re.sub(r"\d\d:\d\d:\d\d\.\d UTC|[\d.]+ m?s", "T", fault) for fault in report["faults"]
+        ]
         assert texts == [
             "vehicle 1: xy not valid, since T (T)",
             "vehicle 1: dead reckoning, at T, T ago",
@@ -174,7 +206,8 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
         wait_for(lambda: health().exit_code == 1, what="the report on vehicle 2")
         result = health()
         assert re.fullmatch(
-            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n", result.err
+            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n",
+            result.err,
         )
         assert health("--expect", "1").exit_code == 0
         assert health("--vehicle", "1").exit_code == 0
@@ -186,10 +219,15 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
         (("--expect", "1,a b"), "nedbus: vehicle 'a b' is not valid"),
         (("--expect", ""), "nedbus: --expect: the list is empty"),
         (("--valid", " , "), "nedbus: --valid: the list is empty"),
-        (("--valid", "xy,heading"), "nedbus: --valid: 'heading': expected a list of xy, z, vxy, vz\n"),
+        (
+            ("--valid", "xy,heading"),
+            "nedbus: --valid: 'heading': expected a list of xy, z, vxy, vz\n",
+        ),
     ],
 )
-def test_invalid_option_value_exits_with_2(health: Health, arguments: tuple[str, ...], text: str) -> None:
+def test_invalid_option_value_exits_with_2(
+    health: Health, arguments: tuple[str, ...], text: str
+) -> None:
     """An invalid value is reported in one line before any query, with exit code 2."""
     result = health(*arguments)
     assert result.exit_code == 2
@@ -202,18 +240,27 @@ def test_ended_replay_causes_no_silence_event(endpoint: str, bus: nedbus.Bus) ->
     with serving(endpoint, "sim:?duration=0.1"):
 
         def is_old() -> bool:
-            return any(sample.latency is not None and sample.latency > 3.5 for sample in bus.latest("*"))
+            return any(
+                sample.latency is not None and sample.latency > 3.5 for sample in bus.latest("*")
+            )
 
         wait_for(is_old, what="the last message to be old")
         result = run_command("events", "-c", endpoint, "--duration", "4")
         assert result.out == ""
 
 
-def test_service_without_history_is_a_fault(endpoint: str, zenoh_session: Session, health: Health) -> None:
+def test_service_without_history_is_a_fault(
+    endpoint: str, zenoh_session: Session, health: Health
+) -> None:
     """--valid and --within fail for an older service, which keeps no history of its vehicles."""
-    key, status = "nedbus/@service/1/old/status", {"service": "old", "host": socket.gethostname(), "sources": []}
+    key, status = (
+        "nedbus/@service/1/old/status",
+        {"service": "old", "host": socket.gethostname(), "sources": []},
+    )
     with answer_queries(
-        zenoh_session, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")
+        zenoh_session,
+        key,
+        reply_with({key: json.dumps(status).encode()}, encoding="application/json"),
     ):
         for option in ("--valid", "xy"), ("--within", "60"):
             result = health("--services", "1", *option)

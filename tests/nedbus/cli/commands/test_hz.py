@@ -31,10 +31,14 @@ def test_gone_stream_is_hidden_after_a_minute(age: float, is_shown: bool) -> Non
     assert (shown, forgotten) == ((["gone"], []) if is_shown else ([], [address]))
 
 
-def test_stream_that_was_hidden_is_written_when_it_returns(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
+def test_stream_that_was_hidden_is_written_when_it_returns(
+    monkeypatch: pytest.MonkeyPatch, endpoint: str
+) -> None:
     """What was written of a stream is forgotten with the stream, so --json shows a stream that returns."""
     address, health = Address("1", VLP), StreamHealth(VLP).snapshot(0)
-    rows = iter([[(address, health, StreamState("ok"))], [(address, health, StreamState("ok"))], []] * 2)
+    rows = iter(
+        [[(address, health, StreamState("ok"))], [(address, health, StreamState("ok"))], []] * 2
+    )
 
     def show_each(*_: object, each_second: Callable[[], None], **__: object) -> None:
         for _second in range(6):

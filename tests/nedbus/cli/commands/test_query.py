@@ -6,6 +6,7 @@ import csv
 import json
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,10 @@ from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import DEADLINE, wait_for
 
 COMMANDS = [str(each.name) for each in make_app().registered_commands]
-COMMANDS += [f"pki {each.name or getattr(each.callback, '__name__', None)}" for each in pki.registered_commands]
+COMMANDS += [
+    f"pki {each.name or getattr(each.callback, '__name__', None)}"
+    for each in pki.registered_commands
+]
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +41,9 @@ def simulation(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, "-s", "sim:")
-    environment = {name: value for name, value in without_coverage().items() if not name.startswith("NEDBUS_")}
+    environment = {
+        name: value for name, value in without_coverage().items() if not name.startswith("NEDBUS_")
+    }
     service = Process(command, tmp_path_factory.mktemp("simulation"), environment, fork_server)
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: len(bus.latest(ANY)) == 12, what="twelve streams")
@@ -46,7 +52,9 @@ def simulation(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory
     router.close()
 
 
-@pytest.mark.parametrize("fresh", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "fresh"])
+@pytest.mark.parametrize(
+    "fresh", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "fresh"]
+)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_starts(run_nedbus: Start, command: str, *, fresh: bool) -> None:
     """Each command starts in a separate process and imports all it needs; most other tests run in-process."""
@@ -71,7 +79,10 @@ def test_list_shows_published_streams(simulation: str) -> None:
     ]
     assert len(lines) == 12
     assert all(line.endswith("ok") for line in lines)
-    rows = [json.loads(line) for line in run_command("list", "-c", simulation, "--json").out.splitlines()]
+    rows = [
+        json.loads(line)
+        for line in run_command("list", "-c", simulation, "--json").out.splitlines()
+    ]
     assert [row["instance"] for row in rows if "local" in row["topic"]] == [0, 1, None, None, None]
     assert all(row["vehicle"] == "1" and row["age"] >= 0 for row in rows)
 
@@ -84,12 +95,18 @@ def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
     for vehicle, count in (("1", 2), ("2", 1), ("silent", 1), ("3", 0)):
         listed = run_command("list", "-c", endpoint, "--vehicle", vehicle, "--json")
         assert listed.exit_code == (vehicle == "3"), listed.err
-        assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [vehicle] * count
+        assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [
+            vehicle
+        ] * count
         assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
-        assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), "no hint about permissions"
+        assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), (
+            "no hint about permissions"
+        )
 
 
-def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_incomplete_list_exits_with_1(
+    bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """If replies are missing, `list` shows the others with a warning and exits with 1."""
     monkeypatch.setattr(liveliness, "MAX_REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
@@ -114,7 +131,10 @@ def test_list_is_not_reported_as_empty_before_the_router_replies(
 
 def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
     """`hz` prints rate, jitter, latency and loss per stream, as table, JSON or CSV; positions arrive at 100 Hz."""
-    table, csv_form = (run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
+    table, csv_form = (
+        run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False)
+        for form in ([], ["--csv"])
+    )
     measured: list[dict[str, Any]] = []
 
     def is_near() -> bool:
@@ -127,13 +147,23 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -
     wait_for(is_near, what="a rate near 100 Hz")
     assert {row["topic"] for row in measured} == {VLP}
     assert all(
-        set(row) >= {"rate", "jitter", "latency", "latency_max", "lost", "flags", "gaps", "reboots"} for row in measured
+        set(row) >= {"rate", "jitter", "latency", "latency_max", "lost", "flags", "gaps", "reboots"}
+        for row in measured
     )
     assert measured[-1]["lost"] == 0
-    for form in (table, csv_form):
-        wait_for(lambda form=form: form.out.count("1/" if form is table else ",1,") >= 2, what="two seconds")  # type: ignore[misc]
+    for form, row in ((table, "1/"), (csv_form, ",1,")):
+        has_two_rows = partial(lambda form, row: form.out.count(row) >= 2, form, row)
+        wait_for(has_two_rows, what="two seconds")
         form.kill()
-    assert table.out.splitlines()[0].split() == ["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE"]
+    assert table.out.splitlines()[0].split() == [
+        "VEHICLE/TOPIC",
+        "HZ",
+        "JITTER",
+        "LATENCY",
+        "MAX",
+        "LOST",
+        "STATE",
+    ]
     rows = list(csv.DictReader(csv_form.out.splitlines()))
     assert {(row["vehicle"], row["topic"]) for row in rows} == {("1", VLP)}
     assert {row["state"] for row in rows} <= {"ok", "slow"}  # slow on a busy machine
@@ -155,7 +185,11 @@ def test_get_shows_the_last_message(simulation: str) -> None:
     assert "  hagl_max_xy: inf" in estimate
     assert len(get("--json", "*").splitlines()) == 12
     assert [json.loads(line)["topic"] for line in get("--json").splitlines()] == [VLP]
-    assert [line.split(":")[0] for line in get("--field", "x,eph").splitlines()[1:]] == ["  x", "  eph", "---"]
+    assert [line.split(":")[0] for line in get("--field", "x,eph").splitlines()[1:]] == [
+        "  x",
+        "  eph",
+        "---",
+    ]
     assert json.loads(get("--json", "--field", "x"))["message"].keys() == {"x"}
     nothing = run_command("get", "-c", simulation, "--vehicle", "99")
     assert nothing.exit_code == 1
@@ -167,7 +201,9 @@ def test_info_shows_the_services(simulation: str) -> None:
     """`info` prints the router, the vehicles, and the services with their sources."""
     info = run_until_shown("running", "info", "-c", simulation)
     assert info.exit_code == 0, info.err
-    assert all(text in info.out for text in (f"router    {simulation}", "vehicles  1", "SOURCE", "running"))
+    assert all(
+        text in info.out for text in (f"router    {simulation}", "vehicles  1", "SOURCE", "running")
+    )
     machine = run_until_shown('"state": "running"', "info", "-c", simulation, "--json")
     assert json.loads(machine.out)["sources"][0]["source"] == "sim:"
 
@@ -175,7 +211,9 @@ def test_info_shows_the_services(simulation: str) -> None:
 def test_schema_needs_no_network() -> None:
     """`schema` prints JSON Schema and layouts without a router."""
     assert json.loads(run_command("schema").out) == json_schema()
-    assert [layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)] == list(LAYOUTS)
+    assert [
+        layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)
+    ] == list(LAYOUTS)
 
 
 def test_absence_of_vehicles_is_reported(
@@ -198,7 +236,9 @@ def test_absence_of_vehicles_is_reported(
     assert echo.out.startswith("7/vehicle_local_position ")
 
 
-@pytest.mark.parametrize(("command", "key_expr"), [("echo", f"nedbus/*/{VLP}"), ("hz", "nedbus/*/**")])
+@pytest.mark.parametrize(
+    ("command", "key_expr"), [("echo", f"nedbus/*/{VLP}"), ("hz", "nedbus/*/**")]
+)
 def test_duration_without_data_exits_with_1(endpoint: str, command: str, key_expr: str) -> None:
     """A command with --duration exits with 1 if no message arrived."""
     watch = run_command(command, "-c", endpoint, "--duration", "0.1")
@@ -218,7 +258,9 @@ def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.Mo
     where = free_endpoint()
     ended = run_command(command, "-c", where)
     assert ended.exit_code == 1
-    assert ended.err.startswith(f"nedbus: nothing answers at {where} (tried for 0.1 s): start 'nedbus serve'")
+    assert ended.err.startswith(
+        f"nedbus: nothing answers at {where} (tried for 0.1 s): start 'nedbus serve'"
+    )
     assert len(ended.err.splitlines()) == 1
 
 
@@ -240,25 +282,52 @@ def test_wait_option_waits_for_a_router(run_nedbus: Start) -> None:
             ["echo", "vehicle_local_positon"],
             "topic 'vehicle_local_positon' is not valid: expected vehicle_local_position or ",
         ),
-        (["echo", "--field", "xy_vallid"], "--field: unknown field 'xy_vallid': did you mean xy_valid"),
-        (["echo", "--field", "qqq"], "unknown field 'qqq': 'nedbus schema VehicleLocalPosition' lists the fields"),
-        (["echo", "vehicle_attitude", "--field", "x"], "'nedbus schema VehicleAttitude' lists the fields"),
+        (
+            ["echo", "--field", "xy_vallid"],
+            "--field: unknown field 'xy_vallid': did you mean xy_valid",
+        ),
+        (
+            ["echo", "--field", "qqq"],
+            "unknown field 'qqq': 'nedbus schema VehicleLocalPosition' lists the fields",
+        ),
+        (
+            ["echo", "vehicle_attitude", "--field", "x"],
+            "'nedbus schema VehicleAttitude' lists the fields",
+        ),
         (["echo", "vehicle_attitude", "--field", "q[1]"], "unknown field 'q[1]': did you mean q?"),
-        (["echo", "VehicleAttitude"], "expected one of vehicle_attitude, vehicle_attitude_groundtruth"),
+        (
+            ["echo", "VehicleAttitude"],
+            "expected one of vehicle_attitude, vehicle_attitude_groundtruth",
+        ),
         (["get", "--topic", "sensor_gps/0"], "expected sensor_gps with instance 0"),
-        (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude (looks like a mis"),
-        (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink has none of these topics"),
+        (
+            ["serve", "-s", "sim:?topics=vehicle_attitud"],
+            "expected vehicle_attitude (looks like a mis",
+        ),
+        (
+            ["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"],
+            "MAVLink has none of these topics",
+        ),
         (["schema", "vehicle_attitud"], "did you mean vehicle_attitude or VehicleAttitude?"),
         (["echo", f"/px4_1/fmu/out/{VLP}"], f"expected {VLP}, without the ROS 2 prefix"),
-        (["echo", f"/fmu/out/{VLP}"], f"topic 'fmu/out/{VLP}' is not valid: expected {VLP}, without the ROS 2 prefix"),
-        (["echo", "vehicle_attitude", "-t", VLP], "--topic: the argument already names the topic 'vehicle_attitude'"),
+        (
+            ["echo", f"/fmu/out/{VLP}"],
+            f"topic 'fmu/out/{VLP}' is not valid: expected {VLP}, without the ROS 2 prefix",
+        ),
+        (
+            ["echo", "vehicle_attitude", "-t", VLP],
+            "--topic: the argument already names the topic 'vehicle_attitude'",
+        ),
         (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),
         (["echo", "--once", "-n", "3"], "--count: cannot be combined with --once"),
         (["get", "--field", "xx"], "--field: unknown field 'xx'"),
         (["list", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["get", "-t", VLP, "-i", "0"], "instance 0 is not valid: expected none"),
         (["list", "--connect", "nonsense"], "connect: 'nonsense' is not an endpoint"),
-        (["echo", "--wait", "--connect", "tcp/127.0.0.1:1", "--max-rate", "nan"], "max_rate nan is not valid"),
+        (
+            ["echo", "--wait", "--connect", "tcp/127.0.0.1:1", "--max-rate", "nan"],
+            "max_rate nan is not valid",
+        ),
     ],
 )
 def test_invalid_option_exits_with_2(endpoint: str, arguments: list[str], text: str) -> None:
@@ -272,7 +341,11 @@ def test_invalid_option_exits_with_2(endpoint: str, arguments: list[str], text: 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["web", "--listen", "127.0.0.1:0"], ["export", "--listen", "127.0.0.1:0"], ["foxglove", "--port", "0"]],
+    [
+        ["web", "--listen", "127.0.0.1:0"],
+        ["export", "--listen", "127.0.0.1:0"],
+        ["foxglove", "--port", "0"],
+    ],
     ids=" ".join,
 )
 def test_http_option_is_identical_in_all_commands(endpoint: str, arguments: list[str]) -> None:
@@ -294,10 +367,14 @@ def test_version_and_help_are_printed(run_nedbus: Start) -> None:
 
 
 @pytest.mark.process
-def test_full_disk_is_a_one_line_error(endpoint: str, bus: nedbus.Bus, fork_server: ForkServer) -> None:
+def test_full_disk_is_a_one_line_error(
+    endpoint: str, bus: nedbus.Bus, fork_server: ForkServer
+) -> None:
     """A failed write to stdout is a one-line error, not a traceback."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
     with Path("/dev/full").open("wb") as full, Path("err").open("wb") as err:
-        ended = fork_command(fork_server, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
+        ended = fork_command(
+            fork_server, "get", "-c", endpoint, out=full.fileno(), err=err.fileno()
+        )
     assert ended.wait(DEADLINE) == 1
     assert Path("err").read_text() == "nedbus: cannot write to stdout: no space left on device\n"

@@ -23,7 +23,10 @@ def test_suggested_commands_use_an_endpoint_without_tls() -> None:
 
 def wait_for_message(endpoint: str) -> None:
     """Wait until a message is published at this endpoint."""
-    wait_for(lambda: run_command("get", "--wait", "-c", endpoint).exit_code == 0, what=f"a message at {endpoint}")
+    wait_for(
+        lambda: run_command("get", "--wait", "-c", endpoint).exit_code == 0,
+        what=f"a message at {endpoint}",
+    )
 
 
 def test_suggested_commands_for_wildcard_address_use_loopback(run_nedbus: Start) -> None:

@@ -17,7 +17,14 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.cli.output.logs import BURST, PER_MINUTE, JournalFormatter, JsonFormatter, RateLimit, TextFormatter
+from nedbus.cli.output.logs import (
+    BURST,
+    PER_MINUTE,
+    JournalFormatter,
+    JsonFormatter,
+    RateLimit,
+    TextFormatter,
+)
 from nedbus.client import SourceStatus
 from nedbus.log_event import EVENTS, about
 from nedbus.timings import Timings
@@ -38,9 +45,17 @@ EVIL = 'a\x1b[2J\n{"event": "forged"}\u2028'
 VEHICLES = 2 * BURST + 10
 
 
-def record(text: str = "%s is stale", *args: object, event: str | None = "stale", **more: object) -> logging.LogRecord:
+def record(
+    text: str = "%s is stale", *args: object, event: str | None = "stale", **more: object
+) -> logging.LogRecord:
     """Return a log record as a log call in a service creates it."""
-    warning = {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": args}
+    warning = {
+        "name": "nedbus.x",
+        "levelname": "WARNING",
+        "levelno": logging.WARNING,
+        "msg": text,
+        "args": args,
+    }
     return logging.makeLogRecord(warning | (about(event) if event else {}) | more)
 
 
@@ -50,12 +65,21 @@ def log_calls(tree: ast.AST) -> Iterator[ast.Call]:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             logger, level = node.func.value, node.func.attr
             name = logger.id if isinstance(logger, ast.Name) else ""
-            if name == "_log" and level in {"info", "warning", "error", "exception", "critical", "log"}:
+            if name == "_log" and level in {
+                "info",
+                "warning",
+                "error",
+                "exception",
+                "critical",
+                "log",
+            }:
                 yield node
 
 
 def is_about(node: ast.expr | None) -> bool:
-    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "about"
+    return (
+        isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "about"
+    )
 
 
 def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
@@ -66,7 +90,9 @@ def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
     elif isinstance(node, ast.Name):
         for other in ast.walk(tree):
             targets = other.targets if isinstance(other, ast.Assign) else []
-            if isinstance(other, ast.Assign) and node.id in [getattr(target, "id", None) for target in targets]:
+            if isinstance(other, ast.Assign) and node.id in [
+                getattr(target, "id", None) for target in targets
+            ]:
                 yield from values_of(other.value, tree)
     else:
         yield node
@@ -74,11 +100,23 @@ def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
 
 def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
     """Return the events that a log call may emit."""
-    extras = [value for each in call.keywords if each.arg == "extra" for value in values_of(each.value, tree)]
+    extras = [
+        value
+        for each in call.keywords
+        if each.arg == "extra"
+        for value in values_of(each.value, tree)
+    ]
     assert extras, f"line {call.lineno} has no event: extra=about(...)"
     assert all(is_about(each) for each in extras), f"line {call.lineno}: extra is not about(...)"
-    events = [value for each in extras if isinstance(each, ast.Call) for value in values_of(each.args[0], tree)]
-    return {str(each.value) if isinstance(each, ast.Constant) else ast.unparse(each) for each in events}
+    events = [
+        value
+        for each in extras
+        if isinstance(each, ast.Call)
+        for value in values_of(each.args[0], tree)
+    ]
+    return {
+        str(each.value) if isinstance(each, ast.Constant) else ast.unparse(each) for each in events
+    }
 
 
 def test_log_calls_use_exactly_the_documented_events() -> None:
@@ -107,7 +145,9 @@ def test_json_line_escapes_text_of_peers() -> None:
     """A line is one JSON object in printable ASCII, whatever a peer sent; only the event can be null."""
     address = Address("7", "estimator_local_position", 2)
     extra = about("rejected", address, source=EVIL, reason=EVIL * 1000)
-    line = JsonFormatter().format(record("%s: rejected", EVIL * 1000, about=extra["about"], created=1.5))
+    line = JsonFormatter().format(
+        record("%s: rejected", EVIL * 1000, about=extra["about"], created=1.5)
+    )
     assert line.isascii()
     assert line.isprintable()
     assert len(line) < 20_000
@@ -115,7 +155,11 @@ def test_json_line_escapes_text_of_peers() -> None:
     names = ["time", "level", "event", "message", "logger"]
     assert list(fields) == [*names, "vehicle", "topic", "instance", "source", "reason"]
     assert (fields["time"], fields["level"]) == ("1970-01-01T00:00:01.500Z", "warning")
-    assert (fields["vehicle"], fields["topic"], fields["instance"]) == ("7", "estimator_local_position", 2)
+    assert (fields["vehicle"], fields["topic"], fields["instance"]) == (
+        "7",
+        "estimator_local_position",
+        2,
+    )
     assert all(text.isprintable() for text in fields.values() if isinstance(text, str))
     fields = json.loads(JsonFormatter().format(record("plain", event=None)))
     assert list(fields) == names
@@ -138,7 +182,12 @@ def test_journal_lines_have_syslog_priorities() -> None:
     """Each line, including those of a traceback, has a syslog priority, from 3 for errors to 7 for debug."""
     formatter = JournalFormatter(TextFormatter("%(message)s"))
     assert formatter.format(record("%s\nforged", "x")) == "<4>x\\nforged"
-    for level, number in ((logging.DEBUG, 7), (logging.INFO, 6), (logging.ERROR, 3), (logging.CRITICAL, 3)):
+    for level, number in (
+        (logging.DEBUG, 7),
+        (logging.INFO, 6),
+        (logging.ERROR, 3),
+        (logging.CRITICAL, 3),
+    ):
         assert formatter.format(record("text", levelno=level)) == f"<{number}>text"
     try:
         raise ValueError("two\nlines")
@@ -155,7 +204,9 @@ def test_service_logs_json(start: Start) -> None:
     """
     sources = ("-s", REPLAY, "-s", "sim:?vehicle=2")
     soon = Timings(reports=(0.2,))
-    service = start_with_timings(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
+    service = start_with_timings(
+        start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json"
+    )
     for event in ("done", "progress"):  # the first report follows the suggested commands
         wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - called at once
     service.signal(signal.SIGTERM)
@@ -164,7 +215,10 @@ def test_service_logs_json(start: Start) -> None:
     events = [line["event"] for line in lines]
     assert set(events) <= EVENTS.keys() - {"notice"}
     assert (events[0], events.count("replay_opened"), events[-1]) == ("router", 2, "shutdown")
-    assert {line["source"] for line in lines if line["event"] == "replay_opened"} == {REPLAY, "sim:?vehicle=2"}
+    assert {line["source"] for line in lines if line["event"] == "replay_opened"} == {
+        REPLAY,
+        "sim:?vehicle=2",
+    }
 
 
 @pytest.mark.parametrize("level", ["info", "debug"])
@@ -180,10 +234,16 @@ def test_error_of_a_command_is_a_json_object(run_nedbus: Start, level: str) -> N
 
 def test_log_level_selects_lines(endpoint: str) -> None:
     """--log-level warning hides lines of normal operation; --debug overrides it; an unknown level is a usage error."""
-    quiet = run_command("--log-level", "warning", "serve", "-c", endpoint, "-s", REPLAY, "--until-done")
+    quiet = run_command(
+        "--log-level", "warning", "serve", "-c", endpoint, "-s", REPLAY, "--until-done"
+    )
     assert (quiet.exit_code, quiet.err) == (0, "")
     loud = run_command("--log-level", "error", "--debug", "get", "-c", "tcp/127.0.0.1:1")
-    assert (loud.exit_code, "Traceback" in loud.err, "(tried for 1 s)" in loud.err) == (1, True, True)
+    assert (loud.exit_code, "Traceback" in loud.err, "(tried for 1 s)" in loud.err) == (
+        1,
+        True,
+        True,
+    )
     wrong = run_command("list", "-c", endpoint, NEDBUS_LOG_LEVEL="loud")
     assert wrong.exit_code == 2
     assert "NEDBUS_LOG_LEVEL" in wrong.err
@@ -277,7 +337,10 @@ def test_log_lines_of_other_packages_are_rate_limited() -> None:
     """Lines without an event are limited per text; beyond the maximum number of texts, all others share one limit."""
     limited = Limited()
     assert limited.flood(1000, event=None) == BURST
-    assert sum(limited.flood(1, f"text {number} %s", event=None) for number in range(5000)) <= 1000 + BURST
+    assert (
+        sum(limited.flood(1, f"text {number} %s", event=None) for number in range(5000))
+        <= 1000 + BURST
+    )
 
 
 def test_report_of_suppressed_lines_is_an_event() -> None:
@@ -289,7 +352,12 @@ def test_report_of_suppressed_lines_is_an_event() -> None:
     limit.report()
     (report,) = reports
     fields = json.loads(JsonFormatter().format(report))
-    assert (fields["event"], fields["of"], fields["count"], fields["level"]) == ("suppressed", "stale", 3, "warning")
+    assert (fields["event"], fields["of"], fields["count"], fields["level"]) == (
+        "suppressed",
+        "stale",
+        3,
+        "warning",
+    )
     assert fields["message"].isprintable()
 
 
@@ -309,7 +377,9 @@ def count_lines(text: str, elapsed: float) -> Counter[str]:
     return total
 
 
-def test_flood_of_invalid_payloads_is_rate_limited(run_nedbus: Start, endpoint: str, zenoh_session: Session) -> None:
+def test_flood_of_invalid_payloads_is_rate_limited(
+    run_nedbus: Start, endpoint: str, zenoh_session: Session
+) -> None:
     """A flood of invalid payloads with changing keys makes a subscriber log only a few lines and a count."""
     start = time.monotonic()
     echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, coverage=False)
@@ -331,7 +401,9 @@ def test_log_of_flapping_vehicles_is_rate_limited(
     """A hundred vehicles that appear, reboot and fall silent make a service log only a few lines of each event."""
     began = time.monotonic()
     soon = Timings(stale=0.5)
-    service = start_with_timings(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
+    service = start_with_timings(
+        start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:"
+    )
     wait_for(lambda: '"listening"' in service.err, what="the source")
     fleet = [Px4(zenoh_session, namespace=f"wing{number}") for number in range(VEHICLES)]
 
@@ -344,8 +416,13 @@ def test_log_of_flapping_vehicles_is_rate_limited(
         px4.reboot()
         px4.put(1_000_000)
         px4.raw(b"garbage")
-    wait_for(lambda: max((each.reboots for each in sources()), default=0) == VEHICLES, what="the reboots")
-    wait_for(lambda: len({stale for each in sources() for stale in each.stale}) == VEHICLES, what="the silence")
+    wait_for(
+        lambda: max((each.reboots for each in sources()), default=0) == VEHICLES, what="the reboots"
+    )
+    wait_for(
+        lambda: len({stale for each in sources() for stale in each.stale}) == VEHICLES,
+        what="the silence",
+    )
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
     total = count_lines(service.err, time.monotonic() - began)

@@ -54,8 +54,24 @@ def test_text_of_a_peer_is_one_short_printable_line() -> None:
 HEAD = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
 OPTIONAL = ("JITTER", "MAX", "LATENCY", "LOST")
 ROWS = [
-    ("1/vehicle_local_position_groundtruth", "100.0", "12.3 ms", "999 ms", "119.9 s", "12345", "ok"),
-    ("1/vehicle_local_position", "-", "-", "-", "-", "0", "stale: nothing for 4.2 s, xy z invalid, dead reckoning"),
+    (
+        "1/vehicle_local_position_groundtruth",
+        "100.0",
+        "12.3 ms",
+        "999 ms",
+        "119.9 s",
+        "12345",
+        "ok",
+    ),
+    (
+        "1/vehicle_local_position",
+        "-",
+        "-",
+        "-",
+        "-",
+        "0",
+        "stale: nothing for 4.2 s, xy z invalid, dead reckoning",
+    ),
 ]
 
 
@@ -86,11 +102,22 @@ def test_table_is_complete_without_a_terminal() -> None:
 
 
 def sample(address: nedbus.Address) -> nedbus.Sample:
-    position = {"x": -1234.5678, "y": 2.0, "z": -3.0, "vx": -1.0, "heading": 1.5, "eph": 0.5, "xy_valid": True}
+    position = {
+        "x": -1234.5678,
+        "y": 2.0,
+        "z": -3.0,
+        "vx": -1.0,
+        "heading": 1.5,
+        "eph": 0.5,
+        "xy_valid": True,
+    }
     return nedbus.Sample(message(99_999_123_456, **position), address, 0, lost=3)
 
 
-ALL_TOPICS = [nedbus.Address("1", name, 0 if topic.instances else None) for name, topic in DEFAULT.topics.items()]
+ALL_TOPICS = [
+    nedbus.Address("1", name, 0 if topic.instances else None)
+    for name, topic in DEFAULT.topics.items()
+]
 
 
 @pytest.fixture
@@ -125,7 +152,9 @@ def test_header_is_aligned_with_its_columns(lines: Callable[[int], Lines]) -> No
     """The header is repeated once per screenful and when the columns change, and every state is below STATE."""
     to_line, with_header, state = lines(150), [], 0
     for number in range(80):
-        *head, line = to_line(sample(nedbus.Address("1" if number < 40 else "wing", VLP))).splitlines()
+        *head, line = to_line(
+            sample(nedbus.Address("1" if number < 40 else "wing", VLP))
+        ).splitlines()
         if head:
             with_header.append(number)
             state = head[0].index("STATE")
@@ -142,7 +171,9 @@ class Terminal:
         self._main, terminal = pty.openpty()
         self._bytes = bytearray()
         environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
-        self.popen = fork_command(fork_server, *arguments, out=terminal, err=terminal, **environment)
+        self.popen = fork_command(
+            fork_server, *arguments, out=terminal, err=terminal, **environment
+        )
         os.close(terminal)
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -198,7 +229,11 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
     """At 80 columns a message is one line below a header, with complete addresses in one column."""
     with publishing(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
         assert terminal.wait() == 0
-    shown = [line for line in terminal.output.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
+    shown = [
+        line
+        for line in terminal.output.splitlines()
+        if line.startswith("VEHICLE/TOPIC  ") or VLP in line
+    ]
     assert len([line for line in shown if VLP in line]) == 40
     assert max(map(len, shown)) <= 80
     state = -1
@@ -210,11 +245,15 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
 
 
 @pytest.mark.process
-def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_session: Session) -> None:
+def test_info_lists_gone_streams(
+    on_terminal: OnTerminal, endpoint: str, zenoh_session: Session
+) -> None:
     """The table shows the number of gone streams; their addresses are listed below it, unsplit on a terminal."""
     gone = [f"wing-1/vehicle_local_position_{number}" for number in range(5)]
     sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
-    service = answer(zenoh_session, "nedbus/@service/wing-1/s/status", {"service": "s", "sources": sources})
+    service = answer(
+        zenoh_session, "nedbus/@service/wing-1/s/status", {"service": "s", "sources": sources}
+    )
     info = run_until_shown("5 gone", "info", "-c", endpoint)
     assert info.exit_code == 0, info.err
     assert "  5 gone\n" in info.out
@@ -248,7 +287,9 @@ def test_hz_redraws_in_place(
     assert "Traceback" not in terminal.output
 
 
-@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+@pytest.mark.parametrize(
+    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+)
 def test_signal_during_table_setup_restores_the_cursor(
     monkeypatch: pytest.MonkeyPatch, number: signal.Signals, raised: type[BaseException]
 ) -> None:
@@ -285,7 +326,9 @@ def test_lost_link_is_reported(run_nedbus: Start, command: str) -> None:
     router.close()
     wait_for(lambda: f"the link to {where} is lost: reconnecting" in follower.err, what="the break")
     if command == "hz":
-        wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
+        wait_for(
+            lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state"
+        )
     with closing(open_router(listen=(where,))):
         wait_for(lambda: f"the link to {where} is up again" in follower.err, what="the link")
         lines = follower.out.count("\n")
@@ -296,7 +339,9 @@ def states(lines: str) -> list[str]:
     return [json.loads(line)["state"] for line in lines.splitlines() if line.endswith("}")]
 
 
-def test_streams_of_killed_service_are_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_streams_of_killed_service_are_gone(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """After a service was killed, `hz` reports its stream once as "gone"."""
     service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="data")
@@ -315,18 +360,27 @@ def test_streams_of_killed_service_are_gone(run_nedbus: Start, endpoint: str, bu
     assert states(hz.out).count("gone") == 1
 
 
-def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, timings: Timings) -> None:
+def test_ended_replay_is_stale(
+    start: Start, run_nedbus: Start, endpoint: str, timings: Timings
+) -> None:
     """The streams of an ended replay in a running service are stale in `list`, `info` and `hz`."""
-    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
+    run_nedbus(
+        "serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition"
+    )
     hz = start_with_timings(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
     timings.stale = 0.5
 
     def listed() -> list[str]:
-        return [line.split()[3] for line in run_command("list", "-c", endpoint).out.splitlines()[1:]]
+        return [
+            line.split()[3] for line in run_command("list", "-c", endpoint).out.splitlines()[1:]
+        ]
 
     wait_for(lambda: listed() == ["stale:"] * 5, what="the streams in `list`")
-    wait_for(lambda: run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5, what="them in `info`")
+    wait_for(
+        lambda: run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5,
+        what="them in `info`",
+    )
 
 
 def answer(zenoh_session: Session, key: str, status: object) -> object:
@@ -336,12 +390,34 @@ def answer(zenoh_session: Session, key: str, status: object) -> object:
 
 def test_malicious_status_is_escaped(endpoint: str, zenoh_session: Session) -> None:
     """Escape sequences, forged lines and long texts of a service are escaped and truncated, or omitted."""
-    flood = [{"source": EVIL * 1000, "state": "retrying", "error": EVIL * 1000, "published": [EVIL] * 1000}]
+    flood = [
+        {
+            "source": EVIL * 1000,
+            "state": "retrying",
+            "error": EVIL * 1000,
+            "published": [EVIL] * 1000,
+        }
+    ]
     stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
-    source = {**flood[0], "stale": [EVIL], "streams": [stream, None, {"address": 1}], "addresses": EVIL}
-    status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
+    source = {
+        **flood[0],
+        "stale": [EVIL],
+        "streams": [stream, None, {"address": 1}],
+        "addresses": EVIL,
+    }
+    status = {
+        "service": EVIL,
+        "host": EVIL,
+        "version": EVIL,
+        "role": EVIL,
+        "sources": [source, "\x1b[2J", None],
+    }
     hostile = answer(zenoh_session, "nedbus/@service/1/hostile/status", status)
-    for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
+    for arguments in (
+        ["info"],
+        ["health", "--services", "1"],
+        ["health", "--services", "1", "--json"],
+    ):
         result = run_command(*arguments, "-c", endpoint)
         assert result.exit_code == (arguments[0] == "health"), result.err
         assert not has_control(result.out + result.err)
@@ -362,7 +438,11 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
         zenoh_session.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
 
     with repeating(put):
-        for arguments, exit_code in ((["list"], 0), (["echo", "*", "-d", "0.5"], 1), (["hz", "-d", "0.5"], 1)):
+        for arguments, exit_code in (
+            (["list"], 0),
+            (["echo", "*", "-d", "0.5"], 1),
+            (["hz", "-d", "0.5"], 1),
+        ):
             result = run_command(*arguments, "-c", endpoint)
             assert result.exit_code == exit_code, result.err
             assert not has_control(result.out + result.err)
@@ -374,7 +454,8 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
 def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
     """For 100 vehicles `hz` prints 50 rows per second, and the number of omitted vehicles."""
     with publishing(bus, *(f"flood-{number}" for number in range(100))):
-        hz = run_command("hz", "-c", endpoint, "-n", "1000")  # by then each vehicle has sent a message
+        # by then each vehicle has sent a message
+        hz = run_command("hz", "-c", endpoint, "-n", "1000")
     assert hz.exit_code == 0
     assert "\n50 more\n" in hz.out
     assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
@@ -387,24 +468,38 @@ CLOSING = {
 CLOSED = "nedbus: cannot write to stdout: standard output is closed\n"
 
 
-@pytest.mark.parametrize("shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"])
+@pytest.mark.parametrize(
+    "shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"]
+)
 @pytest.mark.parametrize(
     ("limit", "command", "expected"),  # exit code, number of lines on stdout, stderr
     [
-        *(("exec >&-", command, (1, 0, CLOSED)) for command in ("list", "schema", "get", "--version", "pki ca .")),
+        *(
+            ("exec >&-", command, (1, 0, CLOSED))
+            for command in ("list", "schema", "get", "--version", "pki ca .")
+        ),
         ("exec 2>&-", "list", (0, 2, "")),
         ("exec 2>&-", "get -v 9", (1, 0, "")),
     ],
 )
 def test_closed_stdout_is_a_one_line_error(
-    start: Start, endpoint: str, bus: nedbus.Bus, *, limit: str, command: str, expected: object, shell: bool
+    start: Start,
+    endpoint: str,
+    bus: nedbus.Bus,
+    *,
+    limit: str,
+    command: str,
+    expected: object,
+    shell: bool,
 ) -> None:
     """`nedbus list >&-` fails with a one-line error; a closed stderr is ignored."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
     script = f"import os, sys\n{CLOSING[limit]}\nfrom nedbus.cli import main\nmain()"
     if shell:
         line = f"{limit}; NEDBUS_CONNECT={endpoint} exec {sys.executable} -m nedbus {command}"
-        ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
+        ended = subprocess.run(
+            ["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True
+        )
         result = ended.returncode, len(ended.stdout.splitlines()), ended.stderr
     else:
         process = start("-c", script, *command.split(), NEDBUS_CONNECT=endpoint)
@@ -412,11 +507,18 @@ def test_closed_stdout_is_a_one_line_error(
     assert result == expected
 
 
-IN_BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")  # a script's `&` starts a job with SIGINT ignored
-MOMENTS = [pytest.param("echo", imports, (), id=f"echo-{imports}") for imports in (1, 50, 150, 300, 10_000)]
-MOMENTS += [pytest.param("echo", imports, IN_BACKGROUND, id=f"background-{imports}") for imports in (1, 10_000)]
+# a script's `&` starts a job with SIGINT ignored
+IN_BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
+MOMENTS = [
+    pytest.param("echo", imports, (), id=f"echo-{imports}") for imports in (1, 50, 150, 300, 10_000)
+]
 MOMENTS += [
-    pytest.param(each, 10_000, (), marks=pytest.mark.slow) for each in ("hz", "list", "serve -s sim:", "router")
+    pytest.param("echo", imports, IN_BACKGROUND, id=f"background-{imports}")
+    for imports in (1, 10_000)
+]
+MOMENTS += [
+    pytest.param(each, 10_000, (), marks=pytest.mark.slow)
+    for each in ("hz", "list", "serve -s sim:", "router")
 ]
 
 
@@ -431,10 +533,15 @@ def test_interrupt_during_imports_prints_no_traceback(
 
     This includes a background job of a shell script, which inherits SIGINT as ignored.
     """
-    environment = without_coverage() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
+    environment = without_coverage() | {
+        "NEDBUS_CONNECT": endpoint,
+        "NEDBUS_LISTEN": free_endpoint(),
+    }
     arguments = [*prefix, sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
-    with subprocess.Popen(arguments, stdout=null, stderr=pipe, text=True, env=environment) as process:
+    with subprocess.Popen(
+        arguments, stdout=null, stderr=pipe, text=True, env=environment
+    ) as process:
         assert process.stderr is not None
         started, seen = False, 0
         for line in process.stderr:  # interrupt at a line of the import log, not at a time
@@ -571,12 +678,15 @@ def test_hangup_stops_a_router(run_nedbus: Start) -> None:
 
 
 ON_TERMINAL = (
-    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+    "import fcntl, os, sys, termios; "
+    "fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
 )
 
 
 @contextmanager
-def on_controlling_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+def on_controlling_terminal(
+    log: Path, *command: str
+) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
     """Run `nedbus` as the session leader of a terminal; yield the process and the other side of the terminal."""
     main, terminal = pty.openpty()
     python = (sys.executable, "-c", ON_TERMINAL, sys.executable, "-m", "nedbus", *command)
@@ -589,14 +699,23 @@ def on_controlling_terminal(log: Path, *command: str) -> Iterator[tuple[subproce
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("command", ["serve -s sim:", "record -o flight.mcap", "web --http 127.0.0.1:PORT"])
-def test_closed_terminal_stops_commands(bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize(
+    "command", ["serve -s sim:", "record -o flight.mcap", "web --http 127.0.0.1:PORT"]
+)
+def test_closed_terminal_stops_commands(
+    bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str
+) -> None:
     """Closing the terminal stops a service, a recording and a web page, as Ctrl-C does."""
     log, arguments = tmp_path / "log", command.replace("PORT", str(free_port())).split()
-    with publishing(bus, "9"), on_controlling_terminal(log, *arguments, "-c", endpoint) as (process, main):
+    with (
+        publishing(bus, "9"),
+        on_controlling_terminal(log, *arguments, "-c", endpoint) as (process, main),
+    ):
         begun = {
             "serve": lambda: "1" in bus.vehicles(),
-            "record": lambda: Path("flight.mcap").exists() and Path("flight.mcap").stat().st_size > 1000,
+            "record": lambda: (
+                Path("flight.mcap").exists() and Path("flight.mcap").stat().st_size > 1000
+            ),
             "web": lambda: "open http" in log.read_text(),
         }
         wait_for(begun[arguments[0]], what="the command")
@@ -612,7 +731,10 @@ def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> No
     with on_controlling_terminal(log, "serve", "-s", "sim:", "-c", endpoint) as (process, main):
         wait_for(lambda: "sim:" in log.read_text(), what="the source")
         process.send_signal(signal.SIGHUP)
-        wait_for(lambda: "settings reloaded: 0 started, 0 stopped, 1 unchanged" in log.read_text(), what="the reload")
+        wait_for(
+            lambda: "settings reloaded: 0 started, 0 stopped, 1 unchanged" in log.read_text(),
+            what="the reload",
+        )
         process.terminate()
         assert process.wait(DEADLINE) == 0
         os.close(main)
@@ -634,7 +756,9 @@ def test_kill_of_make_run_ends_the_service(tmp_path: Path) -> None:
     """`make run & kill $!` ends the service, too, which frees its port."""
     command, log = _make_run(tmp_path), tmp_path / "log"
     with log.open("w") as written:
-        make = subprocess.Popen(command, stdout=written, stderr=written, env=without_coverage(), start_new_session=True)
+        make = subprocess.Popen(
+            command, stdout=written, stderr=written, env=without_coverage(), start_new_session=True
+        )
     try:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
         make.terminate()
@@ -665,7 +789,9 @@ def test_make_run_twice_explains_the_address_conflict(tmp_path: Path) -> None:
         )
     try:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
-        second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)
+        second = subprocess.run(
+            command, capture_output=True, check=False, text=True, timeout=DEADLINE
+        )
         assert second.returncode == 2
         assert "(address already in use): choose another address with --http\n" in second.stderr
         assert 'make run ARGS="' in second.stderr

@@ -49,7 +49,11 @@ def make(address: Address, number: int) -> Message:
         "delta_q_reset": (1, 0, math.nan, -0.0),
     }
     if address == FLAGS:
-        fields = {"control_status_changes": 2**32 - number - 1, "cs_in_air": number % 2 == 0, "fs_bad_hdg": True}
+        fields = {
+            "control_status_changes": 2**32 - number - 1,
+            "cs_in_air": number % 2 == 0,
+            "fs_bad_hdg": True,
+        }
     made: Message = definition_of(address).model.model_validate({"timestamp": number, **fields})
     return made
 
@@ -59,7 +63,9 @@ def array_of(address: Address, numbers: range) -> MessageArray:
 
 
 def publisher_of(bus: nedbus.Bus, address: Address, **options: Any) -> nedbus.Publisher:
-    return bus.publisher(address.topic, vehicle=address.vehicle, instance=address.instance, **options)
+    return bus.publisher(
+        address.topic, vehicle=address.vehicle, instance=address.instance, **options
+    )
 
 
 @pytest.fixture
@@ -95,7 +101,9 @@ def test_publishing_an_invalid_message_raises(bus: nedbus.Bus, address: Address)
     wrong = {"q": (1.0, 0.0, 0.0)} if address == ATTITUDE else {"cs_in_air": 1}
     with pytest.raises(nedbus.InvalidMessageError, match=next(iter(wrong))):
         publisher.publish({"timestamp": 1, **wrong})
-    with pytest.raises(TypeError, match=f"carries {definition_of(address).name}: .*, not VehicleLocalPosition"):
+    with pytest.raises(
+        TypeError, match=f"carries {definition_of(address).name}: .*, not VehicleLocalPosition"
+    ):
         publisher.publish(message(1))
     assert publisher.published == 0
 
@@ -122,7 +130,9 @@ def test_rows_and_batches_are_complete(
     assert subscription.counts == Counts(received=2 * len(sent))
 
 
-def test_batch_has_one_message_type(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
+def test_batch_has_one_message_type(
+    subscription: nedbus.Subscription[Any], bus: nedbus.Bus
+) -> None:
     """Messages of several types are read in batches; each batch has one type, and may have several addresses."""
     addresses = [ATTITUDE, FLAGS, Address("7", VLP), Address("8", "vehicle_attitude")]
     publishers = {address: publisher_of(bus, address) for address in addresses}
@@ -143,7 +153,9 @@ def test_batch_has_one_message_type(subscription: nedbus.Subscription[Any], bus:
 
 
 @BOTH
-def test_max_rate_downsamples(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
+def test_max_rate_downsamples(
+    client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address
+) -> None:
     """With `max_rate=10`, one second of a 100 Hz stream yields ten messages, evenly spaced and unchanged."""
     publisher = publisher_of(bus, address)
     publisher.publish(make(address, 0))
@@ -186,21 +198,28 @@ def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
         assert got.out.splitlines()[1:] == [
             "  q: 0.995004177 0 0 0.099833414", "  delta_q_reset: 1 0 nan -0", "---"
         ]  # fmt: skip
-        lines = run_command("echo", "-c", endpoint, str(ATTITUDE), "--csv", "--once").out.splitlines()
+        lines = run_command(
+            "echo", "-c", endpoint, str(ATTITUDE), "--csv", "--once"
+        ).out.splitlines()
         (row,) = csv.DictReader(lines)
         assert row["q[0]"] == "0.995004177"
         assert row["delta_q_reset[2]"] == "nan"
-        shown = json.loads(run_command("echo", "-c", endpoint, ATTITUDE.topic, "--json", "--once").out)
+        shown = json.loads(
+            run_command("echo", "-c", endpoint, ATTITUDE.topic, "--json", "--once").out
+        )
         assert shown["message"]["delta_q_reset"] == [1.0, 0.0, "NaN", 0.0]
         assert shown["missing"] == ["quat_reset_counter", "timestamp_sample"]
         assert str(ATTITUDE) in run_command("list", "-c", endpoint).out
         assert json.loads(run_command("schema", ATTITUDE.topic).out)["title"] == "VehicleAttitude"
 
 
-def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bus: nedbus.Bus) -> None:
+def test_schema_of_unknown_topic_is_queried_from_its_publisher(
+    endpoint: str, bus: nedbus.Bus
+) -> None:
     """`nedbus schema` queries a definition that is not built in, by topic or message; others are usage errors."""
     definition = define(
-        "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
+        "WheelEncoders",
+        [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))],
     )
     with bus._publishers.publisher(Address("7", "wheel_encoders"), definition) as publisher:
         publisher.publish({"timestamp": 1})
@@ -212,7 +231,10 @@ def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bu
     for wrong in ("wheel_encoders_b", "WheelEncoders", "*"):
         ended = run_command("schema", wrong, "-c", endpoint)
         assert (ended.exit_code, ended.out) == (2, "")
-        assert "and no such message or topic is published: known messages are VehicleLocalPosition, " in ended.err
+        assert (
+            "and no such message or topic is published: known messages are VehicleLocalPosition, "
+            in ended.err
+        )
 
 
 def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
@@ -222,13 +244,22 @@ def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
     """
     text = "uint64 timestamp\nfloat32 range # [m] [@range 0, 100]\nuint8 beacon\n"
     definition = nedbus.define_msg("RangeBeacon", text)
-    with nedbus.connect(endpoint) as reader, reader.subscribe("range_beacon", vehicle="mine") as subscription:
+    with (
+        nedbus.connect(endpoint) as reader,
+        reader.subscribe("range_beacon", vehicle="mine") as subscription,
+    ):
         publisher = client.publisher("range_beacon", vehicle="mine", definition=definition)
         publisher.publish({"timestamp": 5, "range": 2.5, "beacon": 3})
-        assert dict(subscription.receive(DEADLINE).message) == {"timestamp": 5, "range": 2.5, "beacon": 3}
+        assert dict(subscription.receive(DEADLINE).message) == {
+            "timestamp": 5,
+            "range": 2.5,
+            "beacon": 3,
+        }
         with pytest.raises(nedbus.InvalidMessageError, match="range"):
             publisher.publish({"timestamp": 6, "range": 200.0, "beacon": 3})
-    with pytest.raises(nedbus.AddressError, match=r"expected a definition from nedbus\.define_msg, or one of "):
+    with pytest.raises(
+        nedbus.AddressError, match=r"expected a definition from nedbus\.define_msg, or one of "
+    ):
         client.publisher("other_beacon", vehicle="mine")
 
 
@@ -236,7 +267,9 @@ def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
 def test_class_selects_its_topic(client: nedbus.Bus, bus: nedbus.Bus, topic: str | None) -> None:
     """For `subscribe` and `latest`, a class selects its first topic, unless `topic` names another of its topics."""
     chosen, options = topic or ATTITUDE.topic, dict[str, Any](topic=topic) if topic else {}
-    for number, each in enumerate(["vehicle_attitude", "vehicle_attitude_groundtruth", "estimator_attitude"]):
+    for number, each in enumerate(
+        ["vehicle_attitude", "vehicle_attitude_groundtruth", "estimator_attitude"]
+    ):
         instance = 0 if each == "estimator_attitude" else None
         bus.publisher(each, vehicle="7", instance=instance).publish(make(ATTITUDE, number))
     wait_for(lambda: client.latest("*") and len(client.latest("*")) == 3, what="the messages")
@@ -249,10 +282,14 @@ def test_class_without_the_topic_raises(client: nedbus.Bus) -> None:
     """A topic of another message, or a class without topics, raises an error with the valid choices."""
     undeclared = nedbus.define_msg("RangeBeacon", "uint64 timestamp\n").model
     for call in (client.subscribe, client.latest):
-        with pytest.raises(nedbus.AddressError, match="expected one of VehicleAttitude: vehicle_attitude, "):
+        with pytest.raises(
+            nedbus.AddressError, match="expected one of VehicleAttitude: vehicle_attitude, "
+        ):
             call(nedbus.VehicleAttitude, topic=VLP)
         for without in (undeclared, Message):
-            with pytest.raises(nedbus.AddressError, match=f"'{without.__name__}' .* TOPICS, or the name of a topic"):
+            with pytest.raises(
+                nedbus.AddressError, match=f"'{without.__name__}' .* TOPICS, or the name of a topic"
+            ):
                 call(without)
 
 
@@ -282,7 +319,10 @@ def test_custom_class_is_received(start: Start, endpoint: str, bus: nedbus.Bus) 
     process = start("-c", CUSTOM_CLASS, endpoint)
     wait_for(lambda: process.out.count("\n") == 2 or process.err, what="the script")
     assert process.out == 2 * "WheelSpeeds(timestamp=1, speed=(2.0, 3.0))\n", process.err
-    assert dict(bus.subscribe("wheel_speeds").receive(DEADLINE).message) == {"timestamp": 1, "speed": (2.0, 3.0)}
+    assert dict(bus.subscribe("wheel_speeds").receive(DEADLINE).message) == {
+        "timestamp": 1,
+        "speed": (2.0, 3.0),
+    }
 
 
 def test_echo_line_has_losses_before_fields() -> None:
@@ -290,7 +330,8 @@ def test_echo_line_has_losses_before_fields() -> None:
     sample = nedbus.Sample(make(FLAGS, 2), FLAGS, received=1, lost=3)
     numbers = "[3 lost]  control_status_changes 4294967293"
     assert re.fullmatch(
-        rf"{re.escape(numbers)}  cs_in_air  fs_bad_hdg  \(\d\d flags False\)", to_line(sample).split(" s  ")[1]
+        rf"{re.escape(numbers)}  cs_in_air  fs_bad_hdg  \(\d\d flags False\)",
+        to_line(sample).split(" s  ")[1],
     )
 
 
@@ -300,7 +341,9 @@ def test_payload_of_another_message_is_invalid(bus: nedbus.Bus) -> None:
         session = bus._session
         session.put(ATTITUDE.key(), encode(message(1)))
         session.put(
-            ATTITUDE.key(), encode(make(ATTITUDE, 2)), encoding=f"application/msgpack;{definition_of(ATTITUDE).name}"
+            ATTITUDE.key(),
+            encode(make(ATTITUDE, 2)),
+            encoding=f"application/msgpack;{definition_of(ATTITUDE).name}",
         )
         assert subscription.receive(DEADLINE).message == make(ATTITUDE, 2)
         assert subscription.counts.invalid == 1

@@ -24,7 +24,16 @@ from nedbus import Counts
 from nedbus.cli.recorder import Recorder
 from nedbus.flights.writer import RecordingWriter
 from nedbus.transport import Session, open_router, query
-from nedbus_msgs import Address, Definition, Provenance, codec_of, define, encoding_of, field_type, short_hash
+from nedbus_msgs import (
+    Address,
+    Definition,
+    Provenance,
+    codec_of,
+    define,
+    encoding_of,
+    field_type,
+    short_hash,
+)
 from tests.flights.ulogs import UlogWriter
 from tests.nedbus.client.numbered import wait_for_subscriber
 from tests.peers.command_line import run_command
@@ -47,7 +56,10 @@ Sent = tuple[str, dict[str, object]]
 
 
 def definition_of(firmware: str) -> Definition[Any]:
-    types = [(name, field_type("uint64" if name == "timestamp" else "float32")) for name in FIELDS[firmware]]
+    types = [
+        (name, field_type("uint64" if name == "timestamp" else "float32"))
+        for name in FIELDS[firmware]
+    ]
     return define(NAME, types)
 
 
@@ -56,7 +68,9 @@ def fields_of(firmware: str, timestamp: int) -> dict[str, object]:
 
 
 def publisher_of(bus: nedbus.Bus, firmware: str, vehicle: str | None = None) -> nedbus.Publisher:
-    return bus._publishers.publisher(Address(vehicle or firmware, TOPIC), definition_of(firmware), owner=bus)
+    return bus._publishers.publisher(
+        Address(vehicle or firmware, TOPIC), definition_of(firmware), owner=bus
+    )
 
 
 def as_dict(message: Any) -> dict[str, object]:
@@ -86,9 +100,12 @@ class Reader:
                 batch = self.subscription.receive_batch(DEADLINE)
                 names = batch.messages.dtype.names or ()
                 for index, row in zip(batch.address_index, batch.messages.tolist(), strict=True):
-                    self.read.append((batch.addresses[index].vehicle, dict(zip(names, row, strict=True))))
+                    self.read.append(
+                        (batch.addresses[index].vehicle, dict(zip(names, row, strict=True)))
+                    )
                 continue
-            pop = partial(self.subscription._inbox.pop, rows=self.form == "rows")  # `rows()` has no timeout
+            # `rows()` has no timeout
+            pop = partial(self.subscription._inbox.pop, rows=self.form == "rows")
             sample = self.subscription._next(pop, DEADLINE)
             self.read.append((sample.vehicle, as_dict(sample.message)))
 
@@ -171,7 +188,9 @@ def run(router: str, steps: Steps) -> float:
             step(network, which)
         for reader in network.readers.values():
             for vehicle, fields in reader.read:
-                assert fields.keys() == (set(FIELDS[vehicle]) if vehicle in FIELDS else fields.keys())
+                assert fields.keys() == (
+                    set(FIELDS[vehicle]) if vehicle in FIELDS else fields.keys()
+                )
                 assert all(fields[name] == VALUES[name] for name in fields if name != "timestamp")
             counts = reader.subscription.counts
             # A message in transit during the query for last messages arrives twice, and is discarded once.
@@ -217,7 +236,10 @@ def test_definition_with_wrong_hash_is_ignored(client: nedbus.Bus, zenoh_session
     """A definition whose fields do not match the requested hash is not used, whatever hash the peer claims."""
     wrong, definition = definition_of("B"), definition_of("A")
     schema = f"nedbus/@schema/peer/{NAME}"
-    layout = {"wire": 0, "fields": [{"name": name, "type": str(kind)} for name, kind in wrong.types.items()]}
+    layout = {
+        "wire": 0,
+        "fields": [{"name": name, "type": str(kind)} for name, kind in wrong.types.items()],
+    }
     claim = {"layouts": [layout], "hash": short_hash(NAME, definition.types)}
     with (
         answer_queries(zenoh_session, schema, reply_with({schema: json.dumps(claim).encode()})),
@@ -235,7 +257,9 @@ def test_definition_with_wrong_hash_is_ignored(client: nedbus.Bus, zenoh_session
         wait_for(is_rejected, what="the message to be rejected")
 
 
-def test_unresponsive_publisher_does_not_delay_readers(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_unresponsive_publisher_does_not_delay_readers(
+    endpoint: str, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """A message is read as soon as one publisher of its vehicle replies, even if another does not."""
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))
@@ -249,27 +273,41 @@ def test_unresponsive_publisher_does_not_delay_readers(endpoint: str, bus: nedbu
         held.clear()
 
 
-def test_payload_that_contradicts_its_encoding_is_invalid(bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_payload_that_contradicts_its_encoding_is_invalid(
+    bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """A payload that does not fit the definition in its encoding is invalid."""
     publisher_of(bus, "A")
     with bus.subscribe(TOPIC, mode="every") as subscription:
         key, encoding = f"nedbus/1/{TOPIC}", encoding_of(definition_of("A"), None)
         wait_for_matching(zenoh_session, key)
-        for payload in (msgpack.packb([0, 1, 2.0]), msgpack.packb([7, 1, 2.0, 3.0]), msgpack.packb([0, 1, 2.0, 3.0])):
+        for payload in (
+            msgpack.packb([0, 1, 2.0]),
+            msgpack.packb([7, 1, 2.0, 3.0]),
+            msgpack.packb([0, 1, 2.0, 3.0]),
+        ):
             zenoh_session.put(key, payload, encoding=encoding)
-        assert as_dict(subscription.receive(DEADLINE).message) == {"timestamp": 1, "north": 2.0, "east": 3.0}
+        assert as_dict(subscription.receive(DEADLINE).message) == {
+            "timestamp": 1,
+            "north": 2.0,
+            "east": 3.0,
+        }
         assert subscription.counts.invalid == 2
 
 
 @pytest.mark.parametrize("distinct", [True, False])
-def test_recording_has_a_schema_per_firmware(bus: nedbus.Bus, tmp_path: Path, distinct: bool) -> None:
+def test_recording_has_a_schema_per_firmware(
+    bus: nedbus.Bus, tmp_path: Path, distinct: bool
+) -> None:
     """Each firmware build is recorded with its schema and read back with its fields, even if two share an address."""
     path, stop = tmp_path / "flight.mcap", threading.Event()
     recorder = Recorder(bus.subscribe(TOPIC, mode="every"), path)
     thread = threading.Thread(target=recorder.run, args=(stop,))
     thread.start()
     for number, firmware in enumerate("ABCAB", 1):
-        with publisher_of(bus, firmware, firmware if distinct or firmware == "C" else "1") as publisher:
+        with publisher_of(
+            bus, firmware, firmware if distinct or firmware == "C" else "1"
+        ) as publisher:
             wait_for_subscriber(publisher)
             publisher.publish(fields_of(firmware, number))
             wait_for(lambda number=number: recorder.messages == number, what="the message")  # type: ignore[misc]
@@ -288,20 +326,34 @@ def test_replay_uses_the_definition_of_each_message(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:
     """A recording of a vehicle that changed its firmware is replayed with the definition of each message."""
-    made = [(number, firmware, definition_of(firmware).model) for number, firmware in enumerate("AACB", 1)]
+    made = [
+        (number, firmware, definition_of(firmware).model)
+        for number, firmware in enumerate("AACB", 1)
+    ]
     with RecordingWriter(tmp_path / "flight.mcap") as writer:
         for number, firmware, model in made:
             message = model.model_validate(fields_of(firmware, number))
-            writer.write_messages([(message, Address("1", TOPIC), Provenance("ulog"), number * 1000)])
+            writer.write_messages(
+                [(message, Address("1", TOPIC), Provenance("ulog"), number * 1000)]
+            )
     with bus.subscribe(TOPIC, mode="every") as subscription:
-        run_nedbus("serve", "-c", endpoint, "--source", f"mcap:{tmp_path / 'flight.mcap'}?topics=*&speed=max&wait=1")
+        run_nedbus(
+            "serve",
+            "-c",
+            endpoint,
+            "--source",
+            f"mcap:{tmp_path / 'flight.mcap'}?topics=*&speed=max&wait=1",
+        )
         read = [as_dict(subscription.receive(DEADLINE).message) for _ in made]
     assert read == [fields_of(firmware, number) for number, firmware, _ in made]
 
 
 def write_log(path: Path, firmware: str, system_id: int) -> Path:
     log = UlogWriter(system_id=system_id)
-    log.put("F", f"{TOPIC}:uint64_t timestamp;{''.join(f'float {name};' for name in FIELDS[firmware][1:])}".encode())
+    log.put(
+        "F",
+        f"{TOPIC}:uint64_t timestamp;{''.join(f'float {name};' for name in FIELDS[firmware][1:])}".encode(),
+    )
     log.put("A", struct.pack("<BH", 0, 0) + TOPIC.encode())
     for number in range(1, 51):
         values = [VALUES[name] for name in FIELDS[firmware][1:]]
@@ -321,16 +373,22 @@ def test_service_with_several_firmware_builds_replies_with_each_definition(
     tmp_path: Path, run_nedbus: Start, start: Start, endpoint: str
 ) -> None:
     """If a service replays logs of several firmware builds, a new reader gets the fields of each log."""
-    logs = [write_log(tmp_path / f"{name}.ulg", name, number) for number, name in enumerate("ABC", 1)]
+    logs = [
+        write_log(tmp_path / f"{name}.ulg", name, number) for number, name in enumerate("ABC", 1)
+    ]
     sources = [each for log in logs for each in ("--source", f"ulog:{log}?topics=*")]
     run_nedbus("serve", "-c", endpoint, *sources)
     for number, name in ((2, "B"), (3, "C"), (1, "A")):
         reader = start("-c", READ_ONE, endpoint, str(number))
         assert reader.wait() == 0, reader.err
         shown = json.loads(reader.out)
-        assert {key: shown[key] for key in FIELDS[name][1:]} == {key: VALUES[key] for key in FIELDS[name][1:]}
+        assert {key: shown[key] for key in FIELDS[name][1:]} == {
+            key: VALUES[key] for key in FIELDS[name][1:]
+        }
         assert list(shown) == list(FIELDS[name])
         shown = json.loads(
-            run_command("echo", "-c", endpoint, TOPIC, "--vehicle", str(number), "-n", "1", "--json").out
+            run_command(
+                "echo", "-c", endpoint, TOPIC, "--vehicle", str(number), "-n", "1", "--json"
+            ).out
         )
         assert list(shown["message"]) == list(FIELDS[name])

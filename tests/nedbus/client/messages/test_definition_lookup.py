@@ -45,14 +45,18 @@ def test_message_with_queried_definition_is_read_completely(
                     strict=True,
                 )
                 continue
-            message: Any = next(iter(subscription) if form == "models" else subscription.rows()).message
+            message: Any = next(
+                iter(subscription) if form == "models" else subscription.rows()
+            ).message
             read.append((message.timestamp, message.wheel_speed))
         assert read == [(number + 1, (number, -number)) for number in range(COUNT)]
         assert subscription.counts == nedbus.Counts(received=COUNT)
     [last] = bus.latest("wheel_encoders")
     assert (last.source, last.missing) == ("ulog", frozenset())
     assert dict(last.message)["wheel_angle"] == (0.5, 0.5)
-    assert last.address in [address for addresses in bus.vehicles().values() for address in addresses]
+    assert last.address in [
+        address for addresses in bus.vehicles().values() for address in addresses
+    ]
 
 
 @pytest.mark.parametrize(
@@ -61,10 +65,30 @@ def test_message_with_queried_definition_is_read_completely(
         b"[" * 2000,
         b'{"layouts": 7}',
         {"fields": [{"name": f"f{number}", "type": "float32"} for number in range(100_000)]},
-        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "x", "type": "float32[1025]"}]},
-        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "__class__", "type": "uint8"}]},
-        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "model_fields", "type": "uint8"}]},
-        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "x", "type": "__import__('os')"}]},
+        {
+            "fields": [
+                {"name": "timestamp", "type": "uint64"},
+                {"name": "x", "type": "float32[1025]"},
+            ]
+        },
+        {
+            "fields": [
+                {"name": "timestamp", "type": "uint64"},
+                {"name": "__class__", "type": "uint8"},
+            ]
+        },
+        {
+            "fields": [
+                {"name": "timestamp", "type": "uint64"},
+                {"name": "model_fields", "type": "uint8"},
+            ]
+        },
+        {
+            "fields": [
+                {"name": "timestamp", "type": "uint64"},
+                {"name": "x", "type": "__import__('os')"},
+            ]
+        },
         {"fields": [{"name": "x", "type": "uint8"}]},
         {"fields": []},
     ],
@@ -74,9 +98,14 @@ def test_hostile_definition_does_not_affect_other_streams(
 ) -> None:
     """If a peer replies with an invalid definition, only messages with this definition are invalid."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
-    with suppress(ValueError):  # use the right hash, if there is one, so that the reply is rejected for another reason
+    # use the right hash, if there is one, so that the reply is rejected for another reason
+    with suppress(ValueError):
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
-    payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
+    payload = (
+        answer
+        if isinstance(answer, bytes)
+        else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
+    )
     schema = "nedbus/@schema/peer/Evil"
     with (
         answer_queries(zenoh_session, schema, reply_with({schema: payload})),
@@ -113,11 +142,17 @@ def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.B
     definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
     publisher = bus.publisher("comes_and_goes", vehicle="1", definition=definition)
     publisher.publish({"timestamp": 1})
-    assert [read_once(endpoint, "comes_and_goes", form) for form in ("latest", "models", "batches")] == [1, 1, 1]
+    assert [
+        read_once(endpoint, "comes_and_goes", form) for form in ("latest", "models", "batches")
+    ] == [1, 1, 1]
 
     def is_freed() -> bool:
         gc.collect()
-        found = [each for each in gc.get_objects() if isinstance(each, Definition) and each.name == definition.name]
+        found = [
+            each
+            for each in gc.get_objects()
+            if isinstance(each, Definition) and each.name == definition.name
+        ]
         return len(found) == 1
 
     wait_for(is_freed, what="the definitions of closed readers to be freed")
@@ -144,8 +179,14 @@ def test_definitions_of_many_topics_are_queried_together(
     client: nedbus.Bus, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For the last messages of 80 topics that are not built in, a reader waits up to four times for definitions."""
-    definitions = [define_msg(f"Custom{number}", f"uint64 timestamp\nuint8 a{number}\n") for number in range(80)]
-    publishers = [bus.publisher(f"custom_{n}", vehicle="7", definition=each) for n, each in enumerate(definitions)]
+    definitions = [
+        define_msg(f"Custom{number}", f"uint64 timestamp\nuint8 a{number}\n")
+        for number in range(80)
+    ]
+    publishers = [
+        bus.publisher(f"custom_{n}", vehicle="7", definition=each)
+        for n, each in enumerate(definitions)
+    ]
     for number, each in enumerate(publishers):
         each.publish({"timestamp": 1, f"a{number}": number})
     waits, wait_for_definitions = list[int](), layout_lookup.wait_for_replies

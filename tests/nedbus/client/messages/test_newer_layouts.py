@@ -22,7 +22,11 @@ from tests.nedbus.client.numbered import receive_timestamps, wait_for_subscriber
 from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, repeating, wait_for_matching
 
-NAME, KEY, SCHEMA = "VehicleLocalPosition", f"nedbus/1/{VLP}", "nedbus/@schema/1/VehicleLocalPosition"
+NAME, KEY, SCHEMA = (
+    "VehicleLocalPosition",
+    f"nedbus/1/{VLP}",
+    "nedbus/@schema/1/VehicleLocalPosition",
+)
 FIELDS: Final = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
 PAYLOAD: Final = msgpack.packb([9, 4, True, 2.5])
 """A message with FIELDS, as layout 9."""
@@ -39,25 +43,34 @@ ENCODING_WITH_HASH: Final = f"{ENCODING};hash={hash_of_fields(FIELDS)}"
 
 def schema(fields: Mapping[str, str], **claims: object) -> bytes:
     """Return the reply of a publisher with these fields."""
-    layout = {"name": "9.9", "wire": 9, "fields": [{"name": name, "type": kind} for name, kind in fields.items()]}
+    layout = {
+        "name": "9.9",
+        "wire": 9,
+        "fields": [{"name": name, "type": kind} for name, kind in fields.items()],
+    }
     return json.dumps({"layouts": [layout], **claims}).encode()
 
 
 @pytest.mark.parametrize("form", ["models", "rows", "batches"])
-def test_reader_of_an_older_release_reads_a_newer_publisher(endpoint: str, bus: nedbus.Bus, form: str) -> None:
+def test_reader_of_an_older_release_reads_a_newer_publisher(
+    endpoint: str, bus: nedbus.Bus, form: str
+) -> None:
     """A reader gets the fields that it knows from a publisher whose layout of a built-in message is newer."""
     publisher = bus.publisher(VLP, vehicle="1", definition=next_release())
     sent = {"timestamp": 5, "xy_valid": True, "x": 1.0, "y": 2.0, "brand_new": 9.0}
     with nedbus.connect(endpoint) as reader, reader.subscribe(mode="every") as subscription:
         wait_for_subscriber(publisher)
-        with repeating(lambda: publisher.publish(sent)):  # messages that arrive before the lookup is done are invalid
+        # messages that arrive before the lookup is done are invalid
+        with repeating(lambda: publisher.publish(sent)):
             receive_timestamps(subscription, 1)
         invalid = subscription.counts.invalid
         publisher.publish(sent | {"timestamp": 6})
         found = [(0, 0.0, 0.0)]
         while found[-1][0] != 6:
             if form == "batches":
-                found += subscription.receive_batch(DEADLINE).messages[["timestamp", "x", "y"]].tolist()
+                found += (
+                    subscription.receive_batch(DEADLINE).messages[["timestamp", "x", "y"]].tolist()
+                )
             else:
                 read = next(subscription if form == "models" else subscription.rows()).message
                 found.append((read.timestamp, read.x, read.y))
@@ -77,14 +90,19 @@ def test_reply_with_swapped_fields_is_ignored(client: nedbus.Bus, zenoh_session:
             for payload in (claim, schema(honest)):
                 query.reply(SCHEMA, payload)
 
-    encoding, peer = f"{ENCODING};hash={hash_of_fields(honest)}", "nedbus/@schema/peer/VehicleLocalPosition"
+    encoding, peer = (
+        f"{ENCODING};hash={hash_of_fields(honest)}",
+        "nedbus/@schema/peer/VehicleLocalPosition",
+    )
     with (
         answer_queries(zenoh_session, peer, reply_with({peer: claim})),
         answer_queries(zenoh_session, SCHEMA, answer),
         client.subscribe(mode="every") as subscription,
     ):
         wait_for_matching(zenoh_session, KEY)
-        with repeating(lambda: zenoh_session.put(KEY, msgpack.packb([9, 4, 1.0, 2.0]), encoding=encoding)):
+        with repeating(
+            lambda: zenoh_session.put(KEY, msgpack.packb([9, 4, 1.0, 2.0]), encoding=encoding)
+        ):
             found = list(islice(subscription, 40))
     assert {(sample.message.x, sample.message.y) for sample in found} == {(1.0, 2.0)}
 
@@ -99,7 +117,11 @@ def test_newer_layout_without_hash_is_invalid(
         client.subscribe(mode="every") as subscription,
     ):
         wait_for_matching(zenoh_session, KEY)
-        for encoding in (ENCODING, f"{ENCODING};hash=no", ENCODING_WITH_HASH.replace(NAME, "Other")):
+        for encoding in (
+            ENCODING,
+            f"{ENCODING};hash=no",
+            ENCODING_WITH_HASH.replace(NAME, "Other"),
+        ):
             zenoh_session.put(KEY, PAYLOAD, encoding=encoding)
         zenoh_session.put(KEY, encode(message(5)))
         assert receive_timestamps(subscription, 1) == [5]
@@ -130,11 +152,16 @@ def test_newer_layout_is_looked_up_once(
         repeating(lambda: zenoh_session.put(KEY, PAYLOAD, encoding=ENCODING_WITH_HASH)),
     ):
         taken = list(islice(subscription, 2))
-    assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [(4, 2.5), (4, 2.5)]
+    assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [
+        (4, 2.5),
+        (4, 2.5),
+    ]
     assert subscription.counts.invalid > 0
     assert len(queries) == 1
     logged = [text for text in caplog.messages if "ignored fields" in text]
-    assert logged == ["a layout of VehicleLocalPosition is newer than this reader; ignored fields: brand_new"]
+    assert logged == [
+        "a layout of VehicleLocalPosition is newer than this reader; ignored fields: brand_new"
+    ]
 
 
 @pytest.mark.parametrize("stored", [False, True])
@@ -150,13 +177,18 @@ def test_last_message_of_a_newer_layout_is_read(
         answer_queries(zenoh_session, KEY, last),
     ):
         found = client.latest(timeout=DEADLINE)
-    assert [(each.message.timestamp, each.message.x, each.stored) for each in found] == [(4, 2.5, stored)]
+    assert [(each.message.timestamp, each.message.x, each.stored) for each in found] == [
+        (4, 2.5, stored)
+    ]
 
 
 @pytest.mark.parametrize(
-    "answer", [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}']
+    "answer",
+    [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}'],
 )
-def test_messages_of_a_malformed_layout_are_invalid(bus: nedbus.Bus, zenoh_session: Session, answer: bytes) -> None:
+def test_messages_of_a_malformed_layout_are_invalid(
+    bus: nedbus.Bus, zenoh_session: Session, answer: bytes
+) -> None:
     """If the reply to a layout lookup is malformed, messages of that layout count as invalid."""
     with answer_queries(zenoh_session, SCHEMA, reply_with({SCHEMA: answer})):
         subscription = bus.subscribe(VLP, mode="every")

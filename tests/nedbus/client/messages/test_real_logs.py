@@ -98,7 +98,10 @@ def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArra
             if ours.dtype.kind == "b":  # PX4 leaves some uninitialized, with any byte
                 expected = expected.astype(bool)
             assert ours.tobytes() == expected.astype(ours.dtype).tobytes(), (stream, column)
-            assert np.array_equal(ours, expected, equal_nan=expected.dtype.kind == "f"), (stream, column)
+            assert np.array_equal(ours, expected, equal_nan=expected.dtype.kind == "f"), (
+                stream,
+                column,
+            )
             compared += len(ours)
     return compared
 
@@ -135,12 +138,16 @@ def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
     assert run.damage is None
     assert messages.keys() == {stream for stream, array in arrays.items() if len(array)}
     for stream, found in messages.items():
-        assert arrays_of(found[0].DEFINITION).of(found).tobytes() == arrays[stream].tobytes(), stream
+        assert arrays_of(found[0].DEFINITION).of(found).tobytes() == arrays[stream].tobytes(), (
+            stream
+        )
 
 
 @pytest.mark.slow
 @each_flight
-def test_replayed_log_reaches_another_process(flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_replayed_log_reaches_another_process(
+    flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """A reader receives all topics of a log through daemon and router, complete and equal to the arrays."""
     arrays = {stream: array for stream, array in nedbus.read(flight, ["*"]).items() if len(array)}
     messages: dict[str, list[Any]] = {}
@@ -154,7 +161,9 @@ def test_replayed_log_reaches_another_process(flight: Path, run_nedbus: Start, e
         assert (subscription.counts.lost, subscription.counts.invalid) == (0, 0)
     assert messages.keys() == arrays.keys()
     for stream, found in messages.items():
-        assert arrays_of(found[0].DEFINITION).of(found).tobytes() == arrays[stream].tobytes(), stream
+        assert arrays_of(found[0].DEFINITION).of(found).tobytes() == arrays[stream].tobytes(), (
+            stream
+        )
     assert "0 rejected" in service.err
 
 
@@ -199,19 +208,24 @@ def test_aligned_table_has_all_topics(flight: Path) -> None:
         rows = np.searchsorted(values["timestamp"][order], table["timestamp"], side="right") - 1
         rows, has_one = order[rows], rows >= 0
         if stream == "vehicle_local_position":
-            rows, has_one = np.arange(len(table)), np.ones(len(table), bool)  # each of its messages is a row
+            # each of its messages is a row
+            rows, has_one = np.arange(len(table)), np.ones(len(table), bool)
         assert np.array_equal(np.isnan(table[f"{stream}.age"]), ~has_one), stream
         for column, logged in values.items():
             if f"{stream}.{column}" in columns:
                 ours = table[f"{stream}.{column}"]
-                assert np.array_equal(ours[has_one], logged[rows].astype(ours.dtype)[has_one], equal_nan=True), column
+                assert np.array_equal(
+                    ours[has_one], logged[rows].astype(ours.dtype)[has_one], equal_nan=True
+                ), column
                 compared += 1
     assert compared > len(raw)
 
 
 def test_plot_of_topic_without_track_fails(tmp_path: Path) -> None:
     """`nedbus plot` of a topic other than a position is a usage error that names the topic."""
-    plot = run_command("plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png"))
+    plot = run_command(
+        "plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png")
+    )
     assert plot.exit_code == 2
     assert "vehicle_attitude has no track" in plot.err
 
@@ -219,5 +233,12 @@ def test_plot_of_topic_without_track_fails(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_plot_of_all_topics_draws_positions(tmp_path: Path) -> None:
     """With `-t "*"`, `nedbus plot` draws the topics that have a track."""
-    drawn = run_command("plot", str(LOGS.parent / "px4" / "twelve_messages.ulg"), "-t", "*", "-o", f"{tmp_path}/a.png")
+    drawn = run_command(
+        "plot",
+        str(LOGS.parent / "px4" / "twelve_messages.ulg"),
+        "-t",
+        "*",
+        "-o",
+        f"{tmp_path}/a.png",
+    )
     assert drawn.exit_code == 0, drawn.err

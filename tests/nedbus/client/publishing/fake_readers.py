@@ -94,10 +94,16 @@ class FakeSession:
     ) -> FlowControl:
         """Return a FlowControl on this session and clock; `is_matched`: whether the router has subscribers."""
         timings.credit_polls = 0.0005, _TICK
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
+        monkeypatch.setattr(
+            module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance)
+        )
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
-        listener = cast("MatchingListener", SimpleNamespace(is_matched=is_matched)) if is_matched else None
-        return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router, listener=listener)
+        listener = (
+            cast("MatchingListener", SimpleNamespace(is_matched=is_matched)) if is_matched else None
+        )
+        return FlowControl(
+            cast("Writer", writer), SharedWindow(), needs_router=needs_router, listener=listener
+        )
 
     def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
         """Publish `count` messages, at `rate` [Hz] while there is credit."""
@@ -158,7 +164,12 @@ class FakeSession:
         return SimpleNamespace(routers_zid=self.routers.copy)
 
     def get(
-        self, selector: str, channel: zenoh.handlers.FifoChannel[zenoh.Reply], *, timeout: float, **options: object
+        self,
+        selector: str,
+        channel: zenoh.handlers.FifoChannel[zenoh.Reply],
+        *,
+        timeout: float,
+        **options: object,
     ) -> Query:
         if self.closed:
             raise zenoh.ZError("session closed")

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from nedbus import limits
 from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, SharedWindow
 from nedbus.client.receiving.receiver import RING_CAPACITY
-from nedbus.client.receiving.unread import CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
 from tests.waits import DEADLINE
@@ -35,7 +35,7 @@ def control(session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timi
 
 def test_unacknowledged_messages_fit_into_cache_and_queues() -> None:
     """Unacknowledged messages fit into the history cache for recovery, and into the queue of each reader."""
-    assert WINDOW < LIMIT < CACHE < RING_CAPACITY < CAPACITY
+    assert WINDOW < LIMIT < CACHE < RING_CAPACITY < limits.UNREAD_MESSAGES
     assert LIMIT + WINDOW == CACHE
 
 
@@ -53,7 +53,9 @@ def test_publisher_sends_no_requests_until_its_key_has_a_subscriber(
     session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """With the router in its process, a publisher requests nothing without a subscriber, and the first one at once."""
-    control = session.flow_control(monkeypatch, timings, needs_router=False, is_matched=lambda: bool(session.readers))
+    control = session.flow_control(
+        monkeypatch, timings, needs_router=False, is_matched=lambda: bool(session.readers)
+    )
     session.publish(control, 10_000)
     assert not session.requests
     session.readers.append(Reader("stuck", rate=0.0, read=10_000))
@@ -80,7 +82,9 @@ def test_flow_control_of_a_known_reader_does_not_depend_on_its_subscription(
     assert session.now > TIMINGS.return_wait / 2
 
 
-def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
+def test_fast_reader_does_not_delay_the_publisher(
+    session: FakeSession, control: FlowControl
+) -> None:
     """The publisher requests an acknowledgement every 250 messages, and never waits for a fast reader."""
     session.readers.append(Reader("fast"))
     session.publish(control, 10_000)
@@ -90,7 +94,9 @@ def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control:
     assert {(each["publisher"], each["read"]) for each in session.requests} == {("p:1", "1")}
 
 
-def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control: FlowControl) -> None:
+def test_stuck_reader_gets_a_window_and_a_trickle(
+    session: FakeSession, control: FlowControl
+) -> None:
     """A stuck reader gets 2,000 messages at once, then 10 per second until the history cache is full, then none.
 
     The publisher waits for a connected reader forever: it repeats its request after 0.5, 1, 2, 4 and 8 s, then
@@ -149,7 +155,9 @@ def test_shares_of_two_threads_do_not_overwrite_each_other() -> None:
     assert set(shared._unread) == {"a", "b"}
 
 
-@pytest.mark.parametrize(("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)])
+@pytest.mark.parametrize(
+    ("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)]
+)
 def test_request_dropped_by_a_full_queue_is_repeated(
     session: FakeSession, control: FlowControl, at: float, rate: float, pause: float
 ) -> None:
@@ -173,7 +181,9 @@ def test_reader_that_resumes_gets_all_messages(session: FakeSession, control: Fl
 
 
 @pytest.mark.parametrize("rate", [100.0, 500.0, 5_000.0])
-def test_slow_reader_sets_the_pace_and_never_starves(session: FakeSession, control: FlowControl, rate: float) -> None:
+def test_slow_reader_sets_the_pace_and_never_starves(
+    session: FakeSession, control: FlowControl, rate: float
+) -> None:
     """The publisher is ahead of a slow reader by at most a window and a trickle; the reader never has to wait."""
     reader = Reader("slow", rate=rate)
     session.readers += [reader, Reader("fast")]
@@ -194,7 +204,9 @@ def test_fast_reader_gets_ten_messages_per_second_despite_a_slow_one(
     assert session.longest_pause() < 0.2
 
 
-def test_closed_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
+def test_closed_reader_does_not_delay_the_publisher(
+    session: FakeSession, control: FlowControl
+) -> None:
     """The publisher continues once a stuck reader closes, because a closing reader acknowledges the open request."""
     reader = Reader("stuck", rate=0.0)
     session.readers += [reader, Reader("fast")]
@@ -224,7 +236,12 @@ def measure_lead(session: FakeSession, control: FlowControl, reader: Reader, at:
     ],
 )
 def test_reader_that_returns_in_time_misses_nothing(  # noqa: PLR0917 - a table
-    session: FakeSession, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
+    session: FakeSession,
+    control: FlowControl,
+    rate: float,
+    interrupt: Interrupt,
+    begin: float,
+    end: float,
 ) -> None:
     """A reader gets all messages, even if its link was reset, its router restarted, or its process was suspended.
 
@@ -280,7 +297,9 @@ def test_publisher_waits_for_readers_while_the_router_is_away(
     assert session.now < away + 3.0 + 20_000 / 10_000.0 + 0.2
 
 
-@pytest.mark.parametrize(("rate", "published"), [(0.0, 10_000.0), (100.0, 10_000.0), (math.inf, 200.0)])
+@pytest.mark.parametrize(
+    ("rate", "published"), [(0.0, 10_000.0), (100.0, 10_000.0), (math.inf, 200.0)]
+)
 @pytest.mark.parametrize("second", range(20, 30, 2))
 def test_publisher_waits_for_a_suspended_reader(
     session: FakeSession, control: FlowControl, rate: float, published: float, second: int
@@ -371,7 +390,9 @@ def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowContro
     assert session.now == pytest.approx(6.0, abs=0.5)
 
 
-def test_message_number_in_acknowledgement_request_wraps(session: FakeSession, control: FlowControl) -> None:
+def test_message_number_in_acknowledgement_request_wraps(
+    session: FakeSession, control: FlowControl
+) -> None:
     """The message number in an acknowledgement request wraps at 2^32, as the reader's numbers do."""
     assert control.wait_for_reception(2**32 + 1, timeout=1.0)
     assert session.requests[-1]["number"] == "0"

@@ -27,7 +27,11 @@ class Clock:
         self.now, self.sizes, self.numbers = 100.0, list[int](), list[int]()
         monkeypatch.setattr(group, "monotonic", lambda: self.now)
         self.writer = SimpleNamespace(published=0)
-        self.group = Group(cast("Writer", self.writer), self.put, cast("Heartbeats", SimpleNamespace(watch=self.watch)))
+        self.group = Group(
+            cast("Writer", self.writer),
+            self.put,
+            cast("Heartbeats", SimpleNamespace(watch=self.watch)),
+        )
 
     def watch(self, watched: Group) -> bool:
         watched.is_watched = True
@@ -186,7 +190,9 @@ def publish(publisher: nedbus.Publisher, first: int, count: int) -> None:
         publisher.publish(message(number))
 
 
-def test_message_arrives_though_no_other_follows(bus: nedbus.Bus, publisher: nedbus.Publisher) -> None:
+def test_message_arrives_though_no_other_follows(
+    bus: nedbus.Bus, publisher: nedbus.Publisher
+) -> None:
     """The messages of an incomplete group are handed over in time, again after a pause, without a flush."""
     with bus.subscribe(VLP, vehicle="1", mode="every") as subscription:
         wait_for_subscriber(publisher)
@@ -196,7 +202,9 @@ def test_message_arrives_though_no_other_follows(bus: nedbus.Bus, publisher: ned
             assert receive_timestamps(subscription, 50) == list(range(first, first + 50))
 
 
-def test_order_is_kept_while_another_thread_hands_over(bus: nedbus.Bus, publisher: nedbus.Publisher) -> None:
+def test_order_is_kept_while_another_thread_hands_over(
+    bus: nedbus.Bus, publisher: nedbus.Publisher
+) -> None:
     """Messages keep their order, and none is lost, while the I/O thread and others hand over groups at any time."""
     count, ended = 1500, threading.Event()  # fewer than the window of flow control
     opened = cast("Any", publisher)._group
@@ -250,7 +258,8 @@ def test_ctrl_c_in_zenoh_repeats_no_message(
 
         def put(*arguments: object, **options: object) -> None:
             zenoh_put(*arguments, **options)
-            if threading.current_thread() is threading.main_thread():  # another one puts a group that takes long
+            # another one puts a group that takes long
+            if threading.current_thread() is threading.main_thread():
                 monkeypatch.undo()
                 raise KeyboardInterrupt
 
@@ -278,7 +287,9 @@ def test_signal_handler_may_flush_while_flow_control_is_asked(publisher: nedbus.
     assert not handler.is_alive()
 
 
-def test_publish_raises_at_once_after_the_bus_is_closed(publisher: nedbus.Publisher, bus: nedbus.Bus) -> None:
+def test_publish_raises_at_once_after_the_bus_is_closed(
+    publisher: nedbus.Publisher, bus: nedbus.Bus
+) -> None:
     """Once another thread has closed the bus, the next message raises, however quickly it follows the last one."""
     publish(publisher, 1, 30)
     bus.close(0.0)

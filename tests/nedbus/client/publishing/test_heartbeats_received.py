@@ -23,11 +23,16 @@ def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> N
     samples: list[zenoh.Sample] = []
 
     def received() -> list[int]:
-        return [decode(sample.payload.to_bytes()).timestamp for sample in drain(subscriber.handler, samples)]
+        return [
+            decode(sample.payload.to_bytes()).timestamp
+            for sample in drain(subscriber.handler, samples)
+        ]
 
     with closing(Link(endpoint)) as link, open_client([link.endpoint], timeout=5.0) as session:
         publisher = bus.publisher(VLP, vehicle="1")
-        subscriber = zenoh.ext.declare_advanced_subscriber(session, publisher.key, channel, recovery=recovery)
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            session, publisher.key, channel, recovery=recovery
+        )
         wait_for_subscriber(publisher)
         publish(publisher, 1)
         wait_for(lambda: received() == [1], what="the first message")
@@ -67,9 +72,15 @@ def test_unread_heartbeats_are_bounded_in_bytes(endpoint: str, zenoh_session: Se
         wait_for_matching(zenoh_session, end)
         wait_for_matching(zenoh_session, f"nedbus/1/{VLP}/@adv/pub/1a/1/_")
         for number in range(5000):
-            zenoh_session.put(f"nedbus/{number}/{VLP}/@adv/pub/1a/1/_", bytes(4), congestion_control=block)
-            zenoh_session.put(f"nedbus/5000/{VLP}/@adv/pub/1a/1/_", bytes(65), congestion_control=block)
+            zenoh_session.put(
+                f"nedbus/{number}/{VLP}/@adv/pub/1a/1/_", bytes(4), congestion_control=block
+            )
+            zenoh_session.put(
+                f"nedbus/5000/{VLP}/@adv/pub/1a/1/_", bytes(65), congestion_control=block
+            )
         zenoh_session.put(end, b"", congestion_control=block)
         wait_for(ended.handler.try_recv, what="the end")
-        assert [key.split("/")[1] for key, _ in take()] == [str(number) for number in range(904, 5000)]
+        assert [key.split("/")[1] for key, _ in take()] == [
+            str(number) for number in range(904, 5000)
+        ]
         undeclare()

@@ -54,7 +54,9 @@ def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
 
 
 @asynccontextmanager
-async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator[list[nedbus.AsyncPublisher]]:
+async def waiting_publishers(
+    bus: nedbus.AsyncBus, number: int
+) -> AsyncIterator[list[nedbus.AsyncPublisher]]:
     """Yield publishers that wait for a reader; finally cancel the waits."""
     publishers = [await bus.publisher(VLP, vehicle=each, lossless=True) for each in range(number)]
     waiting = [asyncio.create_task(each.publish_many(numbered(COUNT))) for each in publishers]
@@ -107,13 +109,17 @@ def test_cancelled_publish_many_can_be_continued(
     assert stuck.counts == nedbus.Counts(received=COUNT)
 
 
-def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Session, bus: nedbus.Bus) -> None:
+def test_cancelled_close_closes_without_waiting(
+    endpoint: str, zenoh_session: Session, bus: nedbus.Bus
+) -> None:
     """A close that waits for acknowledgements can be cancelled; it then closes everything without waiting."""
     queries: list[zenoh.Query] = []
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as other:
-            first, second = [await other.publisher(VLP, vehicle=each, lossless=True) for each in (1, 2)]
+            first, second = [
+                await other.publisher(VLP, vehicle=each, lossless=True) for each in (1, 2)
+            ]
             await first.publish({"timestamp": 1})
             await second.publish({"timestamp": 1})
             for close, vehicles in ((first.close, ["2"]), (other.close, [])):
@@ -139,18 +145,26 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Se
     )
 
 
-def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus, zenoh_session: Session) -> None:
+def test_exception_in_block_closes_publisher_without_waiting(
+    client: nedbus.Bus, zenoh_session: Session
+) -> None:
     """A `with` block that ends with an exception, such as Ctrl-C, does not wait for readers."""
     queries: list[zenoh.Query] = []
     silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append)
-    with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
+    with (
+        silent,
+        suppress(RuntimeError),
+        client.publisher(VLP, vehicle="1", lossless=True) as publisher,
+    ):
         publisher.publish({"timestamp": 1})
         raise RuntimeError("on purpose")
     assert not client.vehicles()
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_close_returns_after_its_timeout(client: nedbus.Bus, zenoh_session: Session, whole_bus: bool) -> None:
+def test_close_returns_after_its_timeout(
+    client: nedbus.Bus, zenoh_session: Session, whole_bus: bool
+) -> None:
     """Without acknowledgements, a close returns after its timeout; with timeout 0, it does not request any."""
     queries: list[zenoh.Query] = []
     with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append):
@@ -165,7 +179,9 @@ def test_close_returns_after_its_timeout(client: nedbus.Bus, zenoh_session: Sess
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_ctrl_c_during_close_ends_the_wait(endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool) -> None:
+def test_ctrl_c_during_close_ends_the_wait(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool
+) -> None:
     """Ctrl-C during a close ends the wait for readers and closes everything."""
 
     def interrupt(*_: object) -> bool:
@@ -220,7 +236,9 @@ def test_lossless_close_waits_for_readers(
 
 
 @pytest.mark.parametrize("fails", [True, False])
-def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
+def test_exception_skips_the_wait_for_readers(
+    client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
     """A `with` block that ends with an exception closes without a flush; one that ends normally flushes."""
     flushed: list[nedbus.Publisher] = []
 
@@ -230,7 +248,8 @@ def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: p
 
     monkeypatch.setattr(nedbus.Publisher, "flush", flush)
     client.publisher(VLP, vehicle="1", lossless=True)
-    client.__exit__(*((KeyError, KeyError(), None) if fails else (None, None, None)))  # the end of a `with` block
+    # the end of a `with` block
+    client.__exit__(*((KeyError, KeyError(), None) if fails else (None, None, None)))
     assert bool(flushed) is not fails
 
 
@@ -245,7 +264,9 @@ def test_lossless_publisher_loses_nothing_during_a_router_restart() -> None:
         assert receive_timestamps(subscription, 1) == [1]
         router.close()
         wait_for(lambda: not bus.connected and not other.connected, what="the loss of the link")
-        sending = threading.Thread(target=publisher.publish_many, args=[numbered(count - 1, first=2)], daemon=True)
+        sending = threading.Thread(
+            target=publisher.publish_many, args=[numbered(count - 1, first=2)], daemon=True
+        )
         sending.start()
         wait_for(lambda: publisher.published > WINDOW, what="a window of messages")
         router = open_router(listen=(endpoint,))

@@ -35,7 +35,9 @@ def test_every_publish_method_raises_for_invalid_messages(client: nedbus.Bus, me
         "publish_row": tuple(fields.values()),
         "publish_many": to_array([message(1), VehicleLocalPosition.model_construct(**fields)]),
     }
-    with pytest.raises(nedbus.InvalidMessageError, match=r"eph: must not be negative \(is -1.0\)") as info:
+    with pytest.raises(
+        nedbus.InvalidMessageError, match=r"eph: must not be negative \(is -1.0\)"
+    ) as info:
         getattr(publisher, method)(given[method])
     assert isinstance(info.value, nedbus.NedbusError)
     assert ("at index 1:" in str(info.value)) is (method == "publish_many")
@@ -85,7 +87,8 @@ def test_invalid_source_leaves_nothing_behind(bus: nedbus.Bus, zenoh_session: Se
         with pytest.raises(nedbus.errors.ArgumentError, match="not valid"):
             bus.publisher(VLP, vehicle=str(number), source="not valid")
         assert_nothing_is_open(bus._publishers, zenoh_session)
-    assert len(io_thread._jobs) <= jobs + 1  # one vehicle answers schema queries, for messages in transit
+    # one vehicle answers schema queries, for messages in transit
+    assert len(io_thread._jobs) <= jobs + 1
 
 
 class FailingSession:
@@ -108,7 +111,9 @@ class FailingSession:
             self.declared += 1
             if self.left == 0:
                 raise zenoh.ZError("out of resources")
-            result = declare(*(self.session if each is self else each for each in arguments), **options)
+            result = declare(
+                *(self.session if each is self else each for each in arguments), **options
+            )
             if isinstance(result, zenoh.Publisher):  # a probe, which declares a matching listener
                 self.probes += 1
                 return SimpleNamespace(
@@ -127,14 +132,24 @@ class FailingSession:
 @pytest.mark.parametrize("step", [*range(1, 11)])
 @pytest.mark.parametrize("declarations", [7, 9], ids=["client", "lossless-in-router"])
 def test_failed_declaration_leaves_nothing_behind(
-    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, step: int, declarations: int
+    bus: nedbus.Bus,
+    zenoh_session: Session,
+    monkeypatch: pytest.MonkeyPatch,
+    step: int,
+    declarations: int,
 ) -> None:
     """If any declaration of a publisher fails, nothing stays open, and the address is free for the next one."""
     is_router = declarations == 9
     session = cast("Any", FailingSession(bus._session, step))
-    monkeypatch.setattr("zenoh.ext.declare_advanced_publisher", session.counted(zenoh.ext.declare_advanced_publisher))
+    monkeypatch.setattr(
+        "zenoh.ext.declare_advanced_publisher",
+        session.counted(zenoh.ext.declare_advanced_publisher),
+    )
     queries = QueryServer(session)
-    registry, address = PublisherRegistry(session, queries, prefix="nedbus", is_client=not is_router), Address("1", VLP)
+    registry, address = (
+        PublisherRegistry(session, queries, prefix="nedbus", is_client=not is_router),
+        Address("1", VLP),
+    )
     if step <= declarations:
         with pytest.raises(nedbus.NedbusError, match="out of resources"):
             registry.publisher(address, lossless=is_router)
@@ -167,7 +182,11 @@ def test_interrupted_open_closes_the_publisher(
 
 def open_tokens(session: Session) -> list[str]:
     """Return the liveliness tokens of publishers and of their keys."""
-    return [key for each in ("**", "*/@alive/**") for key in token_keys(session, f"nedbus/{each}", timeout=DEADLINE)]
+    return [
+        key
+        for each in ("**", "*/@alive/**")
+        for key in token_keys(session, f"nedbus/{each}", timeout=DEADLINE)
+    ]
 
 
 def assert_nothing_is_open(registry: PublisherRegistry, session: Session) -> None:
@@ -182,7 +201,9 @@ def assert_nothing_is_open(registry: PublisherRegistry, session: Session) -> Non
 UNKNOWN_RATE: Final = nedbus.define_msg("SensorCombined", "uint64 timestamp\nfloat32[3] gyro_rad")
 
 
-def recover(endpoint: str, publisher: nedbus.Publisher, sent: Iterable[nedbus.Message]) -> tuple[list[int], Counts]:
+def recover(
+    endpoint: str, publisher: nedbus.Publisher, sent: Iterable[nedbus.Message]
+) -> tuple[list[int], Counts]:
     """Publish messages of which a reader in mode `every` misses all but the first and the last; return what it gets."""
     first, *missed, last = sent
     queue = LossyQueue(publisher.key)
@@ -201,7 +222,9 @@ def recover(endpoint: str, publisher: nedbus.Publisher, sent: Iterable[nedbus.Me
 
 @pytest.mark.parametrize("excess", [0, 3])
 @pytest.mark.parametrize("topic", list(DEFAULT.topics))
-def test_20_s_of_a_position_topic_are_recovered(endpoint: str, bus: nedbus.Bus, topic: str, excess: int) -> None:
+def test_20_s_of_a_position_topic_are_recovered(
+    endpoint: str, bus: nedbus.Bus, topic: str, excess: int
+) -> None:
     """A reader recovers 20 s of each position topic at its nominal rate, at least 400 messages, and counts older ones.
 
     The last message reveals the gap, so the history holds one message less.
@@ -226,7 +249,9 @@ def test_messages_of_a_topic_without_a_rate_are_recovered(
     """
     address, model = Address("1", "home_position"), BY_TOPIC["home_position"].model
     publisher = bus._publishers.publisher(address, short_history=is_source)
-    sent = [model.model_validate({"timestamp": timestamp}) for timestamp in range(depth + 1 + excess)]
+    sent = [
+        model.model_validate({"timestamp": timestamp}) for timestamp in range(depth + 1 + excess)
+    ]
     received, counts = recover(endpoint, publisher, sent)
     assert received == [0, *range(1 + excess, len(sent))]
     assert counts == Counts(received=len(received), lost=excess)
@@ -242,7 +267,16 @@ def test_late_reader_gets_the_last_message_of_a_topic_sent_on_change(
     """
     home = bus.publisher("home_position", vehicle="1")
     other = bus.publisher("sensor_combined", vehicle="1", definition=UNKNOWN_RATE)
-    home.publish({"timestamp": 1, "lat": 47.0, "lon": 8.0, "alt": 400.0, "valid_hpos": True, "valid_alt": True})
+    home.publish(
+        {
+            "timestamp": 1,
+            "lat": 47.0,
+            "lon": 8.0,
+            "alt": 400.0,
+            "valid_hpos": True,
+            "valid_alt": True,
+        }
+    )
     for timestamp in range(300):
         other.publish({"timestamp": timestamp, "gyro_rad": (0.0, 0.0, 0.0)})
     for topic, timestamp in (("home_position", 1), ("sensor_combined", 299)):

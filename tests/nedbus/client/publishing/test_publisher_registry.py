@@ -54,9 +54,16 @@ def test_departed_vehicle_leaves_no_objects(registry: PublisherRegistry) -> None
     references = [each for number in range(5) for each in come_and_go(registry, f"v{number}")]
     gc.collect()
     assert [each() for each in references if each() is not None] == []
-    tables = registry.publishers, registry._rate_listeners, registry._directories, registry.heartbeats.writers
+    tables = (
+        registry.publishers,
+        registry._rate_listeners,
+        registry._directories,
+        registry.heartbeats.writers,
+    )
     assert [len(each) for each in tables] == [0, 0, 0, 0]
-    assert list(registry._queries._queryables) == [schema_key("*", vehicle="v4", prefix=registry.prefix)]
+    assert list(registry._queries._queryables) == [
+        schema_key("*", vehicle="v4", prefix=registry.prefix)
+    ]
     assert len(registry._definitions) == len(TOPICS)
 
 

@@ -44,7 +44,9 @@ def test_panic_in_a_reply_does_not_end_the_server(
 
     # Until the queryable is known to the other session, queries do not reach it.
     wait_for(has_failed, what="a reply that fails")
-    assert [each.payload.to_bytes() for each in query(bus._session, "a/key", timeout=DEADLINE)] == [b"found"]
+    assert [each.payload.to_bytes() for each in query(bus._session, "a/key", timeout=DEADLINE)] == [
+        b"found"
+    ]
     assert [record.getMessage() for record in caplog.records] == [
         "a/key: unexpected error in a query reply (logged once)"
     ]

@@ -17,7 +17,13 @@ from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.timings import Timings
 from nedbus.transport import open_router
 from tests.flights.messages import VLP
-from tests.nedbus.client.numbered import has_subscriber, numbered, publish, receive_timestamps, wait_for_subscriber
+from tests.nedbus.client.numbered import (
+    has_subscriber,
+    numbered,
+    publish,
+    receive_timestamps,
+    wait_for_subscriber,
+)
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
@@ -79,7 +85,9 @@ def test_stuck_reader_slows_down_a_replay_without_losses(
     got = receive_timestamps(reader, WINDOW + 5)
     assert publisher.published < COUNT
     late: list[int] = []
-    reading = threading.Thread(target=lambda: late.extend(receive_timestamps(stuck, COUNT)), daemon=True)
+    reading = threading.Thread(
+        target=lambda: late.extend(receive_timestamps(stuck, COUNT)), daemon=True
+    )
     reading.start()
     got += receive_timestamps(reader, COUNT - len(got))
     reading.join(DEADLINE)
@@ -90,7 +98,8 @@ def test_stuck_reader_slows_down_a_replay_without_losses(
 
 
 @pytest.mark.parametrize(
-    ("when", "lease"), [("before", 1), ("during", 1), pytest.param("during", 5, marks=pytest.mark.slow)]
+    ("when", "lease"),
+    [("before", 1), ("during", 1), pytest.param("during", 5, marks=pytest.mark.slow)],
 )
 def test_suspended_reader_gets_all_messages(
     start: Start, endpoint: str, bus: nedbus.Bus, timings: Timings, *, when: str, lease: int
@@ -107,14 +116,18 @@ def test_suspended_reader_gets_all_messages(
             stopped.popen.send_signal(signal.SIGSTOP)
 
     publisher, sending = publish_all(bus, before=stop)
-    process = psutil.Process(stopped.popen.pid)  # on a busy machine, a lease of 1 s may expire before the stop
+    # on a busy machine, a lease of 1 s may expire before the stop
+    process = psutil.Process(stopped.popen.pid)
     wait_for(lambda: process.status() == psutil.STATUS_STOPPED, what="the reader to stop")
     wait_for(lambda: not has_subscriber(publisher), what="the end of the lease")
     assert sending.is_alive()
     stopped.popen.send_signal(signal.SIGCONT)
     sending.join(2 * DEADLINE)
     assert not sending.is_alive()
-    wait_for(lambda: "complete" in stopped.out or stopped.popen.poll() is not None, what="the last message")
+    wait_for(
+        lambda: "complete" in stopped.out or stopped.popen.poll() is not None,
+        what="the last message",
+    )
     assert "complete" in stopped.out, stopped.err
     assert time.monotonic() - begin > lease - 1
     publisher.close()
@@ -131,7 +144,9 @@ def test_messages_of_publishers_started_during_an_outage_are_recovered(
     with nedbus.connect(near) as other, other.subscribe(VLP, mode="every") as subscription:
         router.close()
         wait_for(lambda: not other.connected, what="the end of the link")
-        publishers = [bus.publisher(VLP, vehicle=vehicle, lossless=lossless) for vehicle in vehicles]
+        publishers = [
+            bus.publisher(VLP, vehicle=vehicle, lossless=lossless) for vehicle in vehicles
+        ]
         last = 0
 
         def publish_next() -> None:

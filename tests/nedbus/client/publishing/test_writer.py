@@ -45,7 +45,14 @@ class Stream:
 
         self.on_sent: Callable[[], object] = lambda: None
 
-    def put(self, key: str, payload: bytes, *, congestion_control: zenoh.CongestionControl, priority: object) -> None:
+    def put(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        congestion_control: zenoh.CongestionControl,
+        priority: object,
+    ) -> None:
         """Record a heartbeat; called like `Session.put`."""
         assert (key, congestion_control) == ("key/@adv/pub/ab/7/_", zenoh.CongestionControl.DROP)
         self.sent.append((self.now, payload))
@@ -133,7 +140,11 @@ def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> Non
 
 def test_heartbeat_carries_the_last_sequence_number(stream: Stream) -> None:
     """A heartbeat carries the sequence number of the last message; numbers start at 0 and wrap at 2^32."""
-    for published, payload in ((1, b"\0\0\0\0"), (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"), (2**32, b"\xff" * 4)):
+    for published, payload in (
+        (1, b"\0\0\0\0"),
+        (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"),
+        (2**32, b"\xff" * 4),
+    ):
         stream.publish(published)
         stream.wait(1.0)
         assert stream.sent[-1][1] == payload
@@ -171,7 +182,9 @@ def test_first_messages_on_two_threads_create_one_job(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(writer, "Job", make_job)
     heartbeats = Heartbeats(cast("Session", None))
-    first, second = (threading.Thread(target=heartbeats.resume, args=(FakeWriter(),)) for _ in range(2))
+    first, second = (
+        threading.Thread(target=heartbeats.resume, args=(FakeWriter(),)) for _ in range(2)
+    )
     first.start()
     assert is_creating.wait(DEADLINE)
     second.start()
@@ -179,5 +192,6 @@ def test_first_messages_on_two_threads_create_one_job(monkeypatch: pytest.Monkey
     first.join()
     second.join()
     heartbeats.close()
-    heartbeats.resume(cast("Writer", FakeWriter()))  # a message that another thread puts after `close`
+    # a message that another thread puts after `close`
+    heartbeats.resume(cast("Writer", FakeWriter()))
     assert (created, ended) == (["job"], ["job"])

@@ -72,7 +72,8 @@ class InboxReceivePath(Inbox):
         self._now, self._since_link = 0.0, 0.0
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         limit = setting.capacity if setting.mode == "every" else None
-        super().__init__(setting.mode, decoder, limit=limit, clock=lambda: self._since_link)  # advances between steps
+        # advances between steps
+        super().__init__(setting.mode, decoder, limit=limit, clock=lambda: self._since_link)
 
     def heartbeat(self, key: str, publisher: str, number: int) -> None:
         self.on_heartbeat(key, publisher, number)
@@ -89,8 +90,16 @@ class InboxReceivePath(Inbox):
             self._now += 1.0
             for writer in list(self.gaps.requesting):
                 self.next_request(writer, self._now)
-        opened = [(each, each.request.requested) for each in self.gaps.requesting if each.request is not None]
-        return [Request(writer, writer.name, numbers) for writer, numbers in opened if numbers is not None]
+        opened = [
+            (each, each.request.requested)
+            for each in self.gaps.requesting
+            if each.request is not None
+        ]
+        return [
+            Request(writer, writer.name, numbers)
+            for writer, numbers in opened
+            if numbers is not None
+        ]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
         assert isinstance(request.handle, WriterProxy)
@@ -161,7 +170,8 @@ class Simulation:
         self._reported = 0
         self._runs = [PublisherRun(slot, slot, cache) for slot, cache in enumerate(setting.caches)]
         self._running = list(self._runs)
-        self._newest: dict[int, PublisherRun] = {}  # per key, the run whose newest message arrived last
+        # per key, the run whose newest message arrived last
+        self._newest: dict[int, PublisherRun] = {}
 
     def step(self, name: str, *arguments: int) -> None:
         """Run a step, then check the invariants."""
@@ -183,7 +193,9 @@ class Simulation:
     def restart(self, slot: int) -> None:
         run = self._running[slot % len(self._running)]
         run.cache, run.given_up = 0, True
-        self._running[run.slot] = PublisherRun(len(self._runs), run.slot, self.setting.caches[run.slot])
+        self._running[run.slot] = PublisherRun(
+            len(self._runs), run.slot, self.setting.caches[run.slot]
+        )
         self._runs.append(self._running[run.slot])
 
     def deliver(self, count: int, dropped: int = 0) -> None:
@@ -230,7 +242,9 @@ class Simulation:
         found = [number for bit, number in enumerate(cached) if not missing >> bit & 1]
         run.given_up |= bool(final) and found != cached
         self._add_arrived((run, number) for number in found)
-        self.path.answer(request, [run.sample(number) for number in reversed(found)], final=bool(final))
+        self.path.answer(
+            request, [run.sample(number) for number in reversed(found)], final=bool(final)
+        )
 
     def read(self, count: int, batch: int = 0) -> None:
         while count > 0 and (found := self.path.read(batch=bool(batch))) is not None:
@@ -241,8 +255,14 @@ class Simulation:
                 run = self._runs[index]
                 previous = run.read[-1] if run.read else -1
                 assert previous < number, "out of order or a duplicate"
-                if run.exact and index == run.slot and not (batch or run.invalid or self._slow or self._overflowed):
-                    assert self._latest or found[1] == number - previous - 1, "the next message has another loss"
+                if (
+                    run.exact
+                    and index == run.slot
+                    and not (batch or run.invalid or self._slow or self._overflowed)
+                ):
+                    assert self._latest or found[1] == number - previous - 1, (
+                        "the next message has another loss"
+                    )
                 run.read.append(number)
 
     def settle(self) -> None:
@@ -259,7 +279,9 @@ class Simulation:
         read, self._slow = self.path.counts.received, self._slow or how == "closed"
         self.path.finish(how)
         self.read(UNLIMITED, batch=ending % 2)
-        assert how != "closed" or self.path.counts.received == read, "messages were read after the end"
+        assert how != "closed" or self.path.counts.received == read, (
+            "messages were read after the end"
+        )
         self._check_total()
 
     def _settle(self) -> None:
@@ -275,16 +297,22 @@ class Simulation:
         self._check_total()
         for run in self._runs:
             if self._latest and self._newest.get(run.slot) is run:
-                assert max(run.arrived) in {*run.read, *run.invalid}, "the newest message was not read"
+                assert max(run.arrived) in {*run.read, *run.invalid}, (
+                    "the newest message was not read"
+                )
             complete = run.whole and run.cache == UNLIMITED and not run.given_up
             if complete and not (self._latest or self._slow or self._overflowed):
-                assert run.read == [number for number in range(run.known + 1) if number not in run.invalid]
+                assert run.read == [
+                    number for number in range(run.known + 1) if number not in run.invalid
+                ]
 
     def _check_total(self) -> None:
         assert (self.path.held, self.path.requests()) == (0, []), "messages or requests remain"
         total, most = self._total(), sum(run.known + 1 for run in self._runs)
         least = most - sum(map(self._unknown, self._runs))
-        assert least <= total <= most, f"received + lost + dropped + invalid is {total}, not {least} to {most}"
+        assert least <= total <= most, (
+            f"received + lost + dropped + invalid is {total}, not {least} to {most}"
+        )
 
     def _total(self) -> int:
         counts = self.path.counts
@@ -305,5 +333,7 @@ class Simulation:
             if number > max(run.arrived, default=-1):
                 self._newest[run.slot] = run
             run.arrived.add(number)
-        waiting = (number > max(run.read, default=-1) for run in self._runs for number in run.arrived)
+        waiting = (
+            number > max(run.read, default=-1) for run in self._runs for number in run.arrived
+        )
         self._slow |= sum(waiting) > self.setting.capacity

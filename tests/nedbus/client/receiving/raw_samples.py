@@ -63,8 +63,16 @@ def raw(
     info = None if number is None else source_info(number, publisher)
     if payload is None:
         payload = VALID if timestamp == 1 else Payload(encode(message(timestamp)))
-    read = {"payload": payload, "key_expr": key, "source_info": info, "encoding": encoding, "timestamp": stamp}
-    return cast("RawSample", Raw(**read, kind=zenoh.SampleKind.PUT, congestion_control=congestion_control))
+    read = {
+        "payload": payload,
+        "key_expr": key,
+        "source_info": info,
+        "encoding": encoding,
+        "timestamp": stamp,
+    }
+    return cast(
+        "RawSample", Raw(**read, kind=zenoh.SampleKind.PUT, congestion_control=congestion_control)
+    )
 
 
 def junk(payload: bytes, key: str = KEY) -> RawSample:
@@ -72,7 +80,9 @@ def junk(payload: bytes, key: str = KEY) -> RawSample:
     return raw(None, payload=Payload(payload), key=key)
 
 
-def make_queue(mode: Mode, *, limit: int | None = None, clock: Callable[[], float] = time.monotonic) -> Inbox:
+def make_queue(
+    mode: Mode, *, limit: int | None = None, clock: Callable[[], float] = time.monotonic
+) -> Inbox:
     """Return an empty queue."""
     decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
     return Inbox(mode, decoder, key_exprs=("queue",), limit=limit, clock=clock)

@@ -27,10 +27,14 @@ class AcknowledgingReader:
     def __post_init__(self) -> None:
         self.queue = make_queue("every", clock=lambda: self.now)
 
-    def request(self, number: int, *, read: bool = False, publisher: str = "a", name: str = "") -> list[str]:
+    def request(
+        self, number: int, *, read: bool = False, publisher: str = "a", name: str = ""
+    ) -> list[str]:
         """Send a request; return the names of all acknowledged requests."""
         reply = partial(self.acknowledged.append, name or str(number))
-        self.queue.acknowledge(AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained)
+        self.queue.acknowledge(
+            AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained
+        )
         return self.acknowledged
 
     def read(self, count: int) -> list[str]:
@@ -49,7 +53,9 @@ def reader() -> AcknowledgingReader:
     return AcknowledgingReader()
 
 
-def test_read_is_acknowledged_after_all_earlier_samples_are_read(reader: AcknowledgingReader) -> None:
+def test_read_is_acknowledged_after_all_earlier_samples_are_read(
+    reader: AcknowledgingReader,
+) -> None:
     """A request with `read` is acknowledged once its message and all samples queued before it have been read."""
     reader.put(raw(0))
     reader.request(1, read=True)
@@ -60,7 +66,9 @@ def test_read_is_acknowledged_after_all_earlier_samples_are_read(reader: Acknowl
     assert reader.read(1) == ["1"]  # later samples need not be read
 
 
-def test_unknown_publisher_is_acknowledged_once_the_ring_is_empty(reader: AcknowledgingReader) -> None:
+def test_unknown_publisher_is_acknowledged_once_the_ring_is_empty(
+    reader: AcknowledgingReader,
+) -> None:
     """An unknown publisher's request waits until the ring is empty, because the ring may hold its messages.
 
     A request with `read` also waits until all samples queued at that time have been read.
@@ -97,7 +105,9 @@ def test_reception_is_acknowledged_at_once(reader: AcknowledgingReader) -> None:
 
 
 @pytest.mark.parametrize("payload", [None, INVALID], ids=["valid", "invalid"])
-def test_read_is_acknowledged_when_the_script_reads(reader: AcknowledgingReader, payload: Payload | None) -> None:
+def test_read_is_acknowledged_when_the_script_reads(
+    reader: AcknowledgingReader, payload: Payload | None
+) -> None:
     """A request with `read` is acknowledged once its sample is read, skipped as invalid, or read in a batch."""
     reader.put(raw(0), raw(1, payload=payload))
     reader.request(1, read=True)
@@ -110,7 +120,9 @@ def test_read_is_acknowledged_when_the_script_reads(reader: AcknowledgingReader,
     assert reader.acknowledged == ["1", "3"]
 
 
-def test_request_of_unknown_publisher_waits_while_the_ring_is_drained(reader: AcknowledgingReader) -> None:
+def test_request_of_unknown_publisher_waits_while_the_ring_is_drained(
+    reader: AcknowledgingReader,
+) -> None:
     """An unknown publisher's request waits while another thread drains the ring, which may hold its messages."""
     assert reader.request(7, name="while receiving") == []
     assert reader.put(raw(0, publisher="b")) == ["while receiving"]
@@ -118,7 +130,9 @@ def test_request_of_unknown_publisher_waits_while_the_ring_is_drained(reader: Ac
     assert reader.request(7, name="while idle") == ["while receiving", "while idle"]
 
 
-def test_unknown_publisher_is_not_acknowledged_after_a_link_change(reader: AcknowledgingReader) -> None:
+def test_unknown_publisher_is_not_acknowledged_after_a_link_change(
+    reader: AcknowledgingReader,
+) -> None:
     """After a link change an unknown publisher's request waits, because a heartbeat may still reveal lost messages."""
     reader.drained = True
     reader.queue.on_link_change()
@@ -140,7 +154,7 @@ def test_acknowledgement_waits_until_gap_is_closed(reader: AcknowledgingReader) 
 
 def test_dropped_message_is_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
     """A request with `read` is acknowledged if its message was dropped."""
-    monkeypatch.setattr("nedbus.client.receiving.inbox.CAPACITY", 10)
+    monkeypatch.setattr("nedbus.limits.UNREAD_MESSAGES", 10)
     reader = AcknowledgingReader()
     reader.put(raw(0), raw(1))
     assert reader.request(1, read=True) == []

@@ -43,7 +43,9 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_mode_every_receives_all_samples_in_order(client: nedbus.Bus, publisher: nedbus.Publisher) -> None:
+def test_mode_every_receives_all_samples_in_order(
+    client: nedbus.Bus, publisher: nedbus.Publisher
+) -> None:
     """A reader in mode "every" receives each sample once and in order, and counts no loss."""
     subscription = client.subscribe(VLP, mode="every")
     first = subscription.receive(DEADLINE)
@@ -79,11 +81,15 @@ def test_mode_latest_keeps_samples_of_quiet_vehicles(
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_unread_subscription_does_not_delay_other_readers(
-    client: nedbus.Bus, endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, mode: Mode
+    client: nedbus.Bus,
+    endpoint: str,
+    publisher: nedbus.Publisher,
+    monkeypatch: pytest.MonkeyPatch,
+    mode: Mode,
 ) -> None:
     """A full subscription delays neither other subscriptions of any bus, nor queries, nor its own close."""
     monkeypatch.setattr("nedbus.client.receiving.receiver.RING_CAPACITY", 256)
-    monkeypatch.setattr("nedbus.client.receiving.inbox.CAPACITY", 1000)
+    monkeypatch.setattr("nedbus.limits.UNREAD_MESSAGES", 1000)
     stuck = client.subscribe(VLP, mode=mode)
     with nedbus.connect(endpoint) as other:
         read = [each.subscribe(VLP, mode="every") for each in (client, other)]
@@ -93,7 +99,10 @@ def test_unread_subscription_does_not_delay_other_readers(
             publish(publisher, *numbers)
             assert [receive_timestamps(each, len(numbers)) for each in read] == [list(numbers)] * 2
     wait_for(lambda: stuck.counts.dropped, what="a dropped message")
-    wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000], what="the last message")
+    wait_for(
+        lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000],
+        what="the last message",
+    )
     assert client.subscribe(VLP).receive(DEADLINE).message.timestamp > 0
     with Stopwatch() as watch:
         stuck.close()
@@ -104,7 +113,7 @@ def test_missing_messages_are_counted_exactly(
     endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each message of a flood that exceeds buffers and queue is counted as received, lost or dropped."""
-    monkeypatch.setattr("nedbus.client.receiving.inbox.CAPACITY", 1000)
+    monkeypatch.setattr("nedbus.limits.UNREAD_MESSAGES", 1000)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         first = subscription.receive(DEADLINE)
         total = 6000
@@ -124,7 +133,9 @@ def test_missing_messages_are_counted_exactly(
         assert lost + counts.dropped == missing == total - received > 0
 
 
-def test_two_publishers_of_one_key_lose_nothing(client: nedbus.Bus, bus: nedbus.Bus, endpoint: str) -> None:
+def test_two_publishers_of_one_key_lose_nothing(
+    client: nedbus.Bus, bus: nedbus.Bus, endpoint: str
+) -> None:
     """Publishers of one key have independent sequence numbers, even if one starts after the other has closed."""
     subscription = client.subscribe(VLP, mode="every")
     one = bus.publisher(VLP, vehicle="1")
@@ -155,7 +166,10 @@ def test_two_reading_threads_receive_a_message_each(bus: nedbus.Bus) -> None:
 
 
 def test_invalid_samples_do_not_end_an_iteration(
-    client: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
+    client: nedbus.Bus,
+    zenoh_session: Session,
+    publisher: nedbus.Publisher,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Invalid payloads and keys, deletes and wildcard puts are counted, logged once per key, and skipped."""
     subscription = client.subscribe("*", mode="every")
@@ -176,12 +190,17 @@ def test_invalid_samples_do_not_end_an_iteration(
     assert (sample.vehicle, sample.message, sample.sent) == ("2", message(2, x=1.0), None)
     assert subscription.counts == Counts(received=2, invalid=7)
     warned = warnings(caplog)
-    assert len(warned) == len({text.split(":")[0] for text in warned}), "a key is logged more than once"
+    assert len(warned) == len({text.split(":")[0] for text in warned}), (
+        "a key is logged more than once"
+    )
     assert any("garbage" in text or "not a single msgpack value" in text for text in warned)
 
 
 def test_long_invalid_keys_are_not_kept(
-    bus: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus,
+    zenoh_session: Session,
+    publisher: nedbus.Publisher,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """150 invalid keys of 60 kB are counted but not kept, and logged in at most 100 short lines."""
     subscription = bus.subscribe("*", mode="every")
@@ -189,7 +208,11 @@ def test_long_invalid_keys_are_not_kept(
     tracemalloc.start()
     try:
         for number in range(150):
-            zenoh_session.put(f"nedbus/{number}/{'x' * 60_000}", b"", congestion_control=zenoh.CongestionControl.BLOCK)
+            zenoh_session.put(
+                f"nedbus/{number}/{'x' * 60_000}",
+                b"",
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
         wait_for(lambda: subscription.counts.invalid == 150, what="the count of all")
         allocated, _ = tracemalloc.get_traced_memory()
     finally:
@@ -198,7 +221,9 @@ def test_long_invalid_keys_are_not_kept(
     warned = warnings(caplog)
     assert len(warned) == 100
     assert max(map(len, warned)) < 1000
-    assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [True]
+    assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [
+        True
+    ]
 
 
 @pytest.mark.parametrize("mode", BOTH)
@@ -213,7 +238,9 @@ def test_peer_that_never_replies_does_not_delay_other_streams(
     for layout in range(100, 150):
         encoding = f"{ENCODING};hash={layout:032x}"
         zenoh_session.put(f"nedbus/2/{VLP}", msgpack.packb([layout, 1, 2]), encoding=encoding)
-    wait_for(lambda: subscription.waiting or subscription.counts.invalid, what="the first unknown layout")
+    wait_for(
+        lambda: subscription.waiting or subscription.counts.invalid, what="the first unknown layout"
+    )
     publish(publisher, 1)
     assert receive_timestamps(subscription, 1) == [1]
     wait_for(lambda: subscription.counts.invalid == 50, what="all unknown layouts")
@@ -222,7 +249,10 @@ def test_peer_that_never_replies_does_not_delay_other_streams(
 
 
 def test_samples_are_counted_and_requested_again_after_an_unexpected_error(
-    bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus,
+    publisher: nedbus.Publisher,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """An unexpected error while samples are queued is logged; each counts as invalid and is requested again."""
     subscription = bus.subscribe(mode="every")
@@ -251,7 +281,9 @@ def test_rejection_reports_have_address_and_reason(bus: nedbus.Bus, zenoh_sessio
     ):
         zenoh_session.put(key, payload)
     queries = QueryServer(zenoh_session)
-    PublisherRegistry(zenoh_session, queries, prefix="nedbus", is_client=True).reject(ADDRESS, {"reason": "x" * 1000})
+    PublisherRegistry(zenoh_session, queries, prefix="nedbus", is_client=True).reject(
+        ADDRESS, {"reason": "x" * 1000}
+    )
     reports: list[RejectionReport] = []
 
     def has_arrived() -> bool:
@@ -293,7 +325,9 @@ def test_unread_reports_are_bounded_in_bytes(bus: nedbus.Bus, zenoh_session: Ses
         return sample is not None and b'"reason": "299"' in sample.payload.to_bytes()
 
     wait_for(is_last, what="the last report")
-    assert [report.reason for report in rejections.take()] == [f"{number}" for number in range(50, 300)]
+    assert [report.reason for report in rejections.take()] == [
+        f"{number}" for number in range(50, 300)
+    ]
     rejections.close()
     newest.undeclare()
 
@@ -310,7 +344,9 @@ def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:
         bus.rejections()
 
 
-def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, endpoint: str) -> None:
+def test_receiving_a_sample_needs_few_python_calls(
+    publisher: nedbus.Publisher, endpoint: str
+) -> None:
     """A reader that waits for each sample needs at most 25 Python calls, in six classes, to receive it."""
     called: list[list[str]] = []
 

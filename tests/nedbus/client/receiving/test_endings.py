@@ -58,7 +58,9 @@ def test_closed_bus_counts_unread_messages(unread: nedbus.Subscription[Any]) -> 
     assert unread.counts == Counts(dropped=COUNT)
 
 
-def test_drained_subscription_is_read_to_its_end(unread: nedbus.Subscription[Any], publisher: nedbus.Publisher) -> None:
+def test_drained_subscription_is_read_to_its_end(
+    unread: nedbus.Subscription[Any], publisher: nedbus.Publisher
+) -> None:
     """After `drain` no message is received; iteration returns those received before, then ends."""
     unread.drain()
     publish(publisher, 1000)
@@ -68,7 +70,9 @@ def test_drained_subscription_is_read_to_its_end(unread: nedbus.Subscription[Any
     assert unread.counts == Counts(received=COUNT)
 
 
-def test_rest_of_a_drained_subscription_is_dropped_by_close(unread: nedbus.Subscription[Any]) -> None:
+def test_rest_of_a_drained_subscription_is_dropped_by_close(
+    unread: nedbus.Subscription[Any],
+) -> None:
     """`close` after `drain` counts what has not been read."""
     unread.drain()
     unread.drain()
@@ -105,7 +109,10 @@ def test_async_subscription_is_drained(publisher: nedbus.Publisher, endpoint: st
     """`await drain()` lets `async for` read what has been received; `await close()` counts the rest as dropped."""
 
     async def scenario(count: int, *, drains: bool) -> Counts:
-        async with nedbus.connect_async(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+        async with (
+            nedbus.connect_async(endpoint) as bus,
+            bus.subscribe(VLP, mode="every") as subscription,
+        ):
             await asyncio.to_thread(wait_for_subscriber, publisher)
             await asyncio.to_thread(publish, publisher, *range(2, COUNT + 2))
             while subscription.waiting < count:
@@ -122,7 +129,9 @@ def test_async_subscription_is_drained(publisher: nedbus.Publisher, endpoint: st
     assert asyncio.run(scenario(with_retained, drains=False)) == Counts(dropped=with_retained)
 
 
-def test_stopped_recorder_writes_all_received_messages(unread: nedbus.Subscription[Any], tmp_path: Path) -> None:
+def test_stopped_recorder_writes_all_received_messages(
+    unread: nedbus.Subscription[Any], tmp_path: Path
+) -> None:
     """A recorder that is stopped, even at once, writes what its subscription has received."""
     stop, path = threading.Event(), tmp_path / "a.mcap"
     stop.set()

@@ -19,7 +19,9 @@ def fleet(bus: nedbus.Bus) -> list[nedbus.Publisher]:
     return [bus.publisher(VehicleLocalPosition, vehicle=vehicle) for vehicle in "12345"]
 
 
-def test_keys_of_received_streams_are_declared(fleet: list[nedbus.Publisher], endpoint: str) -> None:
+def test_keys_of_received_streams_are_declared(
+    fleet: list[nedbus.Publisher], endpoint: str
+) -> None:
     """A reader declares the key of each stream that it has received, and receives its messages as before."""
     with nedbus.connect(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
         for number in (1, 2):
@@ -29,7 +31,9 @@ def test_keys_of_received_streams_are_declared(fleet: list[nedbus.Publisher], en
             assert sorted((sample.vehicle, sample.message.timestamp) for sample in received) == [
                 (vehicle, number) for vehicle in "12345"
             ]
-            wait_for(lambda: sorted(subscription._receiver._declared) == KEYS, what="the declarations")
+            wait_for(
+                lambda: sorted(subscription._receiver._declared) == KEYS, what="the declarations"
+            )
         subscription.close()
         assert not subscription._receiver._declared
 
@@ -47,4 +51,7 @@ def test_number_of_declared_keys_is_bounded(
             subscription.receive(DEADLINE)
             wait_for(lambda: not known._inbox.streams.opened, what="the declaration")
             assert len(known._declared) <= 2
-        wait_for(lambda: not set(known._declared) & set(KEYS[:2]), what="the evicted keys to be undeclared")
+        wait_for(
+            lambda: not set(known._declared) & set(KEYS[:2]),
+            what="the evicted keys to be undeclared",
+        )

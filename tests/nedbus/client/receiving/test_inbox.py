@@ -15,18 +15,16 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus import Batch, Counts, Mode
+from nedbus import Batch, Counts, Mode, limits
 from nedbus.client.receiving import (
     Decoder,
     Inbox,
     LayoutLookup,
-    inbox as module,
     streams as streams_module,
     unread as unread_module,
 )
 from nedbus.client.receiving.arrival import Stream
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
-from nedbus.client.receiving.unread import CAPACITY
 from nedbus.client.receiving.writer_proxy import NUMBERS, WriterProxy
 from nedbus.timings import Timings
 from nedbus.transport import RawSample
@@ -57,7 +55,11 @@ STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_first_reply_of_a_publisher_is_retained(mode: Mode) -> None:
     """The first sample of a publisher is marked as retained if it is a reply to the query for the last message."""
-    inbox, block, drop = make_queue(mode), zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+    inbox, block, drop = (
+        make_queue(mode),
+        zenoh.CongestionControl.BLOCK,
+        zenoh.CongestionControl.DROP,
+    )
     arriving = [(4, "a", block), (5, "a", block), (6, "a", drop), (1, "b", drop), (2, "b", block)]
     seen = []
     for number, publisher, control in arriving:
@@ -98,8 +100,12 @@ def test_counters_are_changed_with_the_lock(form: str) -> None:
     assert inbox.counts == Counts(received=2, lost=2, invalid=1)
 
 
-@pytest.mark.parametrize(("before", "after"), [(0, 0), (0, 1), (0, 20), (1, 0), (1, 1), (3, 3), (20, 0)])
-def test_number_from_another_publisher_does_not_continue_a_sequence(before: int, after: int) -> None:
+@pytest.mark.parametrize(
+    ("before", "after"), [(0, 0), (0, 1), (0, 20), (1, 0), (1, 1), (3, 3), (20, 0)]
+)
+def test_number_from_another_publisher_does_not_continue_a_sequence(
+    before: int, after: int
+) -> None:
     """A message of publisher b, with the number that publisher a sends next, leaves the gap of a open."""
     inbox = make_queue("every")
     inbox.put([raw(0), raw(0, publisher="b"), raw(1)])
@@ -124,8 +130,12 @@ def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPa
     assert inbox.counts == Counts(received=14, lost=1)
 
 
-@pytest.mark.parametrize(("before", "after", "lost"), [(-4, -2, 0), (-4, -1, 2), (-2, 0, 1), (-3, 1, 3), (-1, 2, 0)])
-def test_gap_across_the_wrap_of_sequence_numbers_is_lost(before: int, after: int, lost: int) -> None:
+@pytest.mark.parametrize(
+    ("before", "after", "lost"), [(-4, -2, 0), (-4, -1, 2), (-2, 0, 1), (-3, 1, 3), (-1, 2, 0)]
+)
+def test_gap_across_the_wrap_of_sequence_numbers_is_lost(
+    before: int, after: int, lost: int
+) -> None:
     """A gap up to the highest sequence number, or across it, counts as lost at once; others are requested."""
     inbox = make_queue("every")
     inbox.put([raw(before % NUMBERS), raw(after % NUMBERS, timestamp=2)])
@@ -142,13 +152,16 @@ def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
     for number in range(1, 6):
         now += 0.9 * timings.retransmit_timeout
         assert inbox.next_request(writer, now) == range(number, 6)
-        inbox.on_retransmission(writer, {number: raw(number, timestamp=number)}, ended=True, now=now)
+        inbox.on_retransmission(
+            writer, {number: raw(number, timestamp=number)}, ended=True, now=now
+        )
     assert timestamps(inbox) == [1, 1, 2, 3, 4, 5, 6]
     assert inbox.counts == Counts(received=7)
 
 
 @pytest.mark.parametrize(
-    ("seconds", "requested"), [(None, range(5, 6)), (0.0, range(6)), (9.0, range(6)), (11.0, range(5, 6))]
+    ("seconds", "requested"),
+    [(None, range(5, 6)), (0.0, range(6)), (9.0, range(6)), (11.0, range(5, 6))],
 )
 def test_heartbeat_of_an_unknown_publisher_requests_what_the_outage_may_have_lost(
     seconds: float | None, requested: range
@@ -173,7 +186,9 @@ def test_heartbeat_of_an_unknown_publisher_requests_what_the_outage_may_have_los
 
 
 @pytest.mark.parametrize("when", ["during a gap", "after it"])
-def test_unresponsive_publisher_gets_more_than_one_request_after_a_link_change(timings: Timings, when: str) -> None:
+def test_unresponsive_publisher_gets_more_than_one_request_after_a_link_change(
+    timings: Timings, when: str
+) -> None:
     """A publisher that did not answer gets one request per gap, until a link change: perhaps its link was down."""
     inbox, now = make_queue("every"), 100.0
 
@@ -235,14 +250,25 @@ def test_gap_within_a_batch_is_reported_by_the_sample_after_it() -> None:
 def test_mode_latest_keeps_the_newest_of_each_key(caplog: pytest.LogCaptureFixture) -> None:
     """A newer sample of a key replaces the queued one, which counts as dropped, without a warning."""
     inbox = make_queue("latest")
-    put(inbox, [raw(0, key=OTHER_KEY, publisher="b"), *(raw(each, timestamp=each) for each in range(1, 1001))])
+    put(
+        inbox,
+        [
+            raw(0, key=OTHER_KEY, publisher="b"),
+            *(raw(each, timestamp=each) for each in range(1, 1001)),
+        ],
+    )
     assert inbox.counts == Counts(dropped=999)
-    assert [(each.vehicle, each.message.timestamp) for each in drain(inbox)] == [("2", 1), ("1", 1000)]
+    assert [(each.vehicle, each.message.timestamp) for each in drain(inbox)] == [
+        ("2", 1),
+        ("1", 1000),
+    ]
     assert inbox.counts == Counts(received=2, dropped=999)
     assert not caplog.messages
 
 
-def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_samples_are_counted_and_logged_once_per_key(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Invalid samples are counted, and logged once per key; valid samples between them arrive.
 
     A payload of unusual size is decoded before it can replace a valid sample.
@@ -317,7 +343,14 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(streams_module, "MAX_KEYS", 3)
     now = [0.0]
     inbox = make_queue("every", clock=lambda: now[0])
-    for vehicle, numbers in [("a", [0, 5]), ("b", [0]), ("c", [0, 3]), ("d", [0]), ("d", [2]), ("e", [0])]:
+    for vehicle, numbers in [
+        ("a", [0, 5]),
+        ("b", [0]),
+        ("c", [0, 3]),
+        ("d", [0]),
+        ("d", [2]),
+        ("e", [0]),
+    ]:
         now[0] += 1.0
         inbox.put([raw(number, key=key_of(vehicle), publisher=vehicle) for number in numbers])
     assert inbox.counts == Counts(lost=4, forgotten=2)  # b, then a
@@ -385,7 +418,7 @@ def test_queue_wait_returns_on_sample_wake_end_or_timeout() -> None:
 @pytest.fixture
 def small_queue(monkeypatch: pytest.MonkeyPatch) -> Inbox:
     """Return a queue for mode `every` that holds 10 samples, at most 4 of them with their receive buffers."""
-    monkeypatch.setattr(module, "CAPACITY", 10)
+    monkeypatch.setattr(limits, "UNREAD_MESSAGES", 10)
     monkeypatch.setattr(unread_module, "_MAX_FRESH", 4)
     return make_queue("every")
 
@@ -393,12 +426,12 @@ def small_queue(monkeypatch: pytest.MonkeyPatch) -> Inbox:
 def test_documented_capacity_is_that_of_the_queue() -> None:
     """A queue in mode `every` holds as many unread samples as the documentation states, and one more drops one."""
     queue = make_queue("every")
-    put(queue, [raw(None)] * CAPACITY)
+    put(queue, [raw(None)] * limits.UNREAD_MESSAGES)
     assert queue.counts.dropped == 0
     put(queue, [raw(None)])
     assert queue.counts.dropped == 1
     for page in ("docs/data.md", "CONTRIBUTING.md"):
-        assert f"{CAPACITY:,}" in (Path(__file__).parents[4] / page).read_text(), page
+        assert f"{limits.UNREAD_MESSAGES:,}" in (Path(__file__).parents[4] / page).read_text(), page
 
 
 def test_oldest_samples_are_dropped_counted_and_logged_once(
@@ -406,10 +439,15 @@ def test_oldest_samples_are_dropped_counted_and_logged_once(
 ) -> None:
     """A full queue drops the oldest samples, which count as dropped, not as lost, and are logged once."""
     for start in range(0, 40, 10):
-        assert (small_queue.counts, len(caplog.messages)) == (Counts(dropped=max(0, start - 10)), start > 10)
+        assert (small_queue.counts, len(caplog.messages)) == (
+            Counts(dropped=max(0, start - 10)),
+            start > 10,
+        )
         put(small_queue, [raw(number, timestamp=number + 1) for number in range(start, start + 10)])
     samples = drain(small_queue)
-    assert [(sample.message.timestamp, sample.lost) for sample in samples] == [(each, 0) for each in range(31, 41)]
+    assert [(sample.message.timestamp, sample.lost) for sample in samples] == [
+        (each, 0) for each in range(31, 41)
+    ]
     assert small_queue.counts == Counts(received=10, dropped=30)
     assert caplog.messages == ["queue: the reader is slower than the data, so messages are dropped"]
 
@@ -418,12 +456,21 @@ def test_losses_before_dropped_samples_are_reported_later(small_queue: Inbox) ->
     """A loss in transit is reported by a later sample of the key if the sample after the gap was dropped."""
     put(
         small_queue,
-        [raw(0), raw(3), raw(0, key=OTHER_KEY, publisher="b"), raw(2, key=OTHER_KEY, publisher="b"), raw(5)],
+        [
+            raw(0),
+            raw(3),
+            raw(0, key=OTHER_KEY, publisher="b"),
+            raw(2, key=OTHER_KEY, publisher="b"),
+            raw(5),
+        ],
     )
     put(small_queue, [raw(number) for number in range(6, 15)])
     put(small_queue, [raw(3, key=OTHER_KEY, publisher="b")])
     samples = drain(small_queue)
-    assert [(sample.vehicle, sample.lost) for sample in samples if sample.lost] == [("1", 3), ("2", 1)]
+    assert [(sample.vehicle, sample.lost) for sample in samples if sample.lost] == [
+        ("1", 3),
+        ("2", 1),
+    ]
     assert samples[-1].vehicle == "2"
     assert small_queue.counts == Counts(received=10, lost=4, dropped=5)
 
@@ -456,7 +503,10 @@ def test_waiting_samples_release_their_receive_buffer(small_queue: Inbox, in_bat
     Detached samples keep their sequence number, timestamp and provenance.
     """
     encodings = [encoding_of(f"source{number}", frozenset({"timestamp"})) for number in range(9)]
-    arriving = [raw(number, stamp=STAMP if number % 2 else None, encoding=encodings[number]) for number in range(9)]
+    arriving = [
+        raw(number, stamp=STAMP if number % 2 else None, encoding=encodings[number])
+        for number in range(9)
+    ]
     arrived = [weakref.ref(each) for each in arriving]
     while arriving:
         put(small_queue, [arriving.pop(0)])
@@ -468,9 +518,16 @@ def test_waiting_samples_release_their_receive_buffer(small_queue: Inbox, in_bat
         sent, provenances = batch.sent.tolist(), list(batch.provenances)
     else:
         samples = drain(small_queue)
-        sent, provenances = [sample.sent or 0 for sample in samples], [sample.provenance for sample in samples]
-    assert sent == [STAMP.get_time_as_ntp64().as_nanos() if number % 2 else 0 for number in range(9)]
-    assert [(each.source, len(each.missing)) for each in provenances] == [(f"source{each}", 52) for each in range(9)]
+        sent, provenances = (
+            [sample.sent or 0 for sample in samples],
+            [sample.provenance for sample in samples],
+        )
+    assert sent == [
+        STAMP.get_time_as_ntp64().as_nanos() if number % 2 else 0 for number in range(9)
+    ]
+    assert [(each.source, len(each.missing)) for each in provenances] == [
+        (f"source{each}", 52) for each in range(9)
+    ]
 
 
 class Encoding(str):
@@ -527,9 +584,17 @@ ATTITUDE = Payload(encode(VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))))
 UNDEFINED = f"application/msgpack;px4_msgs/FooBar;hash={'0' * 32}"
 
 
-def undefined(payload: bytes = VALID, *, number: int | None = None, publisher: str = "a") -> RawSample:
+def undefined(
+    payload: bytes = VALID, *, number: int | None = None, publisher: str = "a"
+) -> RawSample:
     """Return a sample of a message whose definition no publisher has."""
-    return raw(number, key="nedbus/1/foo_bar", payload=Payload(payload), encoding=UNDEFINED, publisher=publisher)
+    return raw(
+        number,
+        key="nedbus/1/foo_bar",
+        payload=Payload(payload),
+        encoding=UNDEFINED,
+        publisher=publisher,
+    )
 
 
 def test_messages_left_by_a_batch_are_read_next() -> None:
@@ -566,7 +631,9 @@ class LateLookup(LayoutLookup):
 
 
 @pytest.mark.parametrize("rows", [False, True])
-def test_message_without_an_available_definition_is_invalid(rows: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_message_without_an_available_definition_is_invalid(
+    rows: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     """A reader skips a message of an unknown definition; it counts as invalid, and the log has the reason."""
     inbox = make_queue("every")
     put(inbox, [undefined(number=0), raw(0)])
@@ -588,7 +655,13 @@ def test_definition_that_arrives_while_a_batch_is_decoded_does_not_apply_to_a_pa
 
     def put_three(first: int) -> None:
         numbers = range(first, first + 3)
-        put(inbox, [raw(each, key="nedbus/1/range_beacon", payload=payload, encoding=encoding) for each in numbers])
+        put(
+            inbox,
+            [
+                raw(each, key="nedbus/1/range_beacon", payload=payload, encoding=encoding)
+                for each in numbers
+            ],
+        )
 
     put_three(0)
     assert inbox.pop_batch() is None
@@ -671,7 +744,7 @@ def test_samples_and_batches_report_each_loss_once() -> None:
 
 def test_superseded_messages_free_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """In mode `latest`, only the newest message of a key counts towards the limit of bytes."""
-    monkeypatch.setattr(unread_module, "MAX_UNREAD_BYTES", 5 * len(VALID) // 2)
+    monkeypatch.setattr(limits, "UNREAD_BYTES", 5 * len(VALID) // 2)
     inbox = make_queue("latest")
     for number in range(3):
         put(inbox, [raw(number, timestamp=number + 1)])
@@ -679,7 +752,9 @@ def test_superseded_messages_free_their_memory(monkeypatch: pytest.MonkeyPatch) 
     assert inbox.counts == Counts(received=1, dropped=2)
 
 
-@pytest.mark.parametrize(("back", "is_late"), [(1, True), (1000, True), (65_536, True), (65_537, False)])
+@pytest.mark.parametrize(
+    ("back", "is_late"), [(1, True), (1000, True), (65_536, True), (65_537, False)]
+)
 def test_step_back_by_more_than_65_536_numbers_is_a_restart(back: int, *, is_late: bool) -> None:
     """A message up to 65,536 numbers back is late, and discarded; beyond that, its publisher has restarted."""
     inbox = make_queue("every")

@@ -17,7 +17,9 @@ from tests.waits import DEADLINE, wait_for
 FIELDS = {"timestamp": "uint64", "x": "float32"}
 
 
-def look_up(lookup: LayoutLookup, hashes: Iterable[str], name: str = "VehicleLocalPosition") -> None:
+def look_up(
+    lookup: LayoutLookup, hashes: Iterable[str], name: str = "VehicleLocalPosition"
+) -> None:
     """Look up the definitions with these hashes, and wait for the replies."""
     for each in hashes:
         lookup.codec(name, each)
@@ -42,7 +44,17 @@ def test_failed_lookups_back_off() -> None:
     while now < 250.0:
         look_up(lookup, hashes)
         now += 0.5
-    assert sorted({when for when, _ in queried}) == [0.0, 0.5, 2.5, 7.5, 17.5, 47.5, 107.5, 167.5, 227.5]
+    assert sorted({when for when, _ in queried}) == [
+        0.0,
+        0.5,
+        2.5,
+        7.5,
+        17.5,
+        47.5,
+        107.5,
+        167.5,
+        227.5,
+    ]
     assert len(queried) == len(set(queried)) == 9 * len(hashes)
 
 
@@ -58,8 +70,14 @@ def test_unknown_fields_are_truncated_in_the_log(caplog: pytest.LogCaptureFixtur
     """The unknown fields of a newer layout are logged as one short line, and an invalid name is truncated."""
     many = FIELDS | {f"x{number}_{40 * 'x'}": "uint8" for number in range(100)}
     for fields, start in (
-        (many, "a layout of VehicleLocalPosition is newer than this reader; ignored fields: x0_xxx"),
-        (FIELDS | {100_000 * "x": "uint8"}, "ignored a peer's definition of VehicleLocalPosition: invalid field name"),
+        (
+            many,
+            "a layout of VehicleLocalPosition is newer than this reader; ignored fields: x0_xxx",
+        ),
+        (
+            FIELDS | {100_000 * "x": "uint8"},
+            "ignored a peer's definition of VehicleLocalPosition: invalid field name",
+        ),
     ):
         caplog.clear()
         known: Schemas = {("VehicleLocalPosition", "hash"): fields}
@@ -137,7 +155,8 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
         return {each: {"timestamp": "uint64"} for each in schema_ids if each[0] == "Honest"}
 
     lookup = LayoutLookup(find)
-    lookup._wait_budget, lookup._budget_time = 0.0, time.monotonic()  # the state after 3 s of futile waits
+    # the state after 3 s of futile waits
+    lookup._wait_budget, lookup._budget_time = 0.0, time.monotonic()
     start = time.monotonic()
     for number in range(5000):
         assert lookup.codec("Evil", str(number), wait=True) is None
@@ -164,14 +183,18 @@ def test_wait_for_an_unanswered_lookup_uses_up_the_budget(timings: Timings) -> N
     lookup.close()
 
 
-def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_memory_for_definitions_is_bounded(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The total number of fields is bounded; definitions that exceed the bound are rejected, and logged once.
 
     Definitions no longer in use are evicted, least recently used first.
     """
     now = 0.0
     monkeypatch.setattr(layout_lookup, "_MAX_FIELDS", 10 * (1 + layout_lookup._BASE))
-    lookup = LayoutLookup(lambda schema_ids: {each: {"timestamp": "uint64"} for each in schema_ids}, now=lambda: now)
+    lookup = LayoutLookup(
+        lambda schema_ids: {each: {"timestamp": "uint64"} for each in schema_ids}, now=lambda: now
+    )
     known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
     assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
     assert lookup.codec("Honest", "0") is known[0]
@@ -179,5 +202,8 @@ def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, capl
     now += 3600.0
     assert lookup.codec("Honest", "0") is known[0]
     assert lookup.codec("Honest", "new", wait=True)
-    assert [lookup.codec("Honest", str(number)) is known[number] for number in (0, 2)] == [True, True]
+    assert [lookup.codec("Honest", str(number)) is known[number] for number in (0, 2)] == [
+        True,
+        True,
+    ]
     assert len(lookup._known) == 10

@@ -14,11 +14,18 @@ from nedbus import Mode
 
 from .loss_model import UNLIMITED, InboxReceivePath, InitialState, Simulation
 
-SLOT, POSITION, COUNT, FLAG = st.integers(0, 2), st.integers(0, 40), st.integers(1, 12), st.integers(0, 1)
+SLOT, POSITION, COUNT, FLAG = (
+    st.integers(0, 2),
+    st.integers(0, 40),
+    st.integers(1, 12),
+    st.integers(0, 1),
+)
 MISSING = st.sampled_from([0, 0, -1]) | st.integers(0, 255)
 
 
-def step(name: str, *arguments: st.SearchStrategy[int], when: str = "simulation") -> Callable[..., None]:
+def step(
+    name: str, *arguments: st.SearchStrategy[int], when: str = "simulation"
+) -> Callable[..., None]:
     """Return a Hypothesis rule for a step of the simulation, enabled if the attribute `when` is not empty."""
 
     def run_step(machine: LossMachine, arguments: tuple[int, ...]) -> None:
@@ -69,7 +76,10 @@ SEEDS = [
     # 0 replaces 1, which is newer.
     (InitialState("latest"), "publish 0 2, delay 0 1, deliver 2"),
     # 0 of the second run arrives before 1 of the first run, which is the latest by arrival.
-    (InitialState("latest"), "publish 0 2, deliver 1, restart 0, publish 0 1, delay 0 1, deliver 2"),
+    (
+        InitialState("latest"),
+        "publish 0 2, deliver 1, restart 0, publish 0 1, delay 0 1, deliver 2",
+    ),
     # 1 counts as lost before it arrives.
     (InitialState("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
     # 1 and 2 are requested, but only 2 arrives: 1 is lost and not requested again.
@@ -77,9 +87,15 @@ SEEDS = [
     # The first run sent 0 to 5: 6 of the second run was taken for 6 of the first run, read too early, and read again.
     (InitialState(), "publish 0 6, deliver 6, link 1, restart 0, publish 0 8, drop 0 6, deliver 2"),
     # 1 is requested and 2 announced by a heartbeat when the publisher disappears: 1 is lost, 2 is not counted.
-    (InitialState(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),
+    (
+        InitialState(),
+        "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0",
+    ),
     # The cache has 2 to 4, then 3 to 5: 1 is lost, and 5 is still requested.
-    (InitialState(caches=(3,)), "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1"),
+    (
+        InitialState(caches=(3,)),
+        "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1",
+    ),
     # 1 and 3 are missing, and the cache has 3 to 5: 2, which has arrived, is not skipped.
     (InitialState(caches=(3,)), "publish 0 6, deliver 1, drop 0 1, drop 1 1"),
 ]

@@ -24,7 +24,9 @@ DOWNSAMPLED = f"{KEY}/@rate/5"
 
 def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateInbox:
     """Return an empty queue."""
-    return MaxRateInbox(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate)
+    return MaxRateInbox(
+        mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate
+    )
 
 
 class Clock:
@@ -45,10 +47,17 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def at(
-    sent: float, number: int | None, *, key: str = DOWNSAMPLED, timestamp: int | None = None, publisher: str = "a"
+    sent: float,
+    number: int | None,
+    *,
+    key: str = DOWNSAMPLED,
+    timestamp: int | None = None,
+    publisher: str = "a",
 ) -> RawSample:
     """Return a sample sent at the time `sent` [s]; the timestamp of its message is that time in milliseconds."""
-    stamp = SimpleNamespace(get_time_as_ntp64=lambda: SimpleNamespace(as_nanos=lambda: round(sent * 1e9)))
+    stamp = SimpleNamespace(
+        get_time_as_ntp64=lambda: SimpleNamespace(as_nanos=lambda: round(sent * 1e9))
+    )
     timestamp = round(sent * 1000) if timestamp is None else timestamp
     return raw(number, timestamp=timestamp, key=key, publisher=publisher, stamp=stamp)
 
@@ -108,8 +117,12 @@ def test_message_after_restart_with_an_earlier_clock_passes() -> None:
     assert timestamps(queue) == [1_000_000, 5000, 5200]
 
 
-@pytest.mark.parametrize(("earlier", "expected"), [(1.5, [10_000, 11_000]), (3.0, [10_000, 7_000, 11_000])])
-def test_downsampled_message_that_the_last_one_overtook_is_omitted(earlier: float, expected: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("earlier", "expected"), [(1.5, [10_000, 11_000]), (3.0, [10_000, 7_000, 11_000])]
+)
+def test_downsampled_message_that_the_last_one_overtook_is_omitted(
+    earlier: float, expected: list[int]
+) -> None:
     """The query for the last message may be 2 s ahead of the stream; an earlier message shows a clock set back."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])

@@ -63,7 +63,9 @@ def test_requested_rate_is_received(
 
 def test_invalid_max_rate_raises(client: nedbus.Bus) -> None:
     """Both clients raise ArgumentError for an invalid `max_rate`."""
-    with pytest.raises(nedbus.ArgumentError, match="max_rate 0 is not valid: expected messages per second"):
+    with pytest.raises(
+        nedbus.ArgumentError, match="max_rate 0 is not valid: expected messages per second"
+    ):
         client.subscribe(max_rate=0)
     with pytest.raises(nedbus.ArgumentError, match="max_rate nan is not valid"):
         client.subscribe(VLP, max_rate=math.nan)
@@ -72,7 +74,10 @@ def test_invalid_max_rate_raises(client: nedbus.Bus) -> None:
 def test_each_stream_is_downsampled_separately(bus: nedbus.Bus, clock: Clock) -> None:
     """Each stream of a selection is downsampled separately and keeps its address and instance."""
     addresses = [Address("1", VLP), Address("2", VLP), Address("2", "estimator_local_position", 3)]
-    publishers = [bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in addresses]
+    publishers = [
+        bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance)
+        for each in addresses
+    ]
     for publisher in publishers:
         publisher.publish(message(0))
     with bus.subscribe("*", mode="every", max_rate=10) as subscription:
@@ -84,13 +89,18 @@ def test_each_stream_is_downsampled_separately(bus: nedbus.Bus, clock: Clock) ->
                 publisher.publish(message(timestamp))
         taken = [subscription.receive(DEADLINE) for _ in range(30)]
     for address in addresses:
-        assert [each.message.timestamp for each in taken if each.address == address] == list(range(1, 101, 10))
+        assert [each.message.timestamp for each in taken if each.address == address] == list(
+            range(1, 101, 10)
+        )
 
 
 def test_downsampled_messages_are_unchanged(bus: nedbus.Bus, clock: Clock) -> None:
     """Downsampled messages have the payload, source, missing fields and time of sending of the original stream."""
     publisher = bus.publisher(VLP, vehicle="7", source="ins")
-    with bus.subscribe(VLP, mode="every") as full, bus.subscribe(VLP, mode="every", max_rate=5) as downsampled:
+    with (
+        bus.subscribe(VLP, mode="every") as full,
+        bus.subscribe(VLP, mode="every", max_rate=5) as downsampled,
+    ):
         wait_for_downsampling_reader(publisher)
         wait_for_subscriber(publisher)
         clock.now += 10 * MS
@@ -116,7 +126,11 @@ def test_publish_many_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
 
 def downsampled_streams(zenoh_session: Session) -> list[str]:
     """Return the declared downsampled streams, by their liveliness tokens."""
-    return [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("nedbus/**/@rate/*") if reply.ok]
+    return [
+        str(reply.ok.key_expr)
+        for reply in zenoh_session.liveliness().get("nedbus/**/@rate/*")
+        if reply.ok
+    ]
 
 
 def test_downsampled_streams_are_declared_only_while_they_have_readers(
@@ -166,12 +180,19 @@ def test_closed_publishers_leave_no_listeners(bus: nedbus.Bus, clock: Clock) -> 
         assert subscription.counts == nedbus.Counts(received=11)
 
 
-def test_last_messages_of_a_storage_are_ignored(bus: nedbus.Bus, zenoh_session: Session, clock: Clock) -> None:
+def test_last_messages_of_a_storage_are_ignored(
+    bus: nedbus.Bus, zenoh_session: Session, clock: Clock
+) -> None:
     """A subscription with a maximum rate starts with the last messages of publishers, not of a storage."""
-    stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=zenoh_session.new_timestamp())
+    stored = reply_with(
+        {f"nedbus/8/{VLP}": encode(message(99))}, timestamp=zenoh_session.new_timestamp()
+    )
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
-    with answer_queries(zenoh_session, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
+    with (
+        answer_queries(zenoh_session, f"nedbus/*/{VLP}", stored),
+        bus.subscribe(VLP, max_rate=5) as subscription,
+    ):
         assert subscription.receive(DEADLINE).vehicle == "7"
         wait_for_downsampling_reader(publisher)
         publish(publisher, clock, 2, 1)
@@ -179,7 +200,11 @@ def test_last_messages_of_a_storage_are_ignored(bus: nedbus.Bus, zenoh_session: 
 
 
 def publish_across_outage(
-    publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any], clock: Clock, link: Link, seconds: int
+    publisher: nedbus.Publisher,
+    subscription: nedbus.Subscription[Any],
+    clock: Clock,
+    link: Link,
+    seconds: int,
 ) -> list[nedbus.Sample[Any]]:
     """Publish at 100 Hz for 1 s, then for `seconds` in an outage; return the samples up to the first one after it."""
     take_last(publisher, subscription)
@@ -237,10 +262,15 @@ def test_losses_in_an_outage_of_up_to_20_s_are_recovered(
         assert lost == 0 if seconds == 10 else lost > 0
 
 
-def test_lossless_publisher_does_not_wait_for_downsampling_reader(endpoint: str, bus: nedbus.Bus) -> None:
+def test_lossless_publisher_does_not_wait_for_downsampling_reader(
+    endpoint: str, bus: nedbus.Bus
+) -> None:
     """A lossless publisher neither waits for a reader of a downsampled stream nor exceeds the rate of that stream."""
     publisher = bus.publisher(VLP, vehicle="7", lossless=True)
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=1) as subscription:
+    with (
+        nedbus.connect(endpoint) as other,
+        other.subscribe(VLP, mode="every", max_rate=1) as subscription,
+    ):
         wait_for_downsampling_reader(publisher)
         start = time.monotonic()
 
@@ -257,7 +287,9 @@ def test_lossless_publisher_does_not_wait_for_downsampling_reader(endpoint: str,
 
 
 @pytest.mark.parametrize(("mode", "slow_end"), [("latest", "reader"), ("every", "vehicle")])
-def test_slow_link_carries_only_the_requested_rate(endpoint: str, clock: Clock, mode: Mode, slow_end: str) -> None:
+def test_slow_link_carries_only_the_requested_rate(
+    endpoint: str, clock: Clock, mode: Mode, slow_end: str
+) -> None:
     """With `max_rate=5`, a 100 Hz stream needs less than 5 kB/s on the reader's link and on the vehicle's link."""
     with closing(Link(endpoint)) as link:
         near, far = (link.endpoint, endpoint) if slow_end == "reader" else (endpoint, link.endpoint)
@@ -287,10 +319,15 @@ def test_stream_that_is_not_downsampled_is_logged_once(
 ) -> None:
     """A stream that its publisher does not downsample is not received, not even at full rate; this is logged once."""
     put, disabled = Downsampler.put, []
-    monkeypatch.setattr(Downsampler, "put", lambda self, *args: None if self in disabled else put(self, *args))
+    monkeypatch.setattr(
+        Downsampler, "put", lambda self, *args: None if self in disabled else put(self, *args)
+    )
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
     disabled.append(publishers[1]._downsampler)
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
+    with (
+        nedbus.connect(endpoint) as other,
+        other.subscribe(VLP, mode="every", max_rate=10) as subscription,
+    ):
         wait_for_downsampling_reader(publishers[0])
         for publisher in publishers:
             publish(publisher, clock, 1, 20)
@@ -300,7 +337,11 @@ def test_stream_that_is_not_downsampled_is_logged_once(
             subscription.receive(timeout=0.0)
         timings.downsampled_timeout = 0.0
         wait_for(lambda: "no downsampled messages" in caplog.text, what="the warning")
-        assert caplog.text.count(f"of {publishers[1].key} arrive") == caplog.text.count(publishers[1].key) == 1
+        assert (
+            caplog.text.count(f"of {publishers[1].key} arrive")
+            == caplog.text.count(publishers[1].key)
+            == 1
+        )
         assert subscription.counts == nedbus.Counts(received=2)
 
 
@@ -322,21 +363,40 @@ def test_vehicle_with_too_many_tokens_hides_no_stream_without_downsampling(
     tokens.append(zenoh_session.liveliness().declare_token(f"nedbus/8/@alive/1/{VLP}"))
     publisher = bus.publisher(VLP, vehicle="7")
     timings.slow_list, timings.downsampled_timeout = 0.1, math.inf
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
+    with (
+        nedbus.connect(endpoint) as other,
+        other.subscribe(VLP, mode="every", max_rate=10) as subscription,
+    ):
         wait_for_downsampling_reader(publisher)
         publish(publisher, clock, 1, 20)
         assert receive_timestamps(subscription, 2) == [1, 11]
-        wait_for(lambda: "the streams of 'flood' are not listed" in caplog.text, what="the exclusion")
+        wait_for(
+            lambda: "the streams of 'flood' are not listed" in caplog.text, what="the exclusion"
+        )
         timings.downsampled_timeout = 0.0
         wait_for(lambda: "no downsampled messages" in caplog.text, what="the warning")
     assert f"no downsampled messages of nedbus/8/{VLP} arrive" in caplog.text
 
 
-def test_echo_prints_downsampled_messages(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:
+def test_echo_prints_downsampled_messages(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock
+) -> None:
     """`nedbus echo --max-rate 5` prints every 20th message of a 100 Hz stream."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
-    echo = run_nedbus("echo", "-c", endpoint, "--max-rate", "5", "--every", "--csv", "--field", "timestamp", "-n", "51")
+    echo = run_nedbus(
+        "echo",
+        "-c",
+        endpoint,
+        "--max-rate",
+        "5",
+        "--every",
+        "--csv",
+        "--field",
+        "timestamp",
+        "-n",
+        "51",
+    )
     wait_for(lambda: len(echo.out.splitlines()) > 1, what="the last message")
     wait_for_downsampling_reader(publisher)
     publish(publisher, clock, 1, 1000)
@@ -356,7 +416,10 @@ def test_key_of_a_downsampled_stream_ends_with_its_rate() -> None:
     assert Selection(VLP, "7").rate_key_exprs("*", prefix="a/b")[0] == f"a/b/7/{VLP}/@rate/*"
     assert Selection(VLP, "7").alive_key_exprs(prefix="a/b")[0] == f"a/b/7/@alive/*/{VLP}"
     assert Selection().alive_key_exprs()[0] == "nedbus/*/@alive/*/**"
-    assert Selection("estimator_local_position").alive_key_exprs()[0] == "nedbus/*/@alive/*/estimator_local_position/*"
+    assert (
+        Selection("estimator_local_position").alive_key_exprs()[0]
+        == "nedbus/*/@alive/*/estimator_local_position/*"
+    )
     assert not zenoh.KeyExpr("nedbus/**").intersects(address.rate_key(5))
     assert zenoh.KeyExpr(Selection().rate_key_exprs(5)[0]).intersects(address.rate_key(5))
     with pytest.raises(AddressError):

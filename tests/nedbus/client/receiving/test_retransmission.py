@@ -40,7 +40,9 @@ def limit() -> int | None:
 
 
 @pytest.fixture
-def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, *, limit: int | None) -> Iterator[Lossy]:
+def lossy(
+    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, *, limit: int | None
+) -> Iterator[Lossy]:
     """Subscribe to all vehicles, and wait until the publisher is matched."""
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}", limit=limit)
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
@@ -68,23 +70,34 @@ def test_lost_samples_are_requested_by_exact_key(lossy: Lossy, unanswered: int) 
     assert lossy.subscription.counts == Counts(received=7)
 
 
-def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_no_longer_in_the_cache_are_lost(
+    lossy: Lossy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Messages that the publisher no longer caches count as lost after a second request."""
 
     def request_available(
         session: Session, key: str, name: str, numbers: range, *, timeout: float
     ) -> RetransmitRequest:
-        return RetransmitRequest(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
+        return RetransmitRequest(
+            session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout
+        )
 
     monkeypatch.setattr(retransmission, "RetransmitRequest", request_available)
     lossy.queue.missing = {1, 2, 3, 4}
     lossy.publish(*range(6))
     samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]
-    assert [(sample.message.timestamp, sample.lost) for sample in samples] == [(0, 0), (3, 2), (4, 0), (5, 0)]
+    assert [(sample.message.timestamp, sample.lost) for sample in samples] == [
+        (0, 0),
+        (3, 2),
+        (4, 0),
+        (5, 0),
+    ]
     assert lossy.subscription.counts == Counts(received=4, lost=2)
 
 
-def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, zenoh_session: Session, timings: Timings) -> None:
+def test_publisher_without_a_cache_gets_one_request(
+    lossy: Lossy, zenoh_session: Session, timings: Timings
+) -> None:
     """After a timeout, a third-party publisher with sequence numbers but no cache gets only one request per gap."""
     timings.retransmit_timeout = 0.2
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
@@ -121,7 +134,9 @@ def test_publisher_that_replies_again_is_retried(lossy: Lossy, timings: Timings)
 
 
 @pytest.mark.parametrize("waits", ["without", "with a timeout"])
-def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: Session, waits: str) -> None:
+def test_newest_message_is_recovered_by_heartbeat(
+    lossy: Lossy, zenoh_session: Session, waits: str
+) -> None:
     """A heartbeat reveals the loss of the newest messages, even to a reader that waits in Zenoh without a timeout.
 
     The sample that wakes this reader is invisible to other readers of its session, and does not leave the process.
@@ -154,7 +169,9 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: S
     assert lossy.subscription.counts == Counts(received=3)
     assert lossless.counts == Counts(dropped=3)
     elsewhere: list[zenoh.Sample] = []
-    wait_for(lambda: len(drain(foreign.handler, elsewhere)) == 3, what="the messages in another session")
+    wait_for(
+        lambda: len(drain(foreign.handler, elsewhere)) == 3, what="the messages in another session"
+    )
     assert WAKE_UP not in {str(sample.encoding) for sample in elsewhere}
     foreign.undeclare()
 
@@ -170,7 +187,9 @@ def test_replies_of_other_peers_are_ignored(lossy: Lossy, zenoh_session: Session
 
 
 @pytest.mark.parametrize("when", ["open", "closed"])
-def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, zenoh_session: Session, when: str) -> None:
+def test_flood_of_replies_does_not_block_the_session(
+    lossy: Lossy, zenoh_session: Session, when: str
+) -> None:
     """A flood of replies to a request does not block the session, not even after its reader has closed."""
     queried = threading.Event()
 
@@ -200,9 +219,22 @@ def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, zenoh_session
 
 
 @pytest.mark.parametrize(
-    "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
+    "entity",
+    [
+        "a::b/1/_",
+        "_",
+        ":/_",
+        "../1/_",
+        "ab/1",
+        "ab/1/_/x",
+        f"{'a' * 33}/1/_",
+        "ab/12345678901/_",
+        "AB/1/_",
+    ],
 )
-def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, entity: str) -> None:
+def test_malformed_heartbeats_are_ignored(
+    lossy: Lossy, zenoh_session: Session, entity: str
+) -> None:
     """A malformed heartbeat neither causes a request nor prevents requests after later heartbeats."""
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
@@ -230,14 +262,19 @@ def test_unanswered_requests_do_not_delay_others(lossy: Lossy, zenoh_session: Se
         taken.clear()
 
 
-def test_requests_to_publishers_without_a_message_are_bounded(lossy: Lossy, zenoh_session: Session) -> None:
+def test_requests_to_publishers_without_a_message_are_bounded(
+    lossy: Lossy, zenoh_session: Session
+) -> None:
     """At most 16 requests to publishers that have delivered no message are open: others need the remaining slots."""
     taken: list[zenoh.Query] = []
     keys = [f"nedbus/evil{number}/{VLP}" for number in range(40)]
     with answer_queries(zenoh_session, "nedbus/*/*/@adv/pub/ab/1/**", taken.append):
         for key in keys:
             zenoh_session.put(f"{key}/@adv/pub/ab/1/_", b"\x05\x00\x00\x00")
-        wait_for(lambda: len(lossy.queue.gaps.requesting) == len(keys), what="the gaps of all forged publishers")
+        wait_for(
+            lambda: len(lossy.queue.gaps.requesting) == len(keys),
+            what="the gaps of all forged publishers",
+        )
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
@@ -246,7 +283,9 @@ def test_requests_to_publishers_without_a_message_are_bounded(lossy: Lossy, zeno
         taken.clear()
 
 
-def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_open_requests_is_bounded(
+    lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Simultaneous gaps of 60 vehicles are requested a few at a time, and all are filled."""
     monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
@@ -270,7 +309,9 @@ def test_close_counts_open_gaps_as_lost(lossy: Lossy) -> None:
     assert lossy.subscription.counts.lost == 2
 
 
-def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_held_back_samples_is_bounded(
+    lossy: Lossy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """If too many samples are held back behind gaps, the gaps count as lost and the samples are delivered."""
     monkeypatch.setattr(reorder, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
@@ -303,7 +344,10 @@ def test_unanswered_requests_of_a_key_are_bounded(lossy: Lossy, zenoh_session: S
     taken: list[zenoh.Query] = []
     key = f"nedbus/foreign/{VLP}"
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
-    foreign = [zenoh.ext.declare_advanced_publisher(zenoh_session, key, sample_miss_detection=misses) for _ in range(7)]
+    foreign = [
+        zenoh.ext.declare_advanced_publisher(zenoh_session, key, sample_miss_detection=misses)
+        for _ in range(7)
+    ]
     wait_for_matching(zenoh_session, key)
     with answer_queries(zenoh_session, f"{key}/@adv/pub/**", taken.append):
         lossy.queue.missing = {1}
@@ -311,7 +355,10 @@ def test_unanswered_requests_of_a_key_are_bounded(lossy: Lossy, zenoh_session: S
             for timestamp in range(3):
                 publisher.put(encode(message(timestamp)), encoding=encoding_of("sim"))
         assert lossy.receive(7) == [0] * 7
-        wait_for(lambda: len(lossy.queue.gaps.requesting) == 7, what="the gaps of all publishers of the key")
+        wait_for(
+            lambda: len(lossy.queue.gaps.requesting) == 7,
+            what="the gaps of all publishers of the key",
+        )
         wait_for(lambda: taken, what="a request")
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
@@ -370,7 +417,9 @@ def test_newest_messages_are_recovered_after_a_router_restart(rest: int) -> None
     with nedbus.connect(endpoint) as vehicle, nedbus.connect(endpoint) as reader:
         publisher = vehicle.publisher(VLP, vehicle="1")
         subscription = reader.subscribe(mode="every")
-        thread = threading.Thread(target=lambda: received.extend(sample.message.timestamp for sample in subscription))
+        thread = threading.Thread(
+            target=lambda: received.extend(sample.message.timestamp for sample in subscription)
+        )
         thread.start()
         publish(publisher, 0)
         wait_for(lambda: received == [0], what="the first message")
@@ -379,7 +428,9 @@ def test_newest_messages_are_recovered_after_a_router_restart(rest: int) -> None
         with closing(open_router(listen=(endpoint,))):
             wait_for(lambda: vehicle.connected and reader.connected, what="both to reconnect")
             publish(publisher, *range(50, 50 + rest))
-            wait_for(lambda: len(received) == 50 + rest, what="the messages published during the outage")
+            wait_for(
+                lambda: len(received) == 50 + rest, what="the messages published during the outage"
+            )
             subscription.close()
             thread.join(DEADLINE)
     assert received == list(range(50 + rest))

@@ -37,7 +37,9 @@ def take_batches(batches: Iterator[Batch], count: int) -> list[Batch]:
     return taken
 
 
-def test_rows_equal_published_messages(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
+def test_rows_equal_published_messages(
+    subscription: nedbus.Subscription[Any], bus: nedbus.Bus
+) -> None:
     """Rows are named tuples with the published values, in order and complete."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
@@ -47,12 +49,16 @@ def test_rows_equal_published_messages(subscription: nedbus.Subscription[Any], b
     rows = subscription.rows()
     samples = [next(rows) for _ in sent]
     assert all(isinstance(sample.message, Row) for sample in samples)
-    assert [VehicleLocalPosition(**cast("Row", sample.message)._asdict()) for sample in samples] == sent
+    assert [
+        VehicleLocalPosition(**cast("Row", sample.message)._asdict()) for sample in samples
+    ] == sent
     assert {sample.address for sample in samples} == {Address("1", VLP)}
     assert subscription.counts == nedbus.Counts(received=len(sent))
 
 
-def test_batches_equal_published_messages(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
+def test_batches_equal_published_messages(
+    subscription: nedbus.Subscription[Any], bus: nedbus.Bus
+) -> None:
     """Batches have the published values, with address, sequence number and times of each message."""
     messages = to_array([message(number, x=number / 3) for number in range(1, COUNT)])
     for vehicle in ("1", "2"):
@@ -64,7 +70,13 @@ def test_batches_equal_published_messages(subscription: nedbus.Subscription[Any]
         own = np.concatenate([batch.of(Address(vehicle, VLP)) for batch in batches])
         assert own.tobytes() == messages.tobytes()
     for batch in batches:
-        assert len(batch) == len(batch.address_index) == len(batch.sent) == len(batch.received) == len(batch.sequence)
+        assert (
+            len(batch)
+            == len(batch.address_index)
+            == len(batch.sent)
+            == len(batch.received)
+            == len(batch.sequence)
+        )
         assert (batch.sent <= batch.received).all()
         assert (batch.sent > batch.received - 60e9).all()
         for index in range(len(batch.addresses)):
@@ -74,11 +86,18 @@ def test_batches_equal_published_messages(subscription: nedbus.Subscription[Any]
 
 
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
-def test_batch_decodes_unusual_payloads(bus: nedbus.Bus, zenoh_session: Session, filler: int) -> None:
+def test_batch_decodes_unusual_payloads(
+    bus: nedbus.Bus, zenoh_session: Session, filler: int
+) -> None:
     """A batch includes payloads of other encoders and older layouts; invalid payloads and keys count as invalid."""
     good = message(7, x=1.5, hagl_max_z=3.0, hagl_max_xy=3.0)
-    values = [list(value) if isinstance(value, tuple) else value for value in good.__dict__.values()]
-    old = [list(value) if isinstance(value, tuple) else value for value in downgrade(good, "V0").values()]
+    values = [
+        list(value) if isinstance(value, tuple) else value for value in good.__dict__.values()
+    ]
+    old = [
+        list(value) if isinstance(value, tuple) else value
+        for value in downgrade(good, "V0").values()
+    ]
     assert len(old) == len(LAYOUTS["V0"].fields)
     key = f"nedbus/1/{VLP}"
     payloads = [encode(good)] * filler + [msgpack.packb([1, *values]), msgpack.packb([0, *old])]
@@ -122,7 +141,10 @@ def test_async_subscription_yields_rows_and_batches(endpoint: str, bus: nedbus.B
     publisher = bus.publisher(VLP, vehicle="1")
 
     async def read() -> tuple[list[int], int]:
-        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        async with (
+            nedbus.connect_async(endpoint) as other,
+            other.subscribe(VLP, mode="every") as subscription,
+        ):
             await asyncio.to_thread(wait_for_subscriber, publisher)
             publisher.publish_many(numbered(300))
             stamps = []
@@ -142,7 +164,9 @@ def test_async_subscription_yields_rows_and_batches(endpoint: str, bus: nedbus.B
     assert asyncio.run(read()) == (list(range(1, 101)), 200)
 
 
-def test_receive_batch_returns_a_batch_or_raises_on_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+def test_receive_batch_returns_a_batch_or_raises_on_timeout(
+    client: nedbus.Bus, bus: nedbus.Bus
+) -> None:
     """`receive_batch` returns a batch with the provenance of each message, or raises NoDataError on timeout."""
     bus.publisher(VLP, vehicle="1", source="test").publish({"timestamp": 7, "x": 1.0})
     subscription = client.subscribe(VLP, mode="every")
@@ -151,7 +175,11 @@ def test_receive_batch_returns_a_batch_or_raises_on_timeout(client: nedbus.Bus, 
         subscription.receive_batch(0.01)
     assert batch.messages["timestamp"].tolist() == [7]
     [provenance] = batch.provenances
-    assert (provenance.source, "x" in provenance.missing, "y" in provenance.missing) == ("test", False, True)
+    assert (provenance.source, "x" in provenance.missing, "y" in provenance.missing) == (
+        "test",
+        False,
+        True,
+    )
 
 
 def test_sample_has_source_and_missing_fields(bus: nedbus.Bus) -> None:
@@ -160,7 +188,8 @@ def test_sample_has_source_and_missing_fields(bus: nedbus.Bus) -> None:
     whole = message(1).model_dump()
     publisher.publish(whole)
     subscription = bus.subscribe(VLP, mode="every")
-    missing = [subscription.receive(DEADLINE).missing]  # once the last message is here, the reader is subscribed
+    # once the last message is here, the reader is subscribed
+    missing = [subscription.receive(DEADLINE).missing]
     for fields in ({"timestamp": 2, "x": 1.0}, {"timestamp": 3}, whole):
         publisher.publish(fields)
     publisher.publish(VehicleLocalPosition(timestamp=4, y=2.0))

@@ -47,13 +47,23 @@ def reboots(*messages: Any, interval: float = 0.1) -> list[bool]:
 
 def test_message_with_the_time_of_an_old_sample_is_no_reboot() -> None:
     """A sensor without new data repeats the time of its last sample: neither its lag nor the messages show a reboot."""
-    assert not any(reboots(position(BOOT), *(pressure(1000 + 10 * number) for number in range(50)), position(BOOT + 1)))
-    assert not any(reboots(position(1000), pressure(1000), position(BOOT), pressure(1000), pressure(1000)))
+    assert not any(
+        reboots(
+            position(BOOT),
+            *(pressure(1000 + 10 * number) for number in range(50)),
+            position(BOOT + 1),
+        )
+    )
+    assert not any(
+        reboots(position(1000), pressure(1000), position(BOOT), pressure(1000), pressure(1000))
+    )
 
 
 def test_second_sensor_of_a_kind_without_data_is_no_reboot() -> None:
     """Two sensors that share a kind of message, of which one lags, are not mistaken for a clock that went back."""
-    both = [each for number in range(30) for each in (distance(BOOT + 50 * number, 0), distance(500, 1))]
+    both = [
+        each for number in range(30) for each in (distance(BOOT + 50 * number, 0), distance(500, 1))
+    ]
     assert not any(reboots(position(BOOT), *both))
 
 
@@ -62,7 +72,9 @@ def test_single_time_far_ahead_is_no_reboot() -> None:
     flight = [kind(BOOT + 100 * number) for number in range(40) for kind in (position, attitude)]
     flight[20] = position(10**8)
     clock = new_clock()
-    assert not any(is_reboot(clock, message, 0.05 * number) for number, message in enumerate(flight))
+    assert not any(
+        is_reboot(clock, message, 0.05 * number) for number, message in enumerate(flight)
+    )
     assert clock.newest == 1000 * (BOOT + 3900)
 
 
@@ -76,7 +88,12 @@ def test_time_far_ahead_counts_once_it_is_confirmed() -> None:
 
 def test_two_kinds_in_a_row_that_went_back_show_a_reboot() -> None:
     """The second kind whose own time went back shows the reboot, and is the first message of the new boot."""
-    assert reboots(position(BOOT), attitude(BOOT), position(300), attitude(310)) == [False, False, False, True]
+    assert reboots(position(BOOT), attitude(BOOT), position(300), attitude(310)) == [
+        False,
+        False,
+        False,
+        True,
+    ]
     clock = new_clock()
     for each in (position(BOOT), attitude(BOOT), position(300), attitude(310), position(320)):
         is_reboot(clock, each, 0.0)
@@ -86,7 +103,9 @@ def test_two_kinds_in_a_row_that_went_back_show_a_reboot() -> None:
 def test_current_message_disproves_a_reboot() -> None:
     """Kinds that went back do not add up if a current message arrives between them."""
     both = attitude(BOOT), position(BOOT)
-    assert not any(reboots(*both, position(300), attitude(BOOT), attitude(310), position(BOOT), position(320)))
+    assert not any(
+        reboots(*both, position(300), attitude(BOOT), attitude(310), position(BOOT), position(320))
+    )
     clock = new_clock()
     found = []
     for each in (position(BOOT), attitude(BOOT), position(300), attitude(310)):
@@ -104,12 +123,16 @@ def test_single_kind_that_went_back_shows_a_reboot() -> None:
 
 def test_delay_of_less_than_a_second_is_no_reboot() -> None:
     """A reordered datagram, and a reboot in the first second, do not show a reboot."""
-    assert not any(reboots(position(BOOT), attitude(BOOT), position(BOOT - 1000), attitude(BOOT - 1000)))
+    assert not any(
+        reboots(position(BOOT), attitude(BOOT), position(BOOT - 1000), attitude(BOOT - 1000))
+    )
 
 
 @pytest.mark.logs
 @pytest.mark.slow
-@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4: {STREAMS} does not exist")
+@pytest.mark.skipif(
+    not STREAMS.exists(), reason=f"no recordings of a PX4: {STREAMS} does not exist"
+)
 @pytest.mark.parametrize(
     ("recording", "expected"),
     [
@@ -131,9 +154,13 @@ def test_recorded_reboots_are_found_within_two_seconds(recording: str, expected:
     assert all(0 <= when - start < 2 for when, start in zip(found, starts, strict=True))
 
 
-def handled(vehicle: Vehicle, messages: Iterable[Any], interval: float = 0.01) -> list[SourceMessage | Rejection]:
+def handled(
+    vehicle: Vehicle, messages: Iterable[Any], interval: float = 0.01
+) -> list[SourceMessage | Rejection]:
     return [
-        item for number, message in enumerate(messages) for item in vehicle.handle_all(message, 100 + interval * number)
+        item
+        for number, message in enumerate(messages)
+        for item in vehicle.handle_all(message, 100 + interval * number)
     ]
 
 
@@ -148,17 +175,23 @@ def odometry(ms: int) -> Any:
 
 def test_reboot_rejects_nothing() -> None:
     """The time of a sample confirms a reboot; what came before it is certain is neither used nor rejected."""
-    before = [message for ms in range(10_000, 11_000, 20) for message in (position(ms), odometry(ms))]
+    before = [
+        message for ms in range(10_000, 11_000, 20) for message in (position(ms), odometry(ms))
+    ]
     after = [position(250), odometry(252), position(270), odometry(272)]
     items = handled(Vehicle("1", ["vehicle_local_position"]), [*before, *after])
     assert not [item for item in items if isinstance(item, Rejection)]
-    reboots = [item.timestamp for item in items if isinstance(item, SourceMessage) and item.rebooted]
+    reboots = [
+        item.timestamp for item in items if isinstance(item, SourceMessage) and item.rebooted
+    ]
     assert reboots == [270_000]
 
 
 @pytest.mark.logs
 @pytest.mark.slow
-@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4: {STREAMS} does not exist")
+@pytest.mark.skipif(
+    not STREAMS.exists(), reason=f"no recordings of a PX4: {STREAMS} does not exist"
+)
 @pytest.mark.parametrize("recording", ["ulog_stream_session", "ulog_stream_session_second"])
 def test_recorded_reboots_lose_and_reject_nothing(recording: str) -> None:
     """The first second after each reboot of a real PX4 (SITL) has no rejected message, and no loss is counted."""

@@ -73,10 +73,14 @@ def test_blocked_link_drops_whole_frames(pair: Pair) -> None:
     assert link.send(frame(1), link.peer), "there is room again"
 
 
-def test_dropped_frames_are_logged(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_dropped_frames_are_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The number of messages that the link did not accept is logged; the source continues to receive."""
     monkeypatch.setattr(links, "_MAX_UNSENT", 10)
-    position = dialect.MAVLink_local_position_ned_message(1000, 0, 0, 0, 0, 0, 0).pack(dialect.MAVLink(None, 9, 1))
+    position = dialect.MAVLink_local_position_ned_message(1000, 0, 0, 0, 0, 0, 0).pack(
+        dialect.MAVLink(None, 9, 1)
+    )
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         Listener(f"mavlink:tcp:127.0.0.1:{server.getsockname()[1]}") as listener,
@@ -88,7 +92,9 @@ def test_dropped_frames_are_logged(monkeypatch: pytest.MonkeyPatch, caplog: pyte
         connection.setblocking(False)
         with pytest.raises(BlockingIOError):
             connection.recv(1)
-    assert "messages to the vehicle were not sent, because the link did not accept them" in caplog.text
+    assert (
+        "messages to the vehicle were not sent, because the link did not accept them" in caplog.text
+    )
 
 
 class FirstPartner:
@@ -142,6 +148,10 @@ def test_local_port_of_udpout_can_be_chosen() -> None:
         pytest.raises(SourceError, match=rf"address already in use\) at local port {port}: close"),
     ):
         open_link(text, baud=57600)
-    for wrong in ("udpout:10.0.0.1:14580@", "udpout:10.0.0.1:14580@99999", "udpin:0.0.0.0:14540@14550"):
+    for wrong in (
+        "udpout:10.0.0.1:14580@",
+        "udpout:10.0.0.1:14580@99999",
+        "udpin:0.0.0.0:14540@14550",
+    ):
         with pytest.raises(ConfigError, match="is not a link"):
             parse_link(wrong)

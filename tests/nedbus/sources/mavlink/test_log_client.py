@@ -71,7 +71,9 @@ class Session:
     def answer(self, command: int, result: int, ids: tuple[int, int] = OURS) -> None:
         self.add(self.client.on_command_ack(command, result, *ids, self.now))
 
-    def receive(self, *, acked: bool = False, begins: bool = False, sequence: int | None = None) -> None:
+    def receive(
+        self, *, acked: bool = False, begins: bool = False, sequence: int | None = None
+    ) -> None:
         """Receive the next message of the stream, or the one with this sequence number."""
         self._next = 0 if begins else self._next
         assert self.client.accepts(*OURS)
@@ -309,7 +311,9 @@ class TestOwnership:
             session.now += 0.004
         session.wait(TIMINGS.log_retry - 0.5)
         assert session.states[-1] == ("ended", "stopped_elsewhere")
-        assert session.client.status.text.endswith(f"it is requested again in {TIMINGS.log_retry:.0f} s")
+        assert session.client.status.text.endswith(
+            f"it is requested again in {TIMINGS.log_retry:.0f} s"
+        )
         assert session.commands == ["start"]
         session.wait(3)
         assert session.commands[:2] == ["start", "start"]
@@ -418,12 +422,16 @@ class TestHeader:
         assert session.client.status.state == "streaming"
 
     @pytest.mark.parametrize("round_trip", [0.04, 0.08, 0.16, 2.0])
-    def test_no_start_if_the_header_would_take_too_long(self, session: Session, round_trip: float) -> None:
+    def test_no_start_if_the_header_would_take_too_long(
+        self, session: Session, round_trip: float
+    ) -> None:
         """The round trip is measured with TIMESYNC before START, which would block the vehicle's logger."""
         session.round_trip = round_trip
         session.wait(10)
         assert session.states[-1] == ("refused", "slow_link")
-        assert re.search(rf"would take \d+ s, at {1e3 * round_trip + 4:.0f} ms for", session.client.status.text)
+        assert re.search(
+            rf"would take \d+ s, at {1e3 * round_trip + 4:.0f} ms for", session.client.status.text
+        )
         assert "because of the vehicle's parameters alone" in session.client.status.text
         session.wait(2 * TIMINGS.log_slow_retry)
         assert session.commands == []
@@ -451,7 +459,9 @@ class TestHeader:
         session.wait(2)
         assert session.commands[:1] == ["start"]
 
-    def test_refusal_names_number_of_topics_that_fit_and_longer_limit(self, session: Session) -> None:
+    def test_refusal_names_number_of_topics_that_fit_and_longer_limit(
+        self, session: Session
+    ) -> None:
         """At 26 ms per message 10 s are enough for 61 topics, and header=15 for all; then START is sent."""
         session.round_trip = 0.022
         session.wait(2)
@@ -580,7 +590,11 @@ class TestSilence:
         assert session.states[-1] == ("starting", "silent")
         session.header()
         session.stream()
-        assert session.states[-3:] == [("starting", "silent"), ("header", None), ("streaming", None)]
+        assert session.states[-3:] == [
+            ("starting", "silent"),
+            ("header", None),
+            ("streaming", None),
+        ]
 
     def test_stream_ends_without_data_and_start_reply(self, session: Session) -> None:
         """Without data and without a reply to START, the stream has ended; START is retried later."""
@@ -654,7 +668,12 @@ def test_reboot_triggers_new_start(session: Session) -> None:
     assert not session.client.accepts(*OURS)
     session.start()
     assert session.commands == ["start", "start"]
-    assert session.states[-4:] == [("idle", None), ("starting", None), ("header", None), ("streaming", None)]
+    assert session.states[-4:] == [
+        ("idle", None),
+        ("starting", None),
+        ("header", None),
+        ("streaming", None),
+    ]
 
 
 def test_unannounced_new_stream_is_accepted(session: Session) -> None:
@@ -723,7 +742,9 @@ def recorded(name: str) -> list[tuple[float, bool, bytes]]:
 class Replay:
     """Replay part of a recorded session to a client, and collect the recorded client's acknowledgements."""
 
-    def __init__(self, name: str, begin: float, end: float, ids: tuple[int, int], *log: Log) -> None:
+    def __init__(
+        self, name: str, begin: float, end: float, ids: tuple[int, int], *log: Log
+    ) -> None:
         self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1])
         self.reassembly = CountingReassembly()
         self.states: list[StateAndReason] = [("idle", None)]
@@ -754,15 +775,24 @@ class Replay:
     def _handle(self, message: Any, now: float) -> Iterator[Command]:
         client, kind = self.client, message.get_type()
         if kind == "HEARTBEAT":
-            yield from client.on_heartbeat(message.autopilot, now, armed=bool(message.base_mode & 128))
+            yield from client.on_heartbeat(
+                message.autopilot, now, armed=bool(message.base_mode & 128)
+            )
         elif kind == "COMMAND_ACK":
             ids = message.target_system, message.target_component
             yield from client.on_command_ack(message.command, message.result, *ids, now)
         elif kind.startswith("LOGGING_DATA"):
             if client.accepts(message.target_system, message.target_component):
-                fields = message.sequence, message.length, message.first_message_offset, message.data
+                fields = (
+                    message.sequence,
+                    message.length,
+                    message.first_message_offset,
+                    message.data,
+                )
                 begins = self.reassembly.add(*fields).begins
-                yield from client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=begins)
+                yield from client.on_data(
+                    message.sequence, now, acked=kind.endswith("ACKED"), begins=begins
+                )
         elif (ms := getattr(message, "time_boot_ms", None)) is not None:
             if ms < self._boot - 1000:
                 client.on_reboot()
@@ -771,11 +801,17 @@ class Replay:
 
 
 @pytest.mark.logs
-@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist")
+@pytest.mark.skipif(
+    not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"
+)
 class TestRecordedSessions:
     """Replays of recorded sessions of a real PX4 with two clients."""
 
-    STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("streaming", None)]
+    STARTED: Final[list[StateAndReason]] = [
+        ("starting", None),
+        ("header", None),
+        ("streaming", None),
+    ]
 
     def test_acknowledgements_match_recorded_client(self) -> None:
         """The acknowledgements equal the recording's, in order, including late topics and messages after STOP."""

@@ -26,7 +26,10 @@ STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("
 
 pytestmark = [
     pytest.mark.logs,
-    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
+    pytest.mark.skipif(
+        not STREAMS.exists(),
+        reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist",
+    ),
 ]
 
 recording = cache(lambda name: read_recording(STREAMS / f"ulog_stream_{name}.bin.gz"))
@@ -43,7 +46,11 @@ class Link:
     """A client on a UDP port; counts what it receives, and collects each state with its reason."""
 
     def __init__(
-        self, *log: Log, acknowledges: bool = True, header: float | None = None, ids: tuple[int, int] = OURS
+        self,
+        *log: Log,
+        acknowledges: bool = True,
+        header: float | None = None,
+        ids: tuple[int, int] = OURS,
     ) -> None:
         self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1], header=header)
         self.reassembly = CountingReassembly()
@@ -106,7 +113,9 @@ class Link:
             if kind == "ping":
                 message = dialect.MAVLink_timesync_message(0, sequence)
             elif kind != "acknowledge":
-                message = dialect.MAVLink_command_long_message(1, 1, START if kind == "start" else STOP, *(0,) * 8)
+                message = dialect.MAVLink_command_long_message(
+                    1, 1, START if kind == "start" else STOP, *(0,) * 8
+                )
             if self._acknowledges or kind != "acknowledge":
                 self._socket.sendto(message.pack(self._mav), self._vehicle)
 
@@ -125,7 +134,9 @@ class Link:
                 return []
             fields = message.sequence, message.length, message.first_message_offset, message.data
             chunk = self.reassembly.add(*fields)
-            return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=chunk.begins)
+            return client.on_data(
+                message.sequence, now, acked=kind.endswith("ACKED"), begins=chunk.begins
+            )
         if (ms := getattr(message, "time_boot_ms", None)) is not None:
             if ms < self._boot - 1000:
                 client.on_reboot()
@@ -147,7 +158,13 @@ def test_recorded_stream_arrives_completely() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "impairment",
-    [{"loss": 0.03}, {"loss": 0.05}, {"loss": 0.05, "burst": 20}, {"reorder": 0.02}, {"loss": 0.03, "reorder": 0.02}],
+    [
+        {"loss": 0.03},
+        {"loss": 0.05},
+        {"loss": 0.05, "burst": 20},
+        {"reorder": 0.02},
+        {"loss": 0.03, "reorder": 0.02},
+    ],
 )
 def test_loss_count_equals_dropped_and_late_messages(impairment: dict[str, float]) -> None:
     """Exactly the dropped and late messages count as lost; acknowledged messages always arrive."""
@@ -180,7 +197,8 @@ class TestAbnormalStreams:
         """PX4 sends an unacknowledged message 50 times, then nothing more, and the stream is reported as stalled."""
         with Link(acknowledges=False).play("flight1") as link:
             link.expect_states(("starting", None), ("header", None), ("ended", "stalled"))
-            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last duplicates may arrive later
+            # the last duplicates may arrive later
+            link.run(lambda: link.reassembly.counts["duplicate"] == 49)
         assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
     def test_start_without_data_is_repeated(self) -> None:
@@ -252,7 +270,8 @@ class TestAbnormalStreams:
 
         PX4 then accepts the START of either client, but sends the data to the client that had the stream before.
         """
-        timings.log_retry = 1.0  # the client without the stream is the first to send START after STOP
+        # the client without the stream is the first to send START after STOP
+        timings.log_retry = 1.0
         take, other = Link("armed", "take"), Link("armed", ids=OTHERS)
         for each in (take, other):
             each._socket.settimeout(0.001)  # they take turns
@@ -276,6 +295,10 @@ class TestAbnormalStreams:
         assert "stop" not in other.sent
         assert other.states[-1] == ("refused", "taken")
         assert other.reassembly.bytes == 0
-        assert set(take.states[4:]) <= {("ended", "stopped_elsewhere"), ("header", None), ("streaming", None)}
+        assert set(take.states[4:]) <= {
+            ("ended", "stopped_elsewhere"),
+            ("header", None),
+            ("streaming", None),
+        }
         assert take.sent == ["start"]
         assert STOP not in link.peer.commands

@@ -30,7 +30,10 @@ SIZE: Final = 249
 
 needs_recordings = [
     pytest.mark.logs,
-    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
+    pytest.mark.skipif(
+        not STREAMS.exists(),
+        reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist",
+    ),
 ]
 
 
@@ -43,7 +46,12 @@ class CountingReassembly(Reassembly):
         self.lost = self.bytes = self.skipped = 0
 
     def add(
-        self, sequence: int, length: int, first_message_offset: int, data: Sequence[int], now: float | None = None
+        self,
+        sequence: int,
+        length: int,
+        first_message_offset: int,
+        data: Sequence[int],
+        now: float | None = None,
     ) -> Chunk:
         """Add the next message and count the result."""
         chunk = super().add(sequence, length, first_message_offset, data, now)
@@ -74,7 +82,9 @@ def test_retransmitted_first_message_does_not_begin_new_stream() -> None:
     begin(reassembly, b"a")
     assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Chunk("duplicate")
     add(reassembly, plain(1))
-    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Chunk("delivered", HEADER + b"b", begins=True)
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Chunk(
+        "delivered", HEADER + b"b", begins=True
+    )
     assert add(reassembly, plain(1)) == Chunk("delivered", b"data")
     assert reassembly.lost == 0
 
@@ -82,7 +92,9 @@ def test_retransmitted_first_message_does_not_begin_new_stream() -> None:
 def test_same_first_message_begins_new_stream_after_reboot() -> None:
     """After a reboot, a header with the same bytes begins a new stream; without a reboot it is a retransmission."""
     ids, port, encoder = (245, 191), free_port(), dialect.MAVLink(None, 1, 1)
-    header = dialect.MAVLink_logging_data_acked_message(*ids, 0, SIZE, 0, [*HEADER.ljust(SIZE, b"\0")])
+    header = dialect.MAVLink_logging_data_acked_message(
+        *ids, 0, SIZE, 0, [*HEADER.ljust(SIZE, b"\0")]
+    )
     heartbeat = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
     times = [dialect.MAVLink_system_time_message(0, ms) for ms in (9000, 100)]
     with (
@@ -104,15 +116,22 @@ def test_same_first_message_begins_new_stream_after_reboot() -> None:
         receiver = LogReceiver(reader, options, answer)
         with closing(receiver):
             received: list[Received] = []
-            for count, burst in enumerate(([heartbeat], [header, header, *times, heartbeat], [header])):
+            for count, burst in enumerate(
+                ([heartbeat], [header, header, *times, heartbeat], [header])
+            ):
                 transmit(*burst)
                 wait_for(lambda count=count: len(starts) > min(count, 1), what="START")  # type: ignore[misc] # a default
-            while not received or sum(each.message.get_type().startswith("LOGGING") for each in received) < 3:
+            while (
+                not received
+                or sum(each.message.get_type().startswith("LOGGING") for each in received) < 3
+            ):
                 received += [each for each in receiver.read(DEADLINE) if isinstance(each, Received)]
     assert [each.chunk.begins for each in received if each.chunk] == [True, False, True]
 
 
-def test_error_of_the_receiving_thread_is_raised_by_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_the_receiving_thread_is_raised_by_the_source(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """An error of the receiving thread, even one that is not an Exception, is raised where messages are read."""
 
     def fail(_: LogReceiver) -> None:
@@ -289,9 +308,16 @@ def test_exactly_the_complete_records_are_delivered(data: st.DataObject) -> None
     """With messages dropped, delayed or repeated, each complete record is delivered, and nothing else."""
     rng = random.Random(data.draw(st.integers(0, 2**32)))
     sizes = [rng.choice([1, 5, 40, 300, 900]) for _ in range(data.draw(st.integers(1, 300)))]
-    messages = to_messages(struct.pack("<HB", size, ord("D")) + rng.randbytes(size) for size in sizes)
-    loss, reorder = data.draw(st.sampled_from([0.0, 0.05, 0.3])), data.draw(st.sampled_from([0.0, 0.1]))
-    impaired = impair(messages, loss=loss, burst=rng.randint(1, 5), reorder=reorder, seed=rng.randrange(1000))
+    messages = to_messages(
+        struct.pack("<HB", size, ord("D")) + rng.randbytes(size) for size in sizes
+    )
+    loss, reorder = (
+        data.draw(st.sampled_from([0.0, 0.05, 0.3])),
+        data.draw(st.sampled_from([0.0, 0.1])),
+    )
+    impaired = impair(
+        messages, loss=loss, burst=rng.randint(1, 5), reorder=reorder, seed=rng.randrange(1000)
+    )
     repeated = [each for each in impaired.messages for _ in range(rng.choice([1, 1, 1, 2]))]
     records, reassembly = deliver(repeated)
     assert records == complete_records(messages, impaired.in_order)
@@ -303,7 +329,9 @@ def test_exactly_the_complete_records_are_delivered(data: st.DataObject) -> None
 def recorded(name: str) -> list[Message]:
     """Return the messages of a recorded stream, without retransmissions."""
     found = [
-        stream_message(frame) for _, is_sent, frame in datagrams(STREAMS / f"ulog_stream_{name}.bin.gz") if is_sent
+        stream_message(frame)
+        for _, is_sent, frame in datagrams(STREAMS / f"ulog_stream_{name}.bin.gz")
+        if is_sent
     ]
     return [each for each in found if each]
 
@@ -351,14 +379,20 @@ def compare(records: Iterable[tuple[str, bytes]], name: str) -> Comparison:
 
 @pytest.mark.parametrize(
     ("name", "messages", "lost", "common"),
-    [("flight1", 23_032, 0, 47_708), ("lossy1", 23_847, 237, 49_054), ("default_topics", 5_969, 11, 18_482)],
+    [
+        ("flight1", 23_032, 0, 47_708),
+        ("lossy1", 23_847, 237, 49_054),
+        ("default_topics", 5_969, 11, 18_482),
+    ],
 )
 class TestRecordings:
     """Streams of a real PX4 (SITL, main of 2026-05-14), compared with the log that it wrote at the same time."""
 
     pytestmark = needs_recordings
 
-    def test_stream_equals_log_of_vehicle(self, name: str, messages: int, lost: int, common: int) -> None:
+    def test_stream_equals_log_of_vehicle(
+        self, name: str, messages: int, lost: int, common: int
+    ) -> None:
         """Each data message is in the log, in order; only at gaps does the log contain more."""
         records, reassembly = deliver(recorded(name))
         compared = compare(records, name)
@@ -372,14 +406,17 @@ class TestRecordings:
 
 
 @pytest.mark.parametrize(
-    ("loss", "burst", "reorder"), [(0.03, 1, 0.0), (0.05, 1, 0.0), (0.05, 20, 0.0), (0.0, 1, 0.02), (0.03, 5, 0.02)]
+    ("loss", "burst", "reorder"),
+    [(0.03, 1, 0.0), (0.05, 1, 0.0), (0.05, 20, 0.0), (0.0, 1, 0.02), (0.03, 5, 0.02)],
 )
 class TestImpairedLink:
     """A recorded flight with messages dropped and reordered."""
 
     pytestmark = needs_recordings
 
-    def test_every_complete_record_is_delivered(self, loss: float, burst: int, reorder: float) -> None:
+    def test_every_complete_record_is_delivered(
+        self, loss: float, burst: int, reorder: float
+    ) -> None:
         """Exactly the complete records are delivered, decoding resumes after each gap, and the loss count is exact."""
         messages = recorded("flight1")
         impaired = impair(messages, loss=loss, burst=burst, reorder=reorder)
@@ -388,6 +425,8 @@ class TestImpairedLink:
         assert reassembly.lost == len(messages) - len(impaired.in_order)
         compared = compare(records, "flight1")
         assert compared.invented == 0
-        lost_bytes = sum(len(each.data) for each in messages) - reassembly.bytes - reassembly.skipped
+        lost_bytes = (
+            sum(len(each.data) for each in messages) - reassembly.bytes - reassembly.skipped
+        )
         assert lost_bytes <= SIZE * reassembly.lost
         assert 0 < len(compared.missing) <= reassembly.lost

@@ -29,7 +29,16 @@ from nedbus.timings import Timings
 from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from tests.flights.ulogs import UlogWriter, log_messages_in, write_raw_log
 from tests.peers.ports import free_port
-from tests.peers.px4_log_stream import SHORT, START, STOP, STREAMS, Entry, Px4LogStream, Recording, read_recording
+from tests.peers.px4_log_stream import (
+    SHORT,
+    START,
+    STOP,
+    STREAMS,
+    Entry,
+    Px4LogStream,
+    Recording,
+    read_recording,
+)
 from tests.waits import DEADLINE
 
 from .test_log_reassembly import compare as compare_records, deliver, recorded, to_messages
@@ -44,7 +53,9 @@ pytestmark = pytest.mark.timeout(400)  # a flight of 84 s, which coverage slows 
 
 def recorded_flight(test: Any) -> Any:
     """Mark a test that plays a complete flight."""
-    absent = pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
+    absent = pytest.mark.skipif(
+        not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}"
+    )
     return pytest.mark.logs(pytest.mark.slow(absent(test)))
 
 
@@ -75,7 +86,10 @@ class Received:
         self.status = LogStreamStatus()
         self.reasons: set[str] = set()
         recording = read_recording(recording) if isinstance(recording, Path) else recording
-        source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?{options}").open_source(vehicle="1"))
+        source = cast(
+            "LiveSource",
+            parse_source(f"mavlink:udpin:127.0.0.1:{port}?{options}").open_source(vehicle="1"),
+        )
         with (
             closing(cast("Any", source.listen(None))) as items,
             Px4LogStream(recording, port, speed=None, deadline=300, **peer) as self.peer,
@@ -102,7 +116,9 @@ def logged_messages(path: Path) -> dict[tuple[str, int], set[str]]:
     for record in [*parser.feed(path.read_bytes()), *parser.close()]:
         if isinstance(record, Data):
             subscription = record.subscription
-            found[subscription.name, subscription.multi_id].add(repr(subscription.layout.decode(record.payload)))
+            found[subscription.name, subscription.multi_id].add(
+                repr(subscription.layout.decode(record.payload))
+            )
     return found
 
 
@@ -114,7 +130,9 @@ def compare(received: Received, path: Path) -> int:
         if repr(dict(each.fields)) not in logged[each.address.topic, each.address.instance or 0]
     ]  # fmt: skip
     start = min(cast("int", each.fields["timestamp"]) for each in received.stream)
-    assert all(cast("int", each.fields["timestamp"]) < start + 2_000_000 for each in missing), missing[-3:]
+    assert all(cast("int", each.fields["timestamp"]) < start + 2_000_000 for each in missing), (
+        missing[-3:]
+    )
     return len(received.stream) - len(missing)
 
 
@@ -122,7 +140,9 @@ def sent_messages() -> list[tuple[str, str]]:
     """Return topic and fields of each message in the short recording."""
     recording = read_recording(SHORT)
     plain = [each.content for each in recording.entries if not isinstance(each.content, bytes)]
-    records = UlogParser(verify=True).feed(b"".join(each.data for each in (*recording.header, *plain)))
+    records = UlogParser(verify=True).feed(
+        b"".join(each.data for each in (*recording.header, *plain))
+    )
     records = list(LogMessageBuilder().merge(records))
     return [
         (each.subscription.name, repr(each.subscription.layout.decode(each.payload)))
@@ -134,10 +154,14 @@ def sent_messages() -> list[tuple[str, str]]:
 def test_stream_is_published_in_full() -> None:
     """All messages of all topics that a real PX4 (SITL) sent are published in order, with all of their fields."""
     received, sent = Received("log=1"), sent_messages()
-    assert [(each.address.topic, repr(each.fields)) for each in received.messages if each.source] == sent
+    assert [
+        (each.address.topic, repr(each.fields)) for each in received.messages if each.source
+    ] == sent
     assert len({topic for topic, _ in sent}) == 20
     status = received.status
-    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
+    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), (
+        received.reasons
+    )
     assert status.header_time is not None
 
 
@@ -149,7 +173,9 @@ def test_losses_of_link_are_reported_with_stream() -> None:
     entries = recording.entries
     middle = range(len(entries) // 2, len(entries) * 3 // 4)
     recording.entries = [
-        each for index, entry in enumerate(entries) for each in [entry] + [Entry(entry.time, gap)] * (index in middle)
+        each
+        for index, entry in enumerate(entries)
+        for each in [entry] + [Entry(entry.time, gap)] * (index in middle)
     ]
     received = Received("log=1&topics=vehicle_attitude", recording)
     assert {each.source for each in received.messages[-50:]} == {"mavlink-ulog"}
@@ -179,16 +205,21 @@ def test_failing_barometer_does_not_end_stream() -> None:
     assert [each for each in received.rejections if "not requested" in each.reason] == []
     assert not any(each.rebooted for each in received.messages)
     status = received.status
-    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
+    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), (
+        received.reasons
+    )
     assert len({each for each in received.reasons if each}) == 0, received.reasons
 
 
 @recorded_flight
 def test_conversion_resumes_when_stream_ends(timings: Timings) -> None:
     """After another client's STOP, converted messages replace those of the stream, without overlap."""
-    timings.log_silence = 0.2  # at full speed the rest of the flight takes little more than a second
+    # at full speed the rest of the flight takes little more than a second
+    timings.log_silence = 0.2
     received = Received("log=1&topics=vehicle_attitude", FLIGHT, events={40.0: "foreign_stop"})
-    sources = [each.source for each in received.messages if each.address.topic == "vehicle_attitude"]
+    sources = [
+        each.source for each in received.messages if each.address.topic == "vehicle_attitude"
+    ]
     assert [source for source, _ in groupby(sources)] == [None, "mavlink-ulog", None]
     assert any("PX4 stopped the ULog stream" in each for each in received.reasons), received.reasons
 
@@ -198,7 +229,9 @@ def test_published_stream_and_saved_file_equal_log_of_vehicle(tmp_path: Path) ->
     """All messages of a real PX4 (SITL) arrive without a gap and equal its own log, and so does the saved file."""
     received = Received(f"log=1&save={tmp_path}", FLIGHT)
     status = received.status
-    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
+    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), (
+        received.reasons
+    )
     assert status.header_time is not None
     assert compare(received, STREAMS / "ulog_stream_flight1.ulg") >= 47_000
     assert len(received.stream) == MESSAGES
@@ -213,7 +246,9 @@ def test_published_stream_and_saved_file_equal_log_of_vehicle(tmp_path: Path) ->
 def test_log_messages_of_stream_equal_those_of_log() -> None:
     """Logged strings and events in a stream become the same log_message as in the log, and replace STATUSTEXT."""
     received = Received("log=1&topics=log_message", FLIGHT)
-    texts = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
+    texts = [
+        each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000
+    ]
     assert {each.source for each in texts} == {"mavlink-ulog"}
     logged = log_messages_in(STREAMS / "ulog_stream_flight1.ulg")
     assert [tuple(each.fields.values()) for each in texts] == [
@@ -227,24 +262,34 @@ def test_stream_replaces_converted_topics(timings: Timings) -> None:
     """A topic is converted until it arrives in the stream, never both; topics that the stream lacks stay converted."""
     timings.log_silence = DEADLINE  # on a busy host, no data for a second do not end the stream
     timings.log_longest_silence = 2 * DEADLINE
-    received = Received("log=1&topics=vehicle_attitude,vehicle_local_position,home_position", FLIGHT)
+    received = Received(
+        "log=1&topics=vehicle_attitude,vehicle_local_position,home_position", FLIGHT
+    )
     first = min(cast("int", each.fields["timestamp"]) for each in received.stream)
     after = Counter(
-        each.address.topic for each in received.converted if cast("int", each.fields["timestamp"]) > first + 2_000_000
+        each.address.topic
+        for each in received.converted
+        if cast("int", each.fields["timestamp"]) > first + 2_000_000
     )
     assert set(after) <= {"home_position"}
-    assert {each.address.topic for each in received.converted} >= {"vehicle_attitude", "vehicle_local_position"}
+    assert {each.address.topic for each in received.converted} >= {
+        "vehicle_attitude",
+        "vehicle_local_position",
+    }
 
 
 @recorded_flight
 @pytest.mark.parametrize(("name", "messages", "lost", "gaps", "impairment"), [
-    ("default_topics", 18_482, 44, 11, {}),  # lost by PX4 after the header, and in the gap of its own log
+    # lost by PX4 after the header, and in the gap of its own log
+    ("default_topics", 18_482, 44, 11, {}),
     ("lossy1", 49_052, 0, 237, {}),
     ("flight1", MESSAGES, 0, 500, {"loss": 0.03, "reorder": 0.02, "seed": 1}),
     ("flight1", MESSAGES, 0, 1000, {"loss": 0.05, "seed": 3}),
     ("flight1", MESSAGES, 0, 1000, {"loss": 0.05, "burst": 20, "seed": 2}),
 ])  # fmt: skip
-def test_estimate_of_losses(name: str, messages: int, lost: int, gaps: int, impairment: dict[str, Any]) -> None:
+def test_estimate_of_losses(
+    name: str, messages: int, lost: int, gaps: int, impairment: dict[str, Any]
+) -> None:
     """No value is wrong, and the estimated number of missing messages is within 20 %, for recordings of PX4.
 
     `messages`: number in the recording before STOP; `lost`: number missing in both the recording and the log;
@@ -272,7 +317,9 @@ def test_estimate_of_gaps_with_records_of_one_size(size: int, lost: int) -> None
     ]  # fmt: skip
     sent = to_messages(struct.pack("<HB", len(body), ord(kind)) + body for kind, body in bodies)
     period = lost + 5 + 2 * (size // 249)
-    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None))
+    client = cast(
+        "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None)
+    )
     reassembly, stream = Reassembly(), LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
     last = missing = estimated = 0
     for each in sent:
@@ -300,8 +347,12 @@ def test_estimate_after_a_restart_does_not_depend_on_the_first_messages(first: i
         *(("A", struct.pack("<BH", 0, size) + f"noise{size}".encode()) for size in {*sizes}),
     ]  # fmt: skip
     definitions = b"ULog\x01\x12\x35\x01" + bytes(8)
-    definitions += b"".join(struct.pack("<HB", len(body), ord(kind)) + body for kind, body in bodies)
-    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None))
+    definitions += b"".join(
+        struct.pack("<HB", len(body), ord(kind)) + body for kind, body in bodies
+    )
+    client = cast(
+        "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None)
+    )
     stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
     assert not [*stream.add(Chunk("delivered", definitions, begins=True), 0.0)]
     lost, reported = 500, 0
@@ -320,7 +371,9 @@ def test_rate_is_measured_since_the_last_window(tmp_path: Path) -> None:
     fields = "uint64_t timestamp;uint8_t[87] data;"
     header = write_raw_log(tmp_path / "a.ulg", {"noise": (fields, "Q87x")}, []).read_bytes()
     record = struct.pack("<HBHQ87x", 97, ord("D"), 0, 1)
-    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None))
+    client = cast(
+        "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None)
+    )
     stream, found = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client), []
     assert not [*stream.add(Chunk("delivered", header, begins=True), 10.0)]
     stream.status(10.0)
@@ -347,7 +400,10 @@ def test_unreadable_stream_is_stopped_with_reason() -> None:
     recording = read_recording(SHORT)
     first = recording.header[0]
     flags = 16 + 3 + 8  # after the file header, the record's header and the compatible flags
-    header = [first._replace(data=first.data[:flags] + b"\x02" + first.data[flags + 1 :]), *recording.header[1:]]
+    header = [
+        first._replace(data=first.data[:flags] + b"\x02" + first.data[flags + 1 :]),
+        *recording.header[1:],
+    ]
     received = Received("log=1", replace(recording, header=header))
     assert not received.stream
     assert len(received.converted) > 500
@@ -360,14 +416,19 @@ def test_unreadable_stream_is_stopped_with_reason() -> None:
 
 def test_topic_that_is_subscribed_in_turns_is_one_stream() -> None:
     """Unsubscriptions neither restart a stream nor repeat its rejection; topics that are not selected stay unread."""
-    stream = LogStream("1", MavlinkOptions(topics=("vehicle_attitude", "bad/topic")), cast("Any", None))
+    stream = LogStream(
+        "1", MavlinkOptions(topics=("vehicle_attitude", "bad/topic")), cast("Any", None)
+    )
     writer = UlogWriter()
     for name, fields in (("vehicle_attitude", ""), ("bad/topic", "float x;"), ("other", "")):
         writer.put("F", f"{name}:uint64_t timestamp;{fields}".encode())
     for number in range(6):
         for message_id, topic in enumerate((b"vehicle_attitude", b"bad/topic", b"other"), number):
             writer.put("A", struct.pack("<BH", 0, message_id) + topic)
-            writer.put("D", struct.pack("<HQ", message_id, number) + bytes(4 if topic == b"bad/topic" else 0))
+            writer.put(
+                "D",
+                struct.pack("<HQ", message_id, number) + bytes(4 if topic == b"bad/topic" else 0),
+            )
             writer.put("R", struct.pack("<H", message_id))
     found = [*stream.add(Chunk("delivered", bytes(writer.data), begins=True), 0.0)]
     messages = [each.fields["timestamp"] for each in found if isinstance(each, SourceMessage)]
@@ -381,7 +442,8 @@ def test_unreadable_event_metadata_is_rejected_once() -> None:
     writer = UlogWriter()
     writer.put("M", b"\0\x1auint8_t[6] metadata_eventsnot xz")
     writer.put(
-        "F", b"event:uint64_t timestamp;uint32_t id;uint16_t event_sequence;uint8_t[25] arguments;uint8_t log_levels;"
+        "F",
+        b"event:uint64_t timestamp;uint32_t id;uint16_t event_sequence;uint8_t[25] arguments;uint8_t log_levels;",
     )
     writer.put("A", struct.pack("<BH", 0, 1) + b"event")
     found = [*stream.add(Chunk("delivered", bytes(writer.data), begins=True), 0.0)]
@@ -422,16 +484,23 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
 
         def attack(frame: bytes, port: int) -> None:
             """Send an invalid message for each valid one."""
-            message: Any = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+            message: Any = dialect.MAVLink_heartbeat_message(
+                2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3
+            )
             mav.srcSystem = 66
             if (number := sent["frames"]) % 50:
                 mav.srcSystem = rng.choice((66, 66, 67))  # 67 sends no HEARTBEAT
                 content = HOSTILE[number % 3] if number > 100 else HOSTILE[1]
                 sequence = rng.choice((0, 1, number % 2**16, rng.randrange(2**16)))
                 target = rng.choice(((245, 191), (245, 191), (1, 1)))
-                offset, length = rng.choice((0, 0, 255, rng.randrange(256))), rng.choice((len(content), 255))
+                offset, length = (
+                    rng.choice((0, 0, 255, rng.randrange(256))),
+                    rng.choice((len(content), 255)),
+                )
                 data = [*content[:249].ljust(249, b"\0")]
-                message = dialect.MAVLink_logging_data_message(*target, sequence, min(length, 255), offset, data)
+                message = dialect.MAVLink_logging_data_message(
+                    *target, sequence, min(length, 255), offset, data
+                )
             hostile.sendto(message.pack(mav), ("127.0.0.1", port))
             with suppress(BlockingIOError):
                 mav.srcSystem = 66
@@ -440,7 +509,9 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
                         answer: Any = dialect.MAVLink_timesync_message(1, command.ts1)
                         hostile.sendto(answer.pack(mav), ("127.0.0.1", port))
                     elif command.get_type() == "COMMAND_LONG":
-                        answer = dialect.MAVLink_command_ack_message(command.command, 0, 0, 0, 245, 191)
+                        answer = dialect.MAVLink_command_ack_message(
+                            command.command, 0, 0, 0, 245, 191
+                        )
                         hostile.sendto(answer.pack(mav), ("127.0.0.1", port))
                         sent[str(command.command)] += 1
             sent["frames"] += 1
@@ -463,8 +534,12 @@ WINDOWS: Final = count(10**9, 1000)
 
 def small_stream(tmp_path: Path) -> tuple[LogStream, bytes]:
     """Return a stream and its header; each message has a timestamp and a cell count."""
-    path = write_raw_log(tmp_path / "a.ulg", {"battery_status": ("uint64_t timestamp;int32_t cell_count;", "Qi")}, [])
-    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=0.0))
+    path = write_raw_log(
+        tmp_path / "a.ulg", {"battery_status": ("uint64_t timestamp;int32_t cell_count;", "Qi")}, []
+    )
+    client = cast(
+        "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=0.0)
+    )
     return LogStream("1", MavlinkOptions(log=frozenset({"1"})), client), path.read_bytes()
 
 
@@ -497,7 +572,9 @@ class TestClock:
         for sent in (1_700_000_000 * 10**9, round(now * 1e9) - 1, 1):
             stream.add_timesync(10**9, sent, now)
         repeated = stream.request_time()
-        stream.add_timesync(round((repeated / 1e9 + 0.002 + self.BOOT) * 1e9), repeated, repeated / 1e9 + 0.005)
+        stream.add_timesync(
+            round((repeated / 1e9 + 0.002 + self.BOOT) * 1e9), repeated, repeated / 1e9 + 0.005
+        )
         stream.add_timesync(10**9, repeated, repeated / 1e9 + 0.001)
         assert measured_delay(stream, now + self.BOOT - 0.25, now) == pytest.approx(0.25, abs=0.001)
 
@@ -515,7 +592,9 @@ class TestClock:
             stream, header = small_stream(tmp_path)
             list(stream.add(Chunk("delivered", header, begins=True), 0.0))
             now = max(self.answer(stream, *each) for each in delays)
-            assert measured_delay(stream, now + self.BOOT - 0.25, now) == pytest.approx(0.25, abs=0.0015), delays
+            assert measured_delay(stream, now + self.BOOT - 0.25, now) == pytest.approx(
+                0.25, abs=0.0015
+            ), delays
 
     def test_clock_that_went_back_is_measured_again(self, tmp_path: Path) -> None:
         """An answer that disproves the offset replaces it, even if its round trip is longer."""
@@ -523,7 +602,9 @@ class TestClock:
         list(stream.add(Chunk("delivered", header, begins=True), 0.0))
         self.answer(stream, 0.001, 0.001)
         now = self.answer(stream, 0.02, 0.02, boot=self.BOOT - 21.57)
-        assert measured_delay(stream, now + self.BOOT - 21.57 - 0.25, now) == pytest.approx(0.25, abs=0.001)
+        assert measured_delay(stream, now + self.BOOT - 21.57 - 0.25, now) == pytest.approx(
+            0.25, abs=0.001
+        )
 
     def test_new_stream_has_no_delay_until_clock_is_measured(self, tmp_path: Path) -> None:
         """A new stream may be that of a new boot: its delay is unknown until the vehicle answers again."""
@@ -541,7 +622,11 @@ def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
     fields = "uint64_t timestamp;int32_t cell_count;"
     rows = [("battery_status", (number, count)) for number, count in enumerate((6, 300, -1, 7))]
     path = write_raw_log(tmp_path / "a.ulg", {"battery_status": (fields, "Qi")}, rows)
-    data = path.read_bytes() + struct.pack("<HBH", 2, ord("O"), 1500) + struct.pack("<HBHQi", 14, ord("D"), 0, 9, 8)
+    data = (
+        path.read_bytes()
+        + struct.pack("<HBH", 2, ord("O"), 1500)
+        + struct.pack("<HBHQi", 14, ord("D"), 0, 9, 8)
+    )
     client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming")))
     stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
     found = list(stream.add(Chunk("delivered", data, begins=True), 0.0))
@@ -549,16 +634,27 @@ def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
     assert [each.fields.get("cell_count") for each in messages] == [6, None, None, 7, 8]
     assert [each.dropout for each in messages] == [0.0, 0.0, 0.0, 0.0, 1.5]
     [rejection] = [each for each in found if isinstance(each, Rejection)]
-    assert rejection.reason == "battery_status.cell_count is left out where its value does not fit uint8, such as 300"
+    assert (
+        rejection.reason
+        == "battery_status.cell_count is left out where its value does not fit uint8, such as 300"
+    )
     assert rejection.count == 0
 
 
 def test_uninitialized_bools_of_stream_are_true(tmp_path: Path) -> None:
     """As in a file, a bool whose byte is not 0 is true; the reason is the same for each message, and logged once."""
     fields = "uint64_t timestamp;bool[2] flags;"
-    path = write_raw_log(tmp_path / "a.ulg", {"rtl_status": (fields, "Q2B")}, [("rtl_status", (1, 194, 94))] * 2)
-    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"}), topics=("rtl_status",)), cast("Any", None))
+    path = write_raw_log(
+        tmp_path / "a.ulg", {"rtl_status": (fields, "Q2B")}, [("rtl_status", (1, 194, 94))] * 2
+    )
+    stream = LogStream(
+        "1", MavlinkOptions(log=frozenset({"1"}), topics=("rtl_status",)), cast("Any", None)
+    )
     found = [*stream.add(Chunk("delivered", path.read_bytes(), begins=True), 0.0)]
-    assert [each.encode().payload[-3:] for each in found if isinstance(each, SourceMessage)] == [b"\x92\xc3\xc3"] * 2
+    assert [each.encode().payload[-3:] for each in found if isinstance(each, SourceMessage)] == [
+        b"\x92\xc3\xc3"
+    ] * 2
     reason = "bools of rtl_status whose byte is neither 0 nor 1 are read as true (2 in the first such message)"
-    assert [each for each in found if isinstance(each, Rejection)] == [Rejection("1 rtl_status", reason, count=0)] * 2
+    assert [each for each in found if isinstance(each, Rejection)] == [
+        Rejection("1 rtl_status", reason, count=0)
+    ] * 2

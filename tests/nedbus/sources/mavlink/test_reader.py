@@ -108,7 +108,8 @@ def test_reads_that_end_within_a_message_lose_nothing(autopilot: Autopilot) -> N
             for begin in range(0, len(data), size):
                 autopilot.send(data[begin : begin + size])
                 received += (
-                    each.sequence if isinstance(each, Received) else each for each in link_reader.read(DEADLINE)
+                    each.sequence if isinstance(each, Received) else each
+                    for each in link_reader.read(DEADLINE)
                 )
             peak = tracemalloc.get_traced_memory()[1]
         finally:
@@ -123,7 +124,11 @@ def test_source_that_was_blocked_continues_with_the_newest_messages(
     """While the source does not read, the oldest messages are dropped beyond a limit, and counted as lost."""
     monkeypatch.setattr(receive_queue, "_MAX_WAITING", WAITING)
     with Listener(f"mavlink:{autopilot.link}?log=1&topics=vehicle_local_position") as listener:
-        autopilot.send(*autopilot.pack(*(position(1000 + number) for number in range(WAITING + 99)), heartbeat()))
+        autopilot.send(
+            *autopilot.pack(
+                *(position(1000 + number) for number in range(WAITING + 99)), heartbeat()
+            )
+        )
         wait_for(lambda: autopilot.starts, what="START, the answer to the heartbeat")
         dropped = 100 + autopilot.answers  # they wait, too
         first, *rest = listener.receive(WAITING + 99 - dropped)
@@ -156,9 +161,13 @@ def test_vehicles_of_a_link_are_limited(autopilot: Autopilot) -> None:
     assert {each.where.rpartition(" ")[2] for each in listener.rejections} == {"vehicles"}
 
 
-def receive(receiver: Receiver, system: int, now: float, *, peer: object = "peer") -> Received | Rejection:
+def receive(
+    receiver: Receiver, system: int, now: float, *, peer: object = "peer"
+) -> Received | Rejection:
     """Pass a HEARTBEAT of a vehicle to a receiver without a thread."""
-    [received] = parse(new_parser(), heartbeat().pack(dialect.MAVLink(None, system, 1)), "link", peer, now)
+    [received] = parse(
+        new_parser(), heartbeat().pack(dialect.MAVLink(None, system, 1)), "link", peer, now
+    )
     assert isinstance(received, Received)
     return receiver.process(received)
 
@@ -174,7 +183,9 @@ def test_vehicle_that_is_silent_longest_is_removed_for_another_one() -> None:
     assert receiver.vehicles.keys() == {1, *range(3, 102)}, "2 was silent longest"
 
 
-def test_removed_vehicle_has_no_state(monkeypatch: pytest.MonkeyPatch, timings: Timings, autopilot: Autopilot) -> None:
+def test_removed_vehicle_has_no_state(
+    monkeypatch: pytest.MonkeyPatch, timings: Timings, autopilot: Autopilot
+) -> None:
     """A vehicle that was removed and returns is a new one, on both threads: its stream is requested again."""
     monkeypatch.setattr(reader, "_MAX_VEHICLES", 1)
     monkeypatch.setattr(reader, "_MIN_SILENCE", 0.0)
@@ -184,7 +195,9 @@ def test_removed_vehicle_has_no_state(monkeypatch: pytest.MonkeyPatch, timings: 
             autopilot.send(*autopilot.pack(heartbeat(), position(1000 * attempt)))
             wait_for(partial(has_started, autopilot, attempt), what="START")
             autopilot.send(position(1000 * attempt).pack(dialect.MAVLink(None, 8, 1)))
-            listener.step_until(partial(has_received, listener, "8"), what="a position of the other vehicle")
+            listener.step_until(
+                partial(has_received, listener, "8"), what="a position of the other vehicle"
+            )
             listener.messages.clear()
 
 
@@ -240,7 +253,10 @@ def test_stranger_with_the_id_of_a_vehicle_changes_nothing_but_a_remark() -> Non
     [remark] = listener.rejections
     assert remark.count == 0
     assert remark.where.endswith("system 9, second address")
-    assert f"also arrives from 127.0.0.1:{stranger.port}; requests go to 127.0.0.1:{vehicle.port} only" in remark.reason
+    assert (
+        f"also arrives from 127.0.0.1:{stranger.port}; requests go to 127.0.0.1:{vehicle.port} only"
+        in remark.reason
+    )
 
 
 class UdpAutopilot:
@@ -294,7 +310,10 @@ def data_frames() -> Iterator[bytes]:
     """Yield frames of ULog data: full, short, and with zeros at the end, which MAVLink 2 does not transmit."""
     mav = dialect.MAVLink(None, 9, 1)
     for data in (bytes(range(249)), b"abc" + bytes(246), bytes(249)):
-        for kind in (dialect.MAVLink_logging_data_message, dialect.MAVLink_logging_data_acked_message):
+        for kind in (
+            dialect.MAVLink_logging_data_message,
+            dialect.MAVLink_logging_data_acked_message,
+        ):
             for target, sequence, length, offset in ((245, 65_535, 249, 255), (0, 0, 3, 0)):
                 yield bytes(kind(target, target, sequence, length, offset, data).pack(mav))
 
@@ -305,12 +324,16 @@ def test_data_of_the_ulog_stream_is_decoded_as_by_pymavlink() -> None:
     frames = list(data_frames())
     reference = dialect.MAVLink(None)
     for datagrams in (frames, [b"".join(frames)]):
-        found = [each for data in datagrams for each in parse(new_parser(), data, "link", None, 0.0)]
+        found = [
+            each for data in datagrams for each in parse(new_parser(), data, "link", None, 0.0)
+        ]
         assert len(found) == len(frames)
         for received, frame in zip(found, frames, strict=True):
             assert isinstance(received, Received)
             expected: Any = reference.parse_char(frame)
-            assert [getattr(received.message, name) for name in names] == [getattr(expected, name) for name in names]
+            assert [getattr(received.message, name) for name in names] == [
+                getattr(expected, name) for name in names
+            ]
             data = received.message.data.ljust(249, b"\0")
             assert (received.message.get_type(), received.message.get_msgId()) == (
                 expected.get_type(),
@@ -328,5 +351,8 @@ def test_damaged_data_of_the_ulog_stream_is_rejected() -> None:
         found = list(parse(new_parser(), bytes(damaged), "link", None, 0.0))
         assert not any(isinstance(each, Received) for each in found), index
     parser = new_parser()
-    mixed = [*parse(parser, bytes(damaged), "link", None, 0.0), *parse(parser, frames[1], "link", None, 0.0)]
+    mixed = [
+        *parse(parser, bytes(damaged), "link", None, 0.0),
+        *parse(parser, frames[1], "link", None, 0.0),
+    ]
     assert [isinstance(each, Received) for each in mixed] == [False, True]

@@ -22,7 +22,8 @@ from tests.peers.px4_log_stream import STREAMS, datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
 TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
-UNTIMED_AGE: Final = 2.0  # s: maximum age of the logged value that equals a message without a timestamp
+# s: maximum age of the logged value that equals a message without a timestamp
+UNTIMED_AGE: Final = 2.0
 STATUS_AGE: Final = 1.2  # s: ESTIMATOR_STATUS is sent once a second
 RESOLUTION: Final = {
     "lat": 1e-7, "lon": 1e-7, "latitude_deg": 1e-7, "longitude_deg": 1e-7,
@@ -30,7 +31,10 @@ RESOLUTION: Final = {
     "vel_m_s": 0.01, "cog_rad": math.radians(0.01), "hdop": 0.01, "vdop": 0.01, "s_variance_m_s": 1e-3,
     "voltage_v": 1e-3, "remaining": 0.01, "current_a": 0.01,
 }  # fmt: skip
-NOT_IN_THE_LOG: Final = {"time_utc_usec", *(f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health"))}
+NOT_IN_THE_LOG: Final = {
+    "time_utc_usec",
+    *(f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health")),
+}
 FIELDS: Final = {  # converted fields by topic
     "vehicle_attitude": "q",
     "vehicle_odometry": "angular_velocity orientation_variance pose_frame position position_variance q quality"
@@ -57,8 +61,14 @@ def is_same(name: str, converted: Any, logged: Any) -> bool:
         return all(is_same(name, one, other) for one, other in zip(converted, logged, strict=True))
     if converted == logged or not isinstance(converted, float):
         return bool(converted == logged)
-    error = math.remainder(converted - logged, math.tau) if name == "cog_rad" else float(converted - logged)
-    return abs(error) <= RESOLUTION.get(name, 1e-6) or (math.isnan(converted) and math.isnan(logged))
+    error = (
+        math.remainder(converted - logged, math.tau)
+        if name == "cog_rad"
+        else float(converted - logged)
+    )
+    return abs(error) <= RESOLUTION.get(name, 1e-6) or (
+        math.isnan(converted) and math.isnan(logged)
+    )
 
 
 @pytest.mark.slow
@@ -66,10 +76,16 @@ def test_converted_messages_equal_log() -> None:
     """Each converted message is valid, in order, and equals the logged one within MAVLink's resolution."""
     rows: dict[tuple[str, int | None], list[Any]] = defaultdict(list)
     for each in open_replay(f"ulog:{LOG}?topics={','.join(TOPICS)}").messages:
-        rows[each.address.topic, each.address.instance].append(upgrade_with(BY_TOPIC[each.address.topic], each.fields))
+        rows[each.address.topic, each.address.instance].append(
+            upgrade_with(BY_TOPIC[each.address.topic], each.fields)
+        )
     times = {key: [row.timestamp for row in of_key] for key, of_key in rows.items()}
     vehicle, parser = Vehicle("1", TOPICS), dialect.MAVLink(None)
-    compared, unlogged, fields_converted = Counter[str](), Counter[str](), defaultdict[str, set[str]](set)
+    compared, unlogged, fields_converted = (
+        Counter[str](),
+        Counter[str](),
+        defaultdict[str, set[str]](set),
+    )
     for time_ns, datagram in read_datagrams(PX4 / "twelve_messages_mavlink.bin.gz"):
         for message in parser.parse_buffer(datagram) or []:
             if not message.get_srcSystem():
@@ -80,7 +96,11 @@ def test_converted_messages_equal_log() -> None:
                 continue
             assert isinstance(converted, SourceMessage)
             assert not converted.rebooted
-            topic, instance, fields = converted.address.topic, converted.address.instance, converted.fields
+            topic, instance, fields = (
+                converted.address.topic,
+                converted.address.instance,
+                converted.fields,
+            )
             model, now = upgrade_with(BY_TOPIC[topic], fields), converted.fields["timestamp"]
             assert isinstance(now, int)
             of_topic, until = rows[topic, instance], bisect(times[topic, instance], now)
@@ -98,7 +118,13 @@ def test_converted_messages_equal_log() -> None:
                 since = min(until - 1, bisect(times[topic, instance], now - age * 1e6))
                 candidates = [getattr(row, name) for row in of_topic[since:until]]
                 value = getattr(model, name)
-                assert any(is_same(name, value, each) for each in candidates), (topic, now, name, value, candidates)
+                assert any(is_same(name, value, each) for each in candidates), (
+                    topic,
+                    now,
+                    name,
+                    value,
+                    candidates,
+                )
     assert fields_converted == {topic: set(names.split()) for topic, names in FIELDS.items()}
     # The log lacks some attitudes, and was closed before the last odometry.
     assert unlogged == {"vehicle_attitude": 472, "vehicle_odometry": 1}
@@ -117,12 +143,17 @@ def test_gps_time_comes_from_system_time() -> None:
         for message in parser.parse_buffer(datagram) or []:
             converted = vehicle.handle(message, time_ns / 1e9) if message.get_srcSystem() else None
             if isinstance(converted, SourceMessage) and "time_utc_usec" in converted.fields:
-                origins.append(int(str(converted.fields["time_utc_usec"])) - int(str(converted.fields["timestamp"])))
+                origins.append(
+                    int(str(converted.fields["time_utc_usec"]))
+                    - int(str(converted.fields["timestamp"]))
+                )
     assert len(origins) == 378
     assert max(origins) - min(origins) < 2_000_000  # simulated time drifts from the host's clock
 
 
-@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
+@pytest.mark.skipif(
+    not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}"
+)
 def test_statustexts_appear_in_log() -> None:
     """The text of each STATUSTEXT of a flight is a logged string without its module name and trailing tab."""
     vehicle, parser = Vehicle("1", {"log_message"}), new_parser()

@@ -138,7 +138,8 @@ def test_killed_process_leaves_valid_log(tmp_path: Path) -> None:
             pid, count = int(process.stdout.readline()), chance.randrange(1, len(log) // CHUNK_SIZE)
             written = [int(process.stdout.readline()) for _ in range(count)][-1]
             os.kill(pid, signal.SIGKILL)
-            while not process.stdout.readline().endswith("killed\n"):  # may follow an unfinished line
+            # may follow an unfinished line
+            while not process.stdout.readline().endswith("killed\n"):
                 pass
             (saved,) = (tmp_path / f"{number}").iterdir()
             content = saved.read_bytes()
@@ -185,7 +186,11 @@ class TestState:
     ) -> None:
         """The vehicle's clock has advanced like the host's, within 2 s and the drift of a clock; else it rebooted."""
         saved = read_stream(self.save(tmp_path), 7)
-        with nullcontext() if is_same else pytest.raises(ValueError, match="the vehicle has rebooted"):
+        with (
+            nullcontext()
+            if is_same
+            else pytest.raises(ValueError, match="the vehicle has rebooted")
+        ):
             saved.check_boot(round(vehicle * 1e6), 1000.0 + elapsed)
 
     @pytest.mark.parametrize(("change", "reason"), [
@@ -219,16 +224,23 @@ class TestState:
         file.update(1, 1, 1.0)
         assert not file.is_current
 
-    def test_folder_follows_systemd_and_xdg(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_folder_follows_systemd_and_xdg(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """By default the file is in systemd's StateDirectory, else in the XDG state folder; one for each link."""
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "xdg"))
         options = MavlinkOptions()
-        one, two = (state_path(options, link, 1) for link in ("udpin:0.0.0.0:14540", "udpin:0.0.0.0:14541"))
+        one, two = (
+            state_path(options, link, 1) for link in ("udpin:0.0.0.0:14540", "udpin:0.0.0.0:14541")
+        )
         assert one
         assert one != two
         assert one.parent == tmp_path / "xdg" / "nedbus" / "ulog-streams"
         monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path}/systemd:/other")
-        assert state_path(options, "", 1) == tmp_path / "systemd" / "ulog-streams" / f"{sha256(b'').hexdigest()[:16]}-1"
+        assert (
+            state_path(options, "", 1)
+            == tmp_path / "systemd" / "ulog-streams" / f"{sha256(b'').hexdigest()[:16]}-1"
+        )
 
     def test_folder_that_cannot_be_written_is_logged_once(
         self, tmp_path: Path, caplog: pytest.LogCaptureFixture
@@ -249,10 +261,18 @@ class TestState:
 
 def stream_with_files(folder: Path) -> tuple[LogStream, bytes, bytes]:
     """Return a stream that saves to a folder, its header, and a data record."""
-    path = write_raw_log(folder / "a.ulg", {"noise": ("uint64_t timestamp;uint8_t[87] data;", "Q87x")}, [])
-    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=1.0))
+    path = write_raw_log(
+        folder / "a.ulg", {"noise": ("uint64_t timestamp;uint8_t[87] data;", "Q87x")}, []
+    )
+    client = cast(
+        "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=1.0)
+    )
     options = MavlinkOptions(log=frozenset({"1"}), save=str(folder / "saved"))
-    return LogStream("1", options, client), path.read_bytes(), struct.pack("<HBHQ87x", 97, ord("D"), 0, 1)
+    return (
+        LogStream("1", options, client),
+        path.read_bytes(),
+        struct.pack("<HBHQ87x", 97, ord("D"), 0, 1),
+    )
 
 
 class TestFilesOfStream:
@@ -291,7 +311,8 @@ class TestFilesOfStream:
         stream.end()
         assert found == 4
         saved = [
-            ULog(str(each)) for each in sorted((tmp_path / "saved").iterdir(), key=lambda each: each.stat().st_size)
+            ULog(str(each))
+            for each in sorted((tmp_path / "saved").iterdir(), key=lambda each: each.stat().st_size)
         ]
         assert [len(each.data_list[0].data["timestamp"]) for each in saved] == [1, 3]
         assert [[each.duration for each in log.dropouts] for log in saved] == [[], [1000]]
@@ -309,7 +330,9 @@ class TestFilesOfStream:
         assert len([*stream.add(Chunk("delivered", record), 100.1)]) == 1
         assert stream.status(100.1).unsaved == len(header) + len(record)
 
-    def test_deleted_folder_is_logged_once_and_counted(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_deleted_folder_is_logged_once_and_counted(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
         """Data for a file that was deleted in flight is counted, and its loss is logged once."""
         stream, header, record = stream_with_files(tmp_path)
         for chunk in (Chunk("delivered", header, begins=True), Chunk("delivered", record)):
@@ -337,19 +360,28 @@ def test_topics_of_repeated_headers_are_not_kept(tmp_path: Path) -> None:
             writer.put("F", f"{name}:uint64_t timestamp;".encode())
             writer.put("A", struct.pack("<BH", 0, index) + name.encode())
             writer.put("D", struct.pack("<HQ", index, number))
-        assert len([*stream.add(Chunk("delivered", bytes(writer.data), begins=True), float(number))]) == 50
+        assert (
+            len([*stream.add(Chunk("delivered", bytes(writer.data), begins=True), float(number))])
+            == 50
+        )
     assert len(stream._streamed) == 50
 
 
 def test_changed_definitions_of_continued_stream_are_rejected(tmp_path: Path) -> None:
     """A continued stream with a message of another length is rejected; an unknown id is counted, and reported once."""
     reasons: list[str] = []
-    client: Any = SimpleNamespace(status=LogStatus("streaming"), header_seconds=None, reject=reasons.append)
+    client: Any = SimpleNamespace(
+        status=LogStatus("streaming"), header_seconds=None, reject=reasons.append
+    )
     _, header, record = stream_with_files(tmp_path)
     stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
     unknown = struct.pack("<HBHQ", 10, ord("D"), 9, 1)
     found = [*stream.add(Chunk("delivered", header, begins=True), 1.0)]
-    for chunk in (Chunk("delivered", unknown, lost=5), Chunk("delivered", unknown), Chunk("delivered", record)):
+    for chunk in (
+        Chunk("delivered", unknown, lost=5),
+        Chunk("delivered", unknown),
+        Chunk("delivered", record),
+    ):
         found += stream.add(chunk, 2.0)
     assert [each.reason for each in found if isinstance(each, Rejection)] == [
         "messages of topics whose definitions were lost are counted as undecodable until the next stream"

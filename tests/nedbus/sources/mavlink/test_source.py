@@ -68,7 +68,9 @@ def fly(start: Start, port: int, tmp_path: Path) -> Fly:
     def fly(*arguments: object, rows: list[dict[str, float]] | None = None) -> Process:
         values = tmp_path / "values.json"
         values.write_text(json.dumps(rows or [ROW]))
-        return start(PEER, "--to", f"127.0.0.1:{port}", "--values", str(values), *map(str, arguments))
+        return start(
+            PEER, "--to", f"127.0.0.1:{port}", "--values", str(values), *map(str, arguments)
+        )
 
     return fly
 
@@ -117,9 +119,13 @@ def local_position(ms: int, *values: float) -> Any:
 def estimates(number: int) -> list[dict[str, float]]:
     """Return the estimates of a simulated flight at 5 Hz."""
     run = open_replay("sim:?seed=3")
-    chosen = islice((each for each in run.messages if each.address.topic == VLP), 0, 20 * number, 20)
+    chosen = islice(
+        (each for each in run.messages if each.address.topic == VLP), 0, 20 * number, 20
+    )
     flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dist_bottom_valid", "xy_global")
-    return [{name: getattr(upgrade(each.fields), name) for name in (*ROW, *flags)} for each in chosen]
+    return [
+        {name: getattr(upgrade(each.fields), name) for name in (*ROW, *flags)} for each in chosen
+    ]
 
 
 def test_validity_without_estimator_status_is_unknown(
@@ -127,7 +133,15 @@ def test_validity_without_estimator_status_is_unknown(
 ) -> None:
     """Each command reports unknown validity for a vehicle without ESTIMATOR_STATUS, such as ArduPilot by default."""
     pages = HttpClient(free_port())
-    run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
+    run_nedbus(
+        "serve",
+        "--connect",
+        endpoint,
+        "--http",
+        pages.where,
+        "-s",
+        f"mavlink:udpin:127.0.0.1:{port}",
+    )
     expected = {
         "list": "validity unknown", "info": "validity unknown", "echo --once": "validity unknown",
         "hz --count 2": "validity unknown",
@@ -142,13 +156,16 @@ def test_validity_without_estimator_status_is_unknown(
                     return
                 with suppress(ConnectionError):  # before the service listens
                     vehicle.send(
-                        dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), local_position(1000 + 50 * number)
+                        dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
+                        local_position(1000 + 50 * number),
                     )
 
     with ThreadPoolExecutor(1) as pool:
         sending = pool.submit(send)
         try:
-            wait_for(lambda: pages.values("nedbus_messages_published_total", topic=VLP), what="positions")
+            wait_for(
+                lambda: pages.values("nedbus_messages_published_total", topic=VLP), what="positions"
+            )
             for command, text in expected.items():
                 shown = run_command(*command.split(), "-c", endpoint)
                 assert text in shown.out + shown.err, (command, shown)
@@ -162,7 +179,9 @@ def test_validity_without_estimator_status_is_unknown(
         sending.result(DEADLINE)
 
 
-def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int) -> None:
+def test_positions_of_flight_reach_readers(
+    run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int
+) -> None:
     """All positions that were not dropped are published, at 10 % packet loss and with a reboot.
 
     The whole flight fits into the link's receive buffer, so a service that reads late loses no messages.
@@ -172,7 +191,18 @@ def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: ned
     in_use = re.compile(rf":{port:04X} \S+ 07 ")
     wait_for(lambda: in_use.search(Path("/proc/net/udp").read_text()), what="the service to listen")
     with bus.subscribe(mode="every") as every:
-        options = ("--system", 7, "--drop", 0.1, "--count", 120, "--reboot-after", 60, "--speed", 10)
+        options = (
+            "--system",
+            7,
+            "--drop",
+            0.1,
+            "--count",
+            120,
+            "--reboot-after",
+            60,
+            "--speed",
+            10,
+        )
         vehicle = fly(*options, rows=estimates(120))
         assert vehicle.wait() == 0, vehicle.err
         *lines, end = [json.loads(line) for line in vehicle.out.splitlines()]
@@ -195,12 +225,33 @@ def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: ned
 
 def test_position_has_only_fields_that_mavlink_provides(listener: Listener, port: int) -> None:
     """The estimate has the values of MAVLink's messages in PX4's units, and no other fields."""
-    names = ("origin", "estimator", "global_position", "altitude", "odometry", "attitude", "local_position")
+    names = (
+        "origin",
+        "estimator",
+        "global_position",
+        "altitude",
+        "odometry",
+        "attitude",
+        "local_position",
+    )
     with Autopilot(port) as vehicle:
         vehicle.send(*(getattr(mavlink_peer, name)(2000, ROW) for name in names))
         [received] = listener.receive()
-    flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "xy_global", "z_global", "dist_bottom_valid")
-    expected = {"timestamp": 2_000_000, "ref_timestamp": 1_000_000, **ROW, **dict.fromkeys(flags, True)}
+    flags = (
+        "xy_valid",
+        "z_valid",
+        "v_xy_valid",
+        "v_z_valid",
+        "xy_global",
+        "z_global",
+        "dist_bottom_valid",
+    )
+    expected = {
+        "timestamp": 2_000_000,
+        "ref_timestamp": 1_000_000,
+        **ROW,
+        **dict.fromkeys(flags, True),
+    }
     assert received.fields == pytest.approx(expected, abs=1e-4)
     assert received.fields["ref_lat"] == 47.3977418
     assert (str(received.address), received.lost) == (f"9/{VLP}", 0)
@@ -209,14 +260,25 @@ def test_position_has_only_fields_that_mavlink_provides(listener: Listener, port
 def test_messages_are_converted_to_chosen_topics(port: int) -> None:
     """Only the chosen messages arrive, at their own addresses, complemented by fields of earlier messages."""
     topics = "SensorGps,BatteryStatus,VehicleStatus,HomePosition"
-    gps = dialect.MAVLink_gps_raw_int_message(5_000_000, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
+    gps = dialect.MAVLink_gps_raw_int_message(
+        5_000_000, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255
+    )
     cells = [4000, 4100, *[65535] * 8]
-    battery = dialect.MAVLink_battery_status_message(1, 0, 0, 32767, cells, -1, 100, -1, 55, charge_state=2)
+    battery = dialect.MAVLink_battery_status_message(
+        1, 0, 0, 32767, cells, -1, 100, -1, 55, charge_state=2
+    )
     home = dialect.MAVLink_home_position_message(10, 20, 30, 1, 2, 3, [math.nan] * 4, 0, 0, 0)
-    with Listener(f"mavlink:udpin:127.0.0.1:{port}?topics={topics}") as listener, Autopilot(port) as vehicle:
-        heartbeat = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 128, 0x40000, 4, 3)
+    with (
+        Listener(f"mavlink:udpin:127.0.0.1:{port}?topics={topics}") as listener,
+        Autopilot(port) as vehicle,
+    ):
+        heartbeat = dialect.MAVLink_heartbeat_message(
+            2, dialect.MAV_AUTOPILOT_PX4, 128, 0x40000, 4, 3
+        )
         vehicle.send(battery, heartbeat)  # the time is not known yet
-        vehicle.send(dialect.MAVLink_system_time_message(1_700_000_000_000_000, 6000), local_position(7000))
+        vehicle.send(
+            dialect.MAVLink_system_time_message(1_700_000_000_000_000, 6000), local_position(7000)
+        )
         sensors = dialect.MAVLink_sys_status_message(1, 2, 3, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
         vehicle.send(sensors, gps, battery, heartbeat, home)
         received = {each.address.stream: dict(each.fields) for each in listener.receive(4)}
@@ -245,7 +307,11 @@ def test_messages_are_converted_to_chosen_topics(port: int) -> None:
 def test_vehicles_on_one_port_are_separate(timings: Timings, listener: Listener, port: int) -> None:
     """Each system id on a port is a separate vehicle, and receives its requests at its own address."""
     timings.source_tick = 0.01
-    expected = {**dict.fromkeys([32, 230], 20_000), **dict.fromkeys([33, 141, 331], 100_000), ORIGIN: 0}
+    expected = {
+        **dict.fromkeys([32, 230], 20_000),
+        **dict.fromkeys([33, 141, 331], 100_000),
+        ORIGIN: 0,
+    }
     with Autopilot(port, system=3) as one, Autopilot(port, system=250) as other:
         requested: dict[Autopilot, dict[int, float]] = {one: {}, other: {}}
         for step in count():
@@ -282,12 +348,18 @@ def test_nothing_is_sent_over_a_satellite_link(timings: Timings, port: int) -> N
         topics = {each.address.topic for each in listener.messages if each.address.vehicle == "3"}
         assert topics == {"vehicle_global_position", "vehicle_status", "battery_status"}
         [remark] = listener.rejections
-        assert (remark.count, "a satellite link, because only HIGH_LATENCY2 arrives" in remark.reason) == (0, True)
+        assert (
+            remark.count,
+            "a satellite link, because only HIGH_LATENCY2 arrives" in remark.reason,
+        ) == (0, True)
 
 
 def test_receive_buffer_holds_a_burst(port: int) -> None:
     """400 messages that arrive before the service reads are all received, even with Linux's default buffer limit."""
-    with closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link, Autopilot(port) as vehicle:
+    with (
+        closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link,
+        Autopilot(port) as vehicle,
+    ):
         vehicle.send(*map(local_position, range(400)))
         received: list[object] = []
         while items := [*link.read(0.0)]:
@@ -297,7 +369,10 @@ def test_receive_buffer_holds_a_burst(port: int) -> None:
 
 def test_random_datagrams_are_counted_as_rejected(listener: Listener, port: int) -> None:
     """Random datagrams are counted as rejected under their link, and do not affect a vehicle on the same link."""
-    rng, starts = random.Random(0), (b"", b"\xfd\xff\x00", b"\xfe\x09", b"\xfd\x1c\x00\x00\x00\x01\x01\x20\x00\x00")
+    rng, starts = (
+        random.Random(0),
+        (b"", b"\xfd\xff\x00", b"\xfe\x09", b"\xfd\x1c\x00\x00\x00\x01\x01\x20\x00\x00"),
+    )
     with Autopilot(port) as vehicle, Autopilot(port) as attacker:
         for ms in range(1000, 3000, 50):
             for each in range(50):  # the kernel drops what is not read in time
@@ -314,23 +389,38 @@ def test_late_and_foreign_messages_are_not_published(listener: Listener, port: i
         Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as unnamed,
         Autopilot(port, component=0) as unset,
     ):  # fmt: skip
-        vehicle.send(estimator_status(127), local_position(2000, math.nan, *range(5)), local_position(1500))
+        vehicle.send(
+            estimator_status(127), local_position(2000, math.nan, *range(5)), local_position(1500)
+        )
         camera.send(local_position(3000))
         unnamed.send(local_position(3000))
         unset.send(local_position(3000))
         vehicle.send(local_position(4000))
         first, second = listener.receive(2)
-    assert (first.address.vehicle, first.fields["timestamp"], second.fields["timestamp"]) == ("9", 2_000_000, 4_000_000)
-    assert (first.fields["xy_valid"], first.fields["v_xy_valid"], second.fields["xy_valid"]) == (False, True, True)
+    assert (first.address.vehicle, first.fields["timestamp"], second.fields["timestamp"]) == (
+        "9",
+        2_000_000,
+        4_000_000,
+    )
+    assert (first.fields["xy_valid"], first.fields["v_xy_valid"], second.fields["xy_valid"]) == (
+        False,
+        True,
+        True,
+    )
     [late] = [each for each in listener.rejections if each.address]
     ignored = [each for each in listener.rejections if each is not late]
     assert late.reason == "out of order (1500 ms since boot, after 2000 ms)"
     link = f"udpin:127.0.0.1:{port}"
-    assert [each.where for each in ignored] == [f"{link} system 0 component 1", f"{link} system 9 component 0"]
+    assert [each.where for each in ignored] == [
+        f"{link} system 0 component 1",
+        f"{link} system 9 component 0",
+    ]
     assert all("id 0 is for broadcast only" in each.reason for each in ignored)
 
 
-def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_duplicate_system_id_is_logged(
+    listener: Listener, port: int, caplog: pytest.LogCaptureFixture
+) -> None:
     """Two senders with the same system id are logged once, with both addresses; two address changes are not logged."""
     with Autopilot(port) as one, Autopilot(port) as other, Autopilot(port) as third:
         for ms, sender in enumerate((one, one, other, other, third, third), start=1000):
@@ -342,7 +432,9 @@ def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: py
             listener.receive()
         [record] = caplog.records
         ports = {each._socket.getsockname()[1] for each in (other, third)}
-        assert {int(each) for each in re.findall(r"127\.0\.0\.1:(\d+) ?", record.getMessage())[1:]} == ports
+        assert {
+            int(each) for each in re.findall(r"127\.0\.0\.1:(\d+) ?", record.getMessage())[1:]
+        } == ports
         assert "both send as system 9, and their messages are mixed" in record.getMessage()
 
 
@@ -353,7 +445,14 @@ def test_two_senders_alternate_within_seconds(interval: float, is_reported: bool
     peers = [("10.0.0.1", 14550), ("10.0.0.2", 14550)] * 10
     reported = [senders.add(9, peer, interval * number) for number, peer in enumerate(peers)]
     text = "10.0.0.2:14550 and 10.0.0.1:14550 both send as system 9, and their messages are mixed"
-    assert [each.partition(";")[0] for each in reported] == ["", "", "", "", text * is_reported, *[""] * 15]
+    assert [each.partition(";")[0] for each in reported] == [
+        "",
+        "",
+        "",
+        "",
+        text * is_reported,
+        *[""] * 15,
+    ]
 
 
 def test_closed_tcp_link_raises_and_can_be_reopened() -> None:
@@ -367,9 +466,13 @@ def test_closed_tcp_link_raises_and_can_be_reopened() -> None:
                 connection.sendall(b"noise" + data[:7])
                 connection.sendall(data[7:])
                 [received] = listener.receive()
-                assert (received.address.vehicle, received.fields["timestamp"]) == ("boat", ms * 1000)
+                assert (received.address.vehicle, received.fields["timestamp"]) == (
+                    "boat",
+                    ms * 1000,
+                )
                 connection.settimeout(DEADLINE)
-                assert connection.recv(1)[0] == dialect.PROTOCOL_MARKER_V2  # a heartbeat, or a request
+                # a heartbeat, or a request
+                assert connection.recv(1)[0] == dialect.PROTOCOL_MARKER_V2
                 connection.close()
                 with pytest.raises(SourceError, match="the link broke"):
                     listener.receive()
@@ -418,7 +521,9 @@ def test_requests_fit_serial_port(timings: Timings) -> None:
 
 
 def test_port_in_use_raises(listener: Listener, port: int) -> None:
-    with pytest.raises(SourceError, match=r"\(address already in use\): close the other program or use another"):
+    with pytest.raises(
+        SourceError, match=r"\(address already in use\): close the other program or use another"
+    ):
         Listener(f"mavlink:udpin:127.0.0.1:{port}")
     assert not listener.rejections
 

@@ -60,8 +60,12 @@ def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> N
     assert utc.offset_us == EPOCH
     run = open_replay(f"tlog:{path}?vehicle=a")
     replayed = [each for each in run.messages if each.address.topic == VLP]
-    assert [(each.address.vehicle, each.fields["x"]) for each in replayed] == [("a", x) for x in range(100)]
-    np.testing.assert_allclose([each.at for each in replayed], [number / 10 for number in range(100)])
+    assert [(each.address.vehicle, each.fields["x"]) for each in replayed] == [
+        ("a", x) for x in range(100)
+    ]
+    np.testing.assert_allclose(
+        [each.at for each in replayed], [number / 10 for number in range(100)]
+    )
     assert not run.warnings
     assert run_command("events", str(path)).exit_code == 0
     assert run_command("convert", str(path), str(tmp_path / "a.mcap")).exit_code == 0
@@ -77,7 +81,9 @@ def test_step_of_the_hosts_clock_takes_no_time(tmp_path: Path, seconds: float) -
     middle = len(records) // 2
     for index in range(middle, len(records)):
         (stamp,) = struct.unpack_from(">Q", records[index])
-        records[index] = struct.pack(">Q", stamp + round((seconds - 0.1) * 1e6)) + records[index][8:]
+        records[index] = (
+            struct.pack(">Q", stamp + round((seconds - 0.1) * 1e6)) + records[index][8:]
+        )
     path.write_bytes(b"".join(records))
     due = [each.at for each in open_replay(f"tlog:{path}").messages if each.address.topic == VLP]
     np.testing.assert_allclose(np.diff(due), [0.1] * 19, atol=1e-6)
@@ -101,7 +107,9 @@ def test_boot_time_of_tlog_ignores_old_samples(tmp_path: Path) -> None:
         mavlink.MAVLink_gps_raw_int_message(5_000_000, 1, 0, 0, 0, 0, 0, 0, 0, 9),
     ]
     path = tmp_path / "flight.tlog"
-    path.write_bytes(b"".join(struct.pack(">Q", EPOCH + 60_000_000) + each.pack(sender) for each in messages))
+    path.write_bytes(
+        b"".join(struct.pack(">Q", EPOCH + 60_000_000) + each.pack(sender) for each in messages)
+    )
     utc = nedbus.utc_of(path)
     assert utc is not None
     assert utc.offset_us == EPOCH
@@ -113,7 +121,9 @@ def test_damaged_tlog_loses_only_the_damaged_messages(tmp_path: Path) -> None:
     records = list(frames(1, 50))
     damaged = bytearray(records[42])  # a position
     damaged[12] ^= 0xFF
-    path.write_bytes(b"".join([*records[:42], damaged, *records[43:90], bytes(50), *records[90:]])[:-3])
+    path.write_bytes(
+        b"".join([*records[:42], damaged, *records[43:90], bytes(50), *records[90:]])[:-3]
+    )
     positions = nedbus.read(path)
     assert positions["x"].tolist() == [x for x in range(50) if x != 10]
     run = open_replay(f"tlog:{path}")
@@ -198,7 +208,9 @@ def write_messages(path: Path, messages: Iterable[tuple[int, Any]]) -> None:
 
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("is_wrapped", [False, True])
-def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path, direction: int, *, is_wrapped: bool) -> None:
+def test_flight_over_the_antimeridian_has_no_event(
+    tmp_path: Path, direction: int, *, is_wrapped: bool
+) -> None:
     """Eastward and westward, as PX4 up to 1.15 sends longitudes and as later releases do: no rejection, no event."""
     path, copied = tmp_path / "flight.tlog", tmp_path / "flight.mcap"
     latitude, origin = -170_000_000, direction * 1_799_990_000
@@ -212,8 +224,16 @@ def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path, direction: in
             if is_wrapped:
                 estimated = measured
             yield ms, mavlink.MAVLink_estimator_status_message(1000 * ms, FLAGS, *[0] * 6, 0.5, 0.5)
-            yield ms, mavlink.MAVLink_local_position_ned_message(ms, 0, east, -50, 0, 10 * direction, 0)
-            yield ms, mavlink.MAVLink_global_position_int_message(ms, latitude, estimated, 550_000, 50_000, 0, 0, 0, 0)
+            yield (
+                ms,
+                mavlink.MAVLink_local_position_ned_message(ms, 0, east, -50, 0, 10 * direction, 0),
+            )
+            yield (
+                ms,
+                mavlink.MAVLink_global_position_int_message(
+                    ms, latitude, estimated, 550_000, 50_000, 0, 0, 0, 0
+                ),
+            )
             accuracy = 0, 1000, 1500, 100
             fix = 3, latitude, measured, 550_000, 100, 100, 500, 9000, 12
             yield ms, mavlink.MAVLink_gps_raw_int_message(1000 * ms, *fix, *accuracy)
@@ -227,7 +247,9 @@ def test_flight_over_the_antimeridian_has_no_event(tmp_path: Path, direction: in
     assert run_command("convert", "--topics", "*", str(path), str(copied)).exit_code == 0
     for file in (path, copied):
         with nedbus.open(file) as flight:
-            positions = [sample.message.global_position for sample in flight(nedbus.VehicleGlobalPosition)]
+            positions = [
+                sample.message.global_position for sample in flight(nedbus.VehicleGlobalPosition)
+            ]
             homes = [sample.message.global_position for sample in flight(nedbus.HomePosition)]
             assert flight.warnings == ()
         assert (len(positions), len(homes)) == (200, 20)
@@ -278,7 +300,11 @@ def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
 @pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
 @pytest.mark.parametrize(
     ("name", "count", "seconds"),
-    [("06_boot_ms_wrap.tlog", 400, 19.95), ("09_two_links_1.5s.tlog", 300, 14.95), ("duplicate.tlog", 5, 0.4)],
+    [
+        ("06_boot_ms_wrap.tlog", 400, 19.95),
+        ("09_two_links_1.5s.tlog", 300, 14.95),
+        ("duplicate.tlog", 5, 0.4),
+    ],
 )
 def test_each_message_once_and_in_order(name: str, count: int, seconds: float) -> None:
     """After the wrap of `time_boot_ms`, over a second, slower link, and with a frame that is in the file twice."""

@@ -34,7 +34,9 @@ def vehicle() -> Vehicle:
     return new_vehicle(VLP)
 
 
-def handle(vehicle: Vehicle, message: Any, now: float, log: LogStream | None = None) -> SourceMessage:
+def handle(
+    vehicle: Vehicle, message: Any, now: float, log: LogStream | None = None
+) -> SourceMessage:
     """Return the message converted by a vehicle, which must not be rejected."""
     converted = vehicle.handle(message, now, log)
     assert isinstance(converted, SourceMessage)
@@ -60,9 +62,13 @@ def estimate(vehicle: Vehicle, ms: int, now: float) -> dict[str, object]:
         (0b0010111101, False),  # the same, in a release that keeps the position
     ],
 )
-def test_constant_position_mode_invalidates_only_without_velocity(vehicle: Vehicle, flags: int, expected: bool) -> None:
+def test_constant_position_mode_invalidates_only_without_velocity(
+    vehicle: Vehicle, flags: int, expected: bool
+) -> None:
     """Constant position mode invalidates xy only without valid horizontal velocity; see PX4's commit 48f1687d3a."""
-    vehicle.handle(dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0), 100.0)
+    vehicle.handle(
+        dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0), 100.0
+    )
     assert estimate(vehicle, 1, 100.0)["xy_valid"] is expected
 
 
@@ -79,13 +85,20 @@ def test_variances_are_the_diagonals_of_covariances() -> None:
 
 @pytest.mark.parametrize(
     ("time_usec", "timestamp"),
-    [(0, 7_000_000), (6_500_000, 6_500_000), (1_700_000_000_000_000, 7_000_000), (2**64 - 1, 7_000_000)],
+    [
+        (0, 7_000_000),
+        (6_500_000, 6_500_000),
+        (1_700_000_000_000_000, 7_000_000),
+        (2**64 - 1, 7_000_000),
+    ],
 )
 def test_unusable_message_time_is_replaced(time_usec: int, timestamp: int) -> None:
     """A timestamp that is Unix time, unknown or invalid is replaced by the newest time since boot."""
     vehicle = new_vehicle(f"{VLP},sensor_gps")
     estimate(vehicle, 7000, 100.0)
-    gps = dialect.MAVLink_gps_raw_int_message(time_usec, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
+    gps = dialect.MAVLink_gps_raw_int_message(
+        time_usec, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255
+    )
     assert handle(vehicle, gps, 100.0).fields["timestamp"] == timestamp
 
 
@@ -100,7 +113,9 @@ def test_unusable_message_time_is_replaced(time_usec: int, timestamp: int) -> No
         (200.0, None, 200.0, 10.0),
     ],
 )
-def test_estimator_status_rate_fits_link(rate: float, baud: int | None, status: float, odometry: float) -> None:
+def test_estimator_status_rate_fits_link(
+    rate: float, baud: int | None, status: float, odometry: float
+) -> None:
     """ESTIMATOR_STATUS is requested with each position, or as often as the remaining bandwidth of a port allows."""
     rates = request_rates(rate, baud, [VLP])
     assert [*rates] == [*NEEDED]
@@ -109,22 +124,31 @@ def test_estimator_status_rate_fits_link(rate: float, baud: int | None, status: 
     assert rates[230] == pytest.approx(status, abs=0.01)
 
 
-@pytest.mark.parametrize("topics", [[*TOPICS], ["vehicle_attitude"], ["sensor_gps", "home_position"], [VLP], ["x"]])
+@pytest.mark.parametrize(
+    "topics", [[*TOPICS], ["vehicle_attitude"], ["sensor_gps", "home_position"], [VLP], ["x"]]
+)
 @pytest.mark.parametrize("rate", [0.5, 30.0, 100.0])
-def test_only_needed_messages_are_requested_within_bandwidth(topics: list[str], rate: float) -> None:
+def test_only_needed_messages_are_requested_within_bandwidth(
+    topics: list[str], rate: float
+) -> None:
     """Only messages of chosen topics are requested, each at its own rate, or at that of the option if it has none.
 
     If the link cannot carry them, all but the position are reduced, to 2 Hz at the least, until 90 % of it are used.
     """
     rates = request_rates(rate, 57600, topics)
-    own = {number: hertz or rate for number, (_, hertz, of) in STREAMS.items() if {*of.split()} & {*topics}}
+    own = {
+        number: hertz or rate
+        for number, (_, hertz, of) in STREAMS.items()
+        if {*of.split()} & {*topics}
+    }
     if 230 in own:
         own[230] = max(2.0, rate)  # ESTIMATOR_STATUS, which has the flags
     least = {number: hertz if number == 32 else min(2.0, hertz) for number, hertz in own.items()}
     assert [*rates] == [*own]
     assert all(least[number] <= hertz <= own[number] for number, hertz in rates.items())
     used, wanted, minimal = (
-        sum(STREAMS[number][0] * hertz for number, hertz in each.items()) for each in (rates, own, least)
+        sum(STREAMS[number][0] * hertz for number, hertz in each.items())
+        for each in (rates, own, least)
     )
     assert used == pytest.approx(min(wanted, max(0.9 * 57600 / 10, minimal)))
 
@@ -138,9 +162,15 @@ def test_every_converted_topic_has_a_requested_message() -> None:
 def test_attitude_replaces_missing_attitude_quaternion() -> None:
     """ATTITUDE is converted only while the vehicle sends no ATTITUDE_QUATERNION."""
     vehicle = new_vehicle("vehicle_attitude")
-    converted = handle(vehicle, dialect.MAVLink_attitude_message(1000, 0.1, -0.2, 3.0, 0, 0, 0), 100.0)
-    assert quaternion_to_euler(cast("tuple[float, ...]", converted.fields["q"])) == pytest.approx((0.1, -0.2, 3.0))
-    assert vehicle.handle(dialect.MAVLink_attitude_quaternion_message(1010, 1, 0, 0, 0, 0, 0, 0), 100.1)
+    converted = handle(
+        vehicle, dialect.MAVLink_attitude_message(1000, 0.1, -0.2, 3.0, 0, 0, 0), 100.0
+    )
+    assert quaternion_to_euler(cast("tuple[float, ...]", converted.fields["q"])) == pytest.approx(
+        (0.1, -0.2, 3.0)
+    )
+    assert vehicle.handle(
+        dialect.MAVLink_attitude_quaternion_message(1010, 1, 0, 0, 0, 0, 0, 0), 100.1
+    )
     assert vehicle.handle(dialect.MAVLink_attitude_message(1020, 0, 0, 0, 0, 0, 0), 100.2) is None
     assert vehicle.handle(dialect.MAVLink_attitude_message(4000, 0, 0, 0, 0, 0, 0), 103.0)
 
@@ -153,7 +183,10 @@ def test_order_is_checked_per_topic() -> None:
     assert vehicle.handle(dialect.MAVLink_odometry_message(1_900_000, *odometry), 100.0)
     late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
     assert isinstance(late, Rejection)
-    assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order (1800 ms since boot, after 1900 ms)")
+    assert (late.where, late.reason) == (
+        "9/vehicle_odometry",
+        "out of order (1800 ms since boot, after 1900 ms)",
+    )
     assert vehicle.handle(position(2000), 100.0) is None
     assert vehicle.copies == 1
     assert estimate(vehicle, 2050, 100.1)["timestamp"] == 2_050_000
@@ -204,7 +237,9 @@ def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
     return [each for each in requests if each]
 
 
-def test_unanswered_requests_are_repeated(vehicle: Vehicle, caplog: pytest.LogCaptureFixture) -> None:
+def test_unanswered_requests_are_repeated(
+    vehicle: Vehicle, caplog: pytest.LogCaptureFixture
+) -> None:
     """Each message is requested three times, then every few seconds; each one except the origin is logged once."""
     caplog.set_level("INFO")
     requested = [number for number, _ in requests_of(vehicle, range(100, 200))]
@@ -244,7 +279,9 @@ def test_losses_during_stream_are_reported_once() -> None:
     streamed = SourceMessage(0.0, Address("9", VLP), {}, lost=3)
 
     def attitude(ms: int) -> SourceMessage:
-        converted = vehicle.handle(dialect.MAVLink_attitude_quaternion_message(ms, 1, 0, 0, 0, 0, 0, 0), 100.0, log)
+        converted = vehicle.handle(
+            dialect.MAVLink_attitude_quaternion_message(ms, 1, 0, 0, 0, 0, 0, 0), 100.0, log
+        )
         assert isinstance(converted, SourceMessage)
         return converted
 
@@ -277,7 +314,9 @@ def test_stopped_positions_are_requested_again(vehicle: Vehicle) -> None:
     for second in range(100, 140):
         if second < 120:
             estimate(vehicle, 1000 * second, second)
-        requested += [(second, number) for number, _ in requests_of(vehicle, range(second, second + 1))]
+        requested += [
+            (second, number) for number, _ in requests_of(vehicle, range(second, second + 1))
+        ]
     assert [second // 10 for second, number in requested if number == 32][3:] == [12, 12, 13, 13]
 
 
@@ -291,7 +330,9 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert later["ref_lat"] == 47.3977418
     assert "ref_timestamp" not in later
     for ms in (4000, 490):
-        vehicle.handle(dialect.MAVLink_global_position_int_message(ms, 0, 0, 0, 0, 0, 0, 0, 65535), 105.0)
+        vehicle.handle(
+            dialect.MAVLink_global_position_int_message(ms, 0, 0, 0, 0, 0, 0, 0, 65535), 105.0
+        )
     back = handle(vehicle, position(500), 105.0)
     assert ("ref_lat" in back.fields, back.rebooted) == (False, True)
     assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
@@ -302,7 +343,9 @@ def test_heading_that_becomes_unknown_is_not_provided(vehicle: Vehicle) -> None:
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
     assert estimate(vehicle, 1, 100.0)["heading"] == pytest.approx(math.pi / 2)
-    vehicle.handle(dialect.MAVLink_global_position_int_message(2, 0, 0, 0, 0, 0, 0, 0, 65535), 100.1)
+    vehicle.handle(
+        dialect.MAVLink_global_position_int_message(2, 0, 0, 0, 0, 0, 0, 0, 65535), 100.1
+    )
     assert estimate(vehicle, 3, 100.1)["heading"] == pytest.approx(1.25)
     vehicle.handle(dialect.MAVLink_attitude_message(4, 0, 0, math.nan, 0, 0, 0), 100.2)
     assert "heading" not in estimate(vehicle, 5, 100.2)
@@ -311,19 +354,29 @@ def test_heading_that_becomes_unknown_is_not_provided(vehicle: Vehicle) -> None:
 def test_attitude_yaw_replaces_unknown_heading(vehicle: Vehicle) -> None:
     """If the heading in GLOBAL_POSITION_INT is unknown (65535), the heading is the yaw of ATTITUDE."""
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
-    vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
+    vehicle.handle(
+        dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0
+    )
     assert estimate(vehicle, 1, 100.0)["heading"] == pytest.approx(1.25)
 
 
 NAN, U16 = math.nan, 2**16 - 1
-UNKNOWN = {  # messages with the values that mean unknown in MAVLink's common.xml, and the fields that are known
+# messages with the values that mean unknown in MAVLink's common.xml, and the fields that are known
+UNKNOWN = {
     "gps": (
-        dialect.MAVLink_gps_raw_int_message(10**6, 3, 1, 1, 1, U16, U16, U16, U16, 255, 0, 0, 0, 0, 0, U16),
+        dialect.MAVLink_gps_raw_int_message(
+            10**6, 3, 1, 1, 1, U16, U16, U16, U16, 255, 0, 0, 0, 0, 0, U16
+        ),
         {"fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m"},
     ),
-    "silent receiver": (dialect.MAVLink_gps_raw_int_message(10**6, 0, 0, 0, 0, U16, U16, U16, U16, 255), {"fix_type"}),
+    "silent receiver": (
+        dialect.MAVLink_gps_raw_int_message(10**6, 0, 0, 0, 0, U16, U16, U16, U16, 255),
+        {"fix_type"},
+    ),
     "battery": (
-        dialect.MAVLink_battery_status_message(0, 0, 0, 2**15 - 1, [U16] * 10, -1, -1, -1, -1, 0, 0, [0] * 4),
+        dialect.MAVLink_battery_status_message(
+            0, 0, 0, 2**15 - 1, [U16] * 10, -1, -1, -1, -1, 0, 0, [0] * 4
+        ),
         set[str](),
     ),
     "further cells": (
@@ -340,13 +393,32 @@ UNKNOWN = {  # messages with the values that mean unknown in MAVLink's common.xm
         dialect.MAVLink_home_position_message(1, 1, 1, 1, 2, 3, [0] * 4, 0, 0, 0),
         {"lat", "lon", "alt", "x", "y", "z", "valid_hpos", "valid_alt"},
     ),
-    "home at 0, 0": (dialect.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [0] * 4, 0, 0, 0), set[str]()),
-    "attitude": (dialect.MAVLink_attitude_quaternion_message(1000, 0, 0, 0, 0, 0, 0, 0), set[str]()),
-    "odometry without attitude": (
-        dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [0] * 4, *[0] * 6, [0] * 21, [0] * 21, 0, 8, 100),
-        {"pose_frame", "position", "velocity_frame", "velocity", "angular_velocity", "reset_counter", "quality"},
+    "home at 0, 0": (
+        dialect.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [0] * 4, 0, 0, 0),
+        set[str](),
     ),
-    "global position": (dialect.MAVLink_global_position_int_message(1000, 0, 0, 0, 0, 0, 0, 0, 0), set[str]()),
+    "attitude": (
+        dialect.MAVLink_attitude_quaternion_message(1000, 0, 0, 0, 0, 0, 0, 0),
+        set[str](),
+    ),
+    "odometry without attitude": (
+        dialect.MAVLink_odometry_message(
+            0, 1, 1, 1, 2, 3, [0] * 4, *[0] * 6, [0] * 21, [0] * 21, 0, 8, 100
+        ),
+        {
+            "pose_frame",
+            "position",
+            "velocity_frame",
+            "velocity",
+            "angular_velocity",
+            "reset_counter",
+            "quality",
+        },
+    ),
+    "global position": (
+        dialect.MAVLink_global_position_int_message(1000, 0, 0, 0, 0, 0, 0, 0, 0),
+        set[str](),
+    ),
     "landed": (dialect.MAVLink_extended_sys_state_message(0, 0), set[str]()),
     "status": (
         dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3),
@@ -385,7 +457,9 @@ def high_latency(ms: int, *, autopilot: int = dialect.MAV_AUTOPILOT_PX4, **field
 
 def converted_high_latency(message: Any) -> dict[str, dict[str, object]]:
     items = new_vehicle("*").handle_all(message, 100.0)
-    return {item.address.stream: dict(item.fields) for item in items if isinstance(item, SourceMessage)}
+    return {
+        item.address.stream: dict(item.fields) for item in items if isinstance(item, SourceMessage)
+    }
 
 
 def test_high_latency_message_has_position_status_and_battery() -> None:
@@ -423,18 +497,34 @@ def test_zeros_of_other_messages_are_unknown(vehicle: Vehicle) -> None:
     """An origin at 0, 0 and accuracies of 0 are no values, so the estimate has neither."""
     vehicle.handle(dialect.MAVLink_gps_global_origin_message(0, 0, 0), 100.0)
     vehicle.handle(dialect.MAVLink_estimator_status_message(0, 0x3F, *[0] * 8), 100.0)
-    odometry = dialect.MAVLink_odometry_message(0, 1, 1, 1, 2, 3, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21)
+    odometry = dialect.MAVLink_odometry_message(
+        0, 1, 1, 1, 2, 3, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21
+    )
     vehicle.handle(odometry, 100.0)
-    assert estimate(vehicle, 1000, 100.0).keys().isdisjoint({"ref_lat", "xy_global", "eph", "epv", "evh", "evv"})
+    assert (
+        estimate(vehicle, 1000, 100.0)
+        .keys()
+        .isdisjoint({"ref_lat", "xy_global", "eph", "epv", "evh", "evv"})
+    )
 
 
 @pytest.mark.parametrize(
     ("state", "vehicle_type", "is_in_transition", "is_to_fixed_wing"),
     [
         (dialect.MAV_VTOL_STATE_MC, nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING, False, False),
-        (dialect.MAV_VTOL_STATE_TRANSITION_TO_FW, nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING, True, True),
+        (
+            dialect.MAV_VTOL_STATE_TRANSITION_TO_FW,
+            nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING,
+            True,
+            True,
+        ),
         (dialect.MAV_VTOL_STATE_FW, nedbus.VehicleStatus.VEHICLE_TYPE_FIXED_WING, False, False),
-        (dialect.MAV_VTOL_STATE_TRANSITION_TO_MC, nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING, True, False),
+        (
+            dialect.MAV_VTOL_STATE_TRANSITION_TO_MC,
+            nedbus.VehicleStatus.VEHICLE_TYPE_ROTARY_WING,
+            True,
+            False,
+        ),
     ],
 )
 def test_status_of_a_vtol_has_its_transition(
@@ -446,22 +536,33 @@ def test_status_of_a_vtol_has_its_transition(
     vehicle.handle(dialect.MAVLink_extended_sys_state_message(state, 0), 100.0)
     fields = handle(vehicle, heartbeat, 101.0).fields
     assert (fields["is_vtol"], fields["vehicle_type"]) == (True, vehicle_type)
-    assert (fields["in_transition_mode"], fields["in_transition_to_fw"]) == (is_in_transition, is_to_fixed_wing)
+    assert (fields["in_transition_mode"], fields["in_transition_to_fw"]) == (
+        is_in_transition,
+        is_to_fixed_wing,
+    )
     assert "is_vtol" not in handle(vehicle, heartbeat, 110.0).fields
-    vehicle.handle(dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_UNDEFINED, 1), 111.0)
+    vehicle.handle(
+        dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_UNDEFINED, 1), 111.0
+    )
     assert "is_vtol" not in handle(vehicle, heartbeat, 111.0).fields
 
 
 @pytest.mark.parametrize(
     ("kind", "is_vtol"),
-    [(dialect.MAV_TYPE_QUADROTOR, False), (dialect.MAV_TYPE_HEXAROTOR, False), (dialect.MAV_TYPE_FIXED_WING, True)],
+    [
+        (dialect.MAV_TYPE_QUADROTOR, False),
+        (dialect.MAV_TYPE_HEXAROTOR, False),
+        (dialect.MAV_TYPE_FIXED_WING, True),
+    ],
 )
 def test_multicopter_is_no_vtol(kind: int, is_vtol: bool) -> None:
     """ArduCopter 4.5.7 sends the VTOL state of a multicopter, as in a .tlog of its SITL; a fixed wing can be a VTOL."""
     vehicle = new_vehicle("*")
     vehicle.handle(position(1000), 100.0)
     vehicle.handle(dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_MC, 2), 100.0)
-    heartbeat = dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3)
+    heartbeat = dialect.MAVLink_heartbeat_message(
+        kind, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3
+    )
     assert ("is_vtol" in handle(vehicle, heartbeat, 101.0).fields) == is_vtol
 
 
@@ -471,8 +572,12 @@ def test_origin_beyond_the_antimeridian_is_kept(vehicle: Vehicle) -> None:
     assert estimate(vehicle, 1000, 100.0)["ref_lon"] == 180.00001
 
 
-@pytest.mark.parametrize(("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)])
-def test_unmeasured_clearance_is_invalid(vehicle: Vehicle, clearance: float, is_valid: bool) -> None:
+@pytest.mark.parametrize(
+    ("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)]
+)
+def test_unmeasured_clearance_is_invalid(
+    vehicle: Vehicle, clearance: float, is_valid: bool
+) -> None:
     """A bottom_clearance that is negative or NaN means no measurement: dist_bottom is invalid, and left out."""
     vehicle.handle(dialect.MAVLink_altitude_message(10**6, 1, 2, 3, 4, NAN, clearance), 100.0)
     fields = estimate(vehicle, 1000, 100.0)
@@ -485,8 +590,13 @@ def chunk(text: bytes, number: int, sequence: int = 0, severity: int = 4) -> Any
 
 def texts_of(messages: list[tuple[float, Any]]) -> list[tuple[object, ...]]:
     """Return timestamp, severity and text of the log messages of a vehicle that sends messages at these times."""
-    vehicle, later = new_vehicle("log_message"), [(99.0, dialect.MAVLink_timesync_message(0, 0))] * 3
-    found = [vehicle.handle(message, now) for now, message in [(0.0, position(1000)), *messages, *later]]
+    vehicle, later = (
+        new_vehicle("log_message"),
+        [(99.0, dialect.MAVLink_timesync_message(0, 0))] * 3,
+    )
+    found = [
+        vehicle.handle(message, now) for now, message in [(0.0, position(1000)), *messages, *later]
+    ]
     converted = [each for each in found if isinstance(each, SourceMessage)]
     assert {each.address.stream for each in converted} == {"log_message"}
     return [tuple(each.fields.values()) for each in converted]
@@ -495,7 +605,9 @@ def texts_of(messages: list[tuple[float, Any]]) -> list[tuple[object, ...]]:
 def test_statustext_chunks_are_joined() -> None:
     """Chunks are joined in order, by id; missing chunks leave "...", and control characters are removed."""
     first, second = b"a" * 49 + b"\xc2", b"\xb5" + b"b" * 49
-    assert texts_of([(0.0, chunk(b"Takeoff\x1b[31m detected\t", 0))]) == [(1_000_000, 4, "Takeoff detected")]
+    assert texts_of([(0.0, chunk(b"Takeoff\x1b[31m detected\t", 0))]) == [
+        (1_000_000, 4, "Takeoff detected")
+    ]
     whole = [(0.0, chunk(first, 1)), (0.1, chunk(second, 1, 1)), (0.2, chunk(b"end", 1, 2))]
     assert texts_of(whole) == [(1_000_000, 4, f"{'a' * 49}\u00b5{'b' * 49}end")]
     [(_, _, gap)] = texts_of([whole[0], whole[2]])

@@ -69,7 +69,13 @@ def test_departed_vehicles_leave_no_objects(source: Source, zenoh_session: Sessi
     source.step_until(lambda: not source.node._subscriptions)
     source.streams.report(time.monotonic() + 61.0)
     tables = source.streams._streams, source.streams._owners, source.streams._reboots
-    assert [len(each) for each in (*tables, source.node._nodes, source.node._tokens._keys)] == [0, 0, 0, 0, 0]
+    assert [len(each) for each in (*tables, source.node._nodes, source.node._tokens._keys)] == [
+        0,
+        0,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_messages_beyond_the_queue_are_counted_as_rejected(

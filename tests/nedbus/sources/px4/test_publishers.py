@@ -26,7 +26,9 @@ def key(topic: str = VLP, *, domain: int = 0) -> TopicKey:
 
 def px4(session: str, topic: str = VLP) -> PublisherToken:
     """Return the token of a PX4 in simulation."""
-    return PublisherToken.parse(REAL.replace("7f683599e27664034d4ab1bf80ed5a2f", session).replace(VLP, topic))
+    return PublisherToken.parse(
+        REAL.replace("7f683599e27664034d4ab1bf80ed5a2f", session).replace(VLP, topic)
+    )
 
 
 def node(session: str, name: str = "talker") -> PublisherToken:
@@ -34,7 +36,9 @@ def node(session: str, name: str = "talker") -> PublisherToken:
     return PublisherToken.parse(key().token("MP", session, name, 1))
 
 
-def send(streams: StreamRegistry, stream: Px4Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:
+def send(
+    streams: StreamRegistry, stream: Px4Stream, sequence: int, now: float, gid: bytes = GID
+) -> tuple[int, bool]:
     """Feed one message; return the messages lost before it, and True if its vehicle rebooted."""
     return streams.accept(stream, Attachment(sequence, 0, gid), now)
 
@@ -48,13 +52,17 @@ def streams() -> StreamRegistry:
 def test_token_of_real_px4_is_parsed() -> None:
     """A token contains the key of the messages and, for PX4 but not for ROS 2, the gid of the node."""
     token = PublisherToken.parse(REAL)
-    assert str(token.key) == f"0/fmu/out/{VLP}/px4_msgs::msg::dds_::VehicleLocalPosition_/{type_hash('1.16')}"
+    assert (
+        str(token.key)
+        == f"0/fmu/out/{VLP}/px4_msgs::msg::dds_::VehicleLocalPosition_/{type_hash('1.16')}"
+    )
     assert (token.session, token.gid) == ("7f683599e27664034d4ab1bf80ed5a2f", GID)
     assert node("a").gid is None
 
 
 @pytest.mark.parametrize(
-    "text", ["", "a", REAL.replace("MP", "MS"), REAL + "/x", REAL.replace("/0/7", "/x/7"), 99 * REAL]
+    "text",
+    ["", "a", REAL.replace("MP", "MS"), REAL + "/x", REAL.replace("/0/7", "/x/7"), 99 * REAL],
 )
 def test_invalid_token_raises(text: str) -> None:
     """A token that rmw_zenoh would not declare for a publisher raises DecodeError."""
@@ -72,7 +80,9 @@ def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRe
     assert send(streams, stream, 7, 100.1) == (0, False)
     streams.add_publisher(px4("b"), 100.2)
     for number in range(100):
-        with pytest.raises(NotAcceptedError, match="two publishers on this key have the same gid; give each"):
+        with pytest.raises(
+            NotAcceptedError, match="two publishers on this key have the same gid; give each"
+        ):
             send(streams, stream, number, 100.2 + number)
     streams.remove_publisher(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="the same gid"):
@@ -100,7 +110,11 @@ def test_queued_messages_of_vanished_vehicles_are_rejected(streams: StreamRegist
 def test_topics_of_one_vehicle_may_share_a_gid(streams: StreamRegistry) -> None:
     """Publishers with one gid in one session, or in two sessions with different topics, are one vehicle."""
     stream = streams.on_message(str(key()), 0.0)
-    for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
+    for token in (
+        px4("a"),
+        px4("a", "external_ins_local_position"),
+        px4("b", "estimator_local_position_0"),
+    ):
         streams.add_publisher(token, 100.0)
     assert send(streams, stream, 1, 100.1) == (0, False)
 
@@ -140,7 +154,12 @@ def test_restarted_ros_2_publisher_is_accepted_at_once(streams: StreamRegistry) 
 
 def test_reboot_is_counted_once_per_vehicle(streams: StreamRegistry) -> None:
     """Each reboot counts once, whichever topic reveals it first."""
-    topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
+    topics = (
+        VLP,
+        "vehicle_local_position_groundtruth",
+        "estimator_local_position_0",
+        "estimator_local_position_1",
+    )
     vehicle = [streams.on_message(str(key(topic)), 0.0) for topic in topics]
     other = streams.on_message(str(key(domain=1)), 0.0)
     for now in (100.0, 110.0, 120.0):
@@ -163,7 +182,9 @@ def test_number_of_publishers_of_a_key_is_limited(streams: StreamRegistry) -> No
     assert not streams._streams
 
 
-def test_number_of_keys_is_limited(monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry) -> None:
+def test_number_of_keys_is_limited(
+    monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry
+) -> None:
     """The number of keys is limited; keys of withdrawn publishers without an accepted message do not count."""
     monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
     streams.add_publisher(px4("a"), 0.0)
@@ -182,7 +203,8 @@ def test_silent_keys_without_publisher_are_removed(streams: StreamRegistry) -> N
     for number in range(3000):
         now = float(number)
         stream = streams.on_message(
-            str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now
+            str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))),
+            now,
         )
         streams.wire_format_of(stream)
         send(streams, stream, 1, now)

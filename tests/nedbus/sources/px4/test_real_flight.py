@@ -101,7 +101,9 @@ def read_recording(path: Path) -> Iterator[Sent]:
                 assert kind == "SampleKind.PUT"
                 assert congestion in ("CongestionControl.DROP", "CongestionControl.BLOCK")
                 sequence = Attachment.parse(bytes.fromhex(attachment)).sequence
-                distances = [abs(sequence - 1 - last.get((px4, key), 0)) for px4 in range(len(sessions))]
+                distances = [
+                    abs(sequence - 1 - last.get((px4, key), 0)) for px4 in range(len(sessions))
+                ]
                 px4 = distances.index(min(distances))
                 last[px4, key] = sequence
                 raw = bytes.fromhex(attachment), bytes.fromhex(payload)
@@ -118,7 +120,8 @@ class Px4:
             "connect/endpoints": [endpoint],
             "connect/timeout_ms": round(1000 * DEADLINE),
             "listen/endpoints": [],
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,  # us: wait, like zenoh-pico
+            # us: wait, like zenoh-pico
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,
         }
         config = zenoh.Config()
         for name, value in settings.items():
@@ -132,7 +135,9 @@ class Px4:
         if sent.payload:
             if sent.key not in self._publishers:
                 drop = zenoh.CongestionControl.DROP
-                publisher = self.session.declare_publisher(sent.key, congestion_control=drop, express=sent.express)
+                publisher = self.session.declare_publisher(
+                    sent.key, congestion_control=drop, express=sent.express
+                )
                 self._publishers[sent.key] = publisher
                 wait_for(lambda: is_read(publisher), what="the service to subscribe")
             self._publishers[sent.key].put(sent.payload, attachment=sent.attachment)
@@ -185,7 +190,9 @@ def source() -> str:
 
 
 @pytest.fixture(params=["embedded", pytest.param("zenohd", marks=pytest.mark.slow)])
-def where(request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_path: Path, source: str) -> str:
+def where(
+    request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_path: Path, source: str
+) -> str:
     """Start a service that receives from PX4s, as the router or as a client of zenohd; return the endpoint."""
     endpoint = free_endpoint()
     if request.param == "embedded":
@@ -210,7 +217,11 @@ def test_positions_of_flight_equal_log(where: str) -> None:
     logged = log_rows()
     equal: Counter[str] = Counter()
     total = 0
-    with nedbus.connect(where, timeout=DEADLINE) as bus, bus.subscribe(ANY, mode="every") as every, Px4(where) as px4:
+    with (
+        nedbus.connect(where, timeout=DEADLINE) as bus,
+        bus.subscribe(ANY, mode="every") as every,
+        Px4(where) as px4,
+    ):
         window: dict[Address, list[bytes]] = {}
 
         def receive() -> None:
@@ -248,7 +259,9 @@ def read_log(path: Path) -> dict[tuple[str, int, int], dict[str, object]]:
     for data in pyulog.ULog(str(path)).data_list:
         columns: dict[str, list[object]] = {}
         arrays: dict[str, list[list[object]]] = {}
-        for name, column in ((name.replace(".", "_"), column) for name, column in data.data.items()):
+        for name, column in (
+            (name.replace(".", "_"), column) for name, column in data.data.items()
+        ):
             base, _, index = name.partition("[")
             if "_padding" in base:
                 continue
@@ -282,7 +295,11 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
     equal: Counter[bool] = Counter()
     total = received = 0
     last: dict[Address, str] = {}
-    with nedbus.connect(where, timeout=DEADLINE) as bus, bus.subscribe(ANY, mode="every") as every, Px4(where) as px4:
+    with (
+        nedbus.connect(where, timeout=DEADLINE) as bus,
+        bus.subscribe(ANY, mode="every") as every,
+        Px4(where) as px4,
+    ):
 
         def read_all() -> None:
             nonlocal received
@@ -295,7 +312,9 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
                 received += 1
                 row = logged.get((sample.topic, sample.address.instance or 0, fields["timestamp"]))
                 if row is not None:
-                    assert [name for name, value in row.items() if not is_equal(fields[name], value)] == []
+                    assert [
+                        name for name, value in row.items() if not is_equal(fields[name], value)
+                    ] == []
                     equal[sample.topic in TOPICS] += 1
 
         for sent in read_recording(TWELVE.with_name(f"{TWELVE.name}_zenoh.jsonl.gz")):
@@ -340,10 +359,14 @@ def test_silent_topics_are_reported_with_default_pub_csv(where: str) -> None:
             wait_for(lambda: set(source_status(bus).silent) == silent, what="silent topics")
             with changing_timings() as timings:
                 timings.listen = 0.1
-                findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__)
+                findings = examine(
+                    load_settings(None, connect=(where,)), version=nedbus.__version__
+                )
             unsupported = source_status(bus).not_carried
     assert list(unsupported) == sorted(unsupported)
-    assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(unsupported)
+    assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(
+        unsupported
+    )
     [loss] = [each for each in findings if "silent while other topics arrive" in each.seen]
     assert (loss.state, "rel=" in loss.advice) == ("warning", True)
     [other] = [each for each in findings if "SensorCombined" in each.seen]
@@ -370,10 +393,15 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
         Px4(where) as other,
     ):
         later = [sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"]
-        of_both = ([sent for sent in overlapping if bool(sent.px4) == is_second] for is_second in (True, False))
+        of_both = (
+            [sent for sent in overlapping if bool(sent.px4) == is_second]
+            for is_second in (True, False)
+        )
         for part in (lines[:second], *of_both, later):
             played = play(bus, (first, other), part, played)
-        received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
+        received = [
+            encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone
+        ]
         assert sorted(received) == sorted(sent.cdr for sent in alone)
         now = source_status(bus)
         assert (now.published, now.rejected) == (len(alone), played - len(alone))
@@ -441,12 +469,22 @@ def count_outdated_flags(name: str, rate: float) -> int:
             if int(now * rate) > turn:
                 turn = int(now * rate)
                 then = truth(1e6 * turn / rate)
-                bits = 2 * then.v_xy_valid | 4 * then.v_z_valid | 24 * then.xy_valid | 32 * then.z_valid
-                vehicle.handle(dialect.MAVLink_estimator_status_message(0, bits, *[0.0] * 6, 1.0, 1.0), now)
+                bits = (
+                    2 * then.v_xy_valid
+                    | 4 * then.v_z_valid
+                    | 24 * then.xy_valid
+                    | 32 * then.z_valid
+                )
+                vehicle.handle(
+                    dialect.MAVLink_estimator_status_message(0, bits, *[0.0] * 6, 1.0, 1.0), now
+                )
             converted = vehicle.handle(position, now)
             assert isinstance(converted, SourceMessage)
             fields = converted.fields
-            late += any(fields.get(flag, False) != getattr(truth(1000 * position.time_boot_ms), flag) for flag in FLAGS)
+            late += any(
+                fields.get(flag, False) != getattr(truth(1000 * position.time_boot_ms), flag)
+                for flag in FLAGS
+            )
     return late
 
 
@@ -454,7 +492,9 @@ def count_outdated_flags(name: str, rate: float) -> int:
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
 def test_requested_status_rate_reduces_outdated_flags(name: str) -> None:
     """At the rate requested for 57,600 baud, at most a third as many positions have outdated flags as at 2 Hz."""
-    requested, slow = (count_outdated_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
+    requested, slow = (
+        count_outdated_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0)
+    )
     assert 0 < 3 * requested <= slow
 
 
@@ -488,9 +528,13 @@ def test_converted_positions_equal_log(port: int) -> None:
             compared += 1
             assert [fields[name] for name in names] == [row[name] for name in names]
             for flag in FLAGS:
-                differing[flag, (fields["timestamp"] + 850_000) // 1_000_000] += fields[flag] != row[flag]
+                differing[flag, (fields["timestamp"] + 850_000) // 1_000_000] += (
+                    fields[flag] != row[flag]
+                )
     assert compared == 1275
     vertical, horizontal = {1: 11}, {3: 11, 28: 8, 30: 4}
     for flag in FLAGS:
-        found = {second: count for (name, second), count in differing.items() if name == flag and count}
+        found = {
+            second: count for (name, second), count in differing.items() if name == flag and count
+        }
         assert found == (horizontal if "xy" in flag else vertical)

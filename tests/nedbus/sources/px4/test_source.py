@@ -61,7 +61,9 @@ def is_read(publisher: zenoh.Publisher) -> bool:
 class Px4:
     """Zenoh module of a PX4 that publishes like zenoh-pico, with a sequence per topic and trailing garbage."""
 
-    def __init__(self, session: Session, *, domain: int = 0, namespace: str = "", layout: str = "1.16") -> None:
+    def __init__(
+        self, session: Session, *, domain: int = 0, namespace: str = "", layout: str = "1.16"
+    ) -> None:
         self._session = session
         self._start = f"{domain}/{namespace and namespace + '/'}fmu/out"
         self._layout = layout
@@ -73,7 +75,12 @@ class Px4:
         return f"{self._start}/{topic}/{dds_type(ROS2_TYPE)}/{self.type_hash}"
 
     def put(
-        self, each: VehicleLocalPosition | int, *, topic: str = VLP, attachment: bytes | None = None, skip: int = 0
+        self,
+        each: VehicleLocalPosition | int,
+        *,
+        topic: str = VLP,
+        attachment: bytes | None = None,
+        skip: int = 0,
     ) -> None:
         """Send a message, or one with this timestamp; the default attachment equals PX4's."""
         sent = message(each) if isinstance(each, int) else each
@@ -81,7 +88,11 @@ class Px4:
         self._sequences[topic] = self._sequences.get(topic, 0) + 1 + skip
         default = bytes(Attachment(self._sequences[topic], sent.timestamp, GID))
         extra = {"1.13": 12, "1.14": 8, "1.15": 8, "V0": 4, "1.16": 0}[self._layout] * b"\xa5"
-        self.raw(encode_cdr(fields, layout=self._layout) + extra, topic=topic, attachment=attachment or default)
+        self.raw(
+            encode_cdr(fields, layout=self._layout) + extra,
+            topic=topic,
+            attachment=attachment or default,
+        )
 
     def raw(self, payload: bytes, *, topic: str = VLP, attachment: bytes | None = None) -> None:
         """Send any payload."""
@@ -115,7 +126,9 @@ def serve(run_nedbus: Start, endpoint: str) -> Callable[[], Process]:
 def listen(endpoint: str) -> Iterator[Listen]:
     """Receive from PX4s at the test's router, without a service."""
     with ExitStack() as closing:
-        yield lambda options="": closing.enter_context(Listener(f"px4-zenoh:{options}", routers=(endpoint,)))
+        yield lambda options="": closing.enter_context(
+            Listener(f"px4-zenoh:{options}", routers=(endpoint,))
+        )
 
 
 @pytest.fixture
@@ -150,7 +163,10 @@ def test_layout_is_selected_by_type_hash(listener: Listener, zenoh_session: Sess
     """Messages of any release are received with exactly the fields of this release."""
     for domain, layout in enumerate(LAYOUTS):
         px4 = Px4(zenoh_session, layout=layout, domain=domain)
-        sent = [message(each, x=0.1 * each, xy_valid=True, y=-1.0, hagl_max_z=5.0) for each in range(1, 11)]
+        sent = [
+            message(each, x=0.1 * each, xy_valid=True, y=-1.0, hagl_max_z=5.0)
+            for each in range(1, 11)
+        ]
         for each in sent:
             px4.put(each)
         received = listener.receive(10)
@@ -173,7 +189,9 @@ def test_topic_names_map_to_addresses(listener: Listener, zenoh_session: Session
     }
     for timestamp, name in enumerate(names, 1):
         px4.put(timestamp, topic=name)
-    received = {str(each.address): each.fields["timestamp"] for each in listener.receive(len(names))}
+    received = {
+        str(each.address): each.fields["timestamp"] for each in listener.receive(len(names))
+    }
     assert received == {address: timestamp for timestamp, address in enumerate(names.values(), 1)}
 
 
@@ -181,7 +199,10 @@ def test_topic_names_map_to_addresses(listener: Listener, zenoh_session: Session
     ("options", "expected"),
     [
         ("", ["1", "domain5", "domain5-px4_1", "px4_2", "domain3-swarm-px4_3"]),
-        ("?vehicle=lead&vehicles=5:wing,px4_2:tail,swarm/px4_3:end", ["lead", "wing", "wing-px4_1", "tail", "end"]),
+        (
+            "?vehicle=lead&vehicles=5:wing,px4_2:tail,swarm/px4_3:end",
+            ["lead", "wing", "wing-px4_1", "tail", "end"],
+        ),
         ("?domain=5", ["1", "px4_1"]),
     ],
 )
@@ -192,15 +213,22 @@ def test_vehicles_are_named_by_domain_and_namespace(
     listener = listen(options)
     places = ((0, ""), (5, ""), (5, "px4_1"), (0, "px4_2"), (3, "swarm/px4_3"))
     expected_places = [place for place in places if options != "?domain=5" or place[0] == 5]
-    fleet = [Px4(zenoh_session, domain=domain, namespace=namespace) for domain, namespace in expected_places]
+    fleet = [
+        Px4(zenoh_session, domain=domain, namespace=namespace)
+        for domain, namespace in expected_places
+    ]
     for domain, namespace in set(places) - set(expected_places):
-        zenoh_session.put(Px4(zenoh_session, domain=domain, namespace=namespace).key(), payload_of(2))
+        zenoh_session.put(
+            Px4(zenoh_session, domain=domain, namespace=namespace).key(), payload_of(2)
+        )
     for timestamp in range(1, 21):
         for px4 in fleet:
             px4.put(timestamp)
     received = listener.receive(20 * len(fleet))
     for vehicle in expected:
-        assert times(each for each in received if each.address.vehicle == vehicle) == list(range(1, 21))
+        assert times(each for each in received if each.address.vehicle == vehicle) == list(
+            range(1, 21)
+        )
     assert not listener.rejections
 
 
@@ -216,7 +244,9 @@ def test_loss_and_reboot_are_counted(
     px4.put(3)
     px4.put(4, skip=1)
     px4.raw(payload_of(5))  # like any Zenoh client, without an attachment
-    received = [(each.fields["timestamp"], each.lost, each.rebooted) for each in listener.receive(5)]
+    received = [
+        (each.fields["timestamp"], each.lost, each.rebooted) for each in listener.receive(5)
+    ]
     assert received == [(1, 0, False), (2, 3, False), (3, 0, True), (4, 1, False), (5, 0, False)]
     assert not listener.rejections
     assert caplog.text.count("counted as a reboot of the vehicle") == 1
@@ -236,7 +266,13 @@ def test_key_without_type_hash_needs_layout(listen: Listen, zenoh_session: Sessi
 @pytest.mark.parametrize("type_hash_of_key", [type_hash("1.16"), NO_HASH])
 @pytest.mark.parametrize("trailer", [b"", 8 * b"\xa5"])
 def test_payloads_of_another_layout_are_explained(
-    run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, *, type_hash_of_key: str, trailer: bytes
+    run_nedbus: Start,
+    endpoint: str,
+    zenoh_session: Session,
+    bus: nedbus.Bus,
+    *,
+    type_hash_of_key: str,
+    trailer: bytes,
 ) -> None:
     """`info` and `doctor` name the release whose layout the payloads have, from ROS 2 or with the bytes PX4 appends."""
     run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:?layout=1.16")
@@ -246,7 +282,9 @@ def test_payloads_of_another_layout_are_explained(
     for _ in range(3):
         px4.raw(encode_cdr(fields, layout="1.15") + trailer)
     wait_for(lambda: source_status(bus).rejected >= 3, what="the rejections")
-    reason = f"{204 + len(trailer)} bytes, expected 220 for layout 1.16; they fit the layout of PX4 1.15"
+    reason = (
+        f"{204 + len(trailer)} bytes, expected 220 for layout 1.16; they fit the layout of PX4 1.15"
+    )
     for command in ("info", "doctor"):
         shown = " ".join(run_command(command, "--connect", endpoint).out.split())
         assert reason in shown
@@ -266,9 +304,13 @@ def test_user_definition_adds_a_message(
     key = f"0/fmu/out/wheel_encoders/{dds_type(name)}/{hash_of(definition.current, name)}"
     service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
     wait_for_matching(zenoh_session, key)
-    token = zenoh_session.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
+    token = zenoh_session.liveliness().declare_token(
+        TopicKey.parse(key).token("MP", "px4", "px4", 1)
+    )
     zenoh_session.put(key, b"")
-    wait_for(lambda: source_status(bus).not_carried == ("WheelEncoders",), what="the unsupported message")
+    wait_for(
+        lambda: source_status(bus).not_carried == ("WheelEncoders",), what="the unsupported message"
+    )
     assert source_status(bus).rejected == 0
     run_until_shown("not carried: WheelEncoders", "info", "--connect", endpoint)
     token.undeclare()
@@ -282,16 +324,24 @@ def test_user_definition_adds_a_message(
         zenoh_session.put(key, encode_with(definition, fields, definition.current) + bytes(8))
 
     with bus.subscribe("wheel_encoders") as wheels, repeating(lambda: put(1.5)):
-        assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
+        assert wheels.receive(DEADLINE).message.__dict__ == {
+            "timestamp": 1,
+            "wheel_speed": (1.5, 2.0),
+        }
     put(501.0)
     wait_for(lambda: source_status(bus).rejected == 1, what="the message out of range")
 
 
-def test_user_definition_has_timestamp_at_any_place(listen: Listen, zenoh_session: Session, tmp_path: Path) -> None:
+def test_user_definition_has_timestamp_at_any_place(
+    listen: Listen, zenoh_session: Session, tmp_path: Path
+) -> None:
     """A message is decoded in the order of its definition, although nedbus's models begin with the timestamp."""
     text = "float32 speed\nuint64 timestamp\n"
     (tmp_path / "WheelEncoders.msg").write_text(text)
-    dds_name, type_hash = dds_type(ros2_type(define_msg("WheelEncoders", text))), hash_of_msg("WheelEncoders", text)
+    dds_name, type_hash = (
+        dds_type(ros2_type(define_msg("WheelEncoders", text))),
+        hash_of_msg("WheelEncoders", text),
+    )
     listener, key = listen(f"?msg={tmp_path}"), f"0/fmu/out/wheel_encoders/{dds_name}/{type_hash}"
     wait_for_matching(zenoh_session, key)
     zenoh_session.put(key, struct.pack("<4sf4xQ", b"\0\1\0\0", 2.5, 7))
@@ -317,7 +367,9 @@ def test_hash_with_literal_char_is_accepted(
     topic = "letter" if name == "Letter" else "log_message"
     key = f"0/fmu/out/{topic}/{dds_type(ros2_type(definition))}/{literal}"
     wait_for_matching(zenoh_session, key)
-    fields = {field: kind.absent for field, kind in definition.current.types.items()} | {"timestamp": 7}
+    fields = {field: kind.absent for field, kind in definition.current.types.items()} | {
+        "timestamp": 7
+    }
     for _ in range(2):
         zenoh_session.put(key, encode_with(definition, fields, definition.current))
     assert [each.fields["timestamp"] for each in listener.receive(2)] == [7, 7]
@@ -333,7 +385,11 @@ def test_user_definition_decodes_newer_layout(
     newer = define_msg("VehicleLocalPosition", text)
     px4 = Px4(zenoh_session)
     px4.type_hash = hash_of(newer.current, ROS2_TYPE)
-    without, supplied, other = listen(), listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"), listen(f"?msg={tmp_path}")
+    without, supplied, other = (
+        listen(),
+        listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"),
+        listen(f"?msg={tmp_path}"),
+    )
     fields = {**downgrade(message(1, x=0.5), "1.16"), "altitude_good_for_lock": True}
     for _ in range(2):
         px4.raw(encode_with(newer, fields, newer.current))
@@ -354,8 +410,12 @@ def test_only_selected_topics_are_received(listen: Listen, zenoh_session: Sessio
     listener = listen("?topics=vehicle_local_position,wheel_encoders")
     px4 = Px4(zenoh_session)
     px4.put(1, topic="estimator_local_position")
-    zenoh_session.put(f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b"")
-    zenoh_session.put(f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b"")
+    zenoh_session.put(
+        f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b""
+    )
+    zenoh_session.put(
+        f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b""
+    )
     px4.put(2)
     assert [str(each.address) for each in listener.receive()] == [f"1/{VLP}"]
     assert [each.count for each in listener.rejections] == [1]
@@ -415,11 +475,21 @@ def test_invalid_input_is_rejected_and_counted(listener: Listener, zenoh_session
     for payload in (b"\x00\x01\x00\x00" + bytes(100), b"", bytes(100_000)):
         short.raw(payload)
     wrong = Px4(zenoh_session, domain=3)
-    for attachment in (b"x", bytes(33), bytes(34), bytes(Attachment(2**62, 0, GID))[:-1], 16 * b"\xff" + b"\x10" + GID):
+    for attachment in (
+        b"x",
+        bytes(33),
+        bytes(34),
+        bytes(Attachment(2**62, 0, GID))[:-1],
+        16 * b"\xff" + b"\x10" + GID,
+    ):
         wrong.put(1, attachment=attachment)
     noise, rng = Px4(zenoh_session, domain=4), random.Random(0)
     for each in range(2000):
-        noise.raw(rng.randbytes(220) if each % 2 else b"\x00\x01\x00\x00" + rng.randbytes(rng.randrange(240)))
+        noise.raw(
+            rng.randbytes(220)
+            if each % 2
+            else b"\x00\x01\x00\x00" + rng.randbytes(rng.randrange(240))
+        )
     other = Px4(zenoh_session, domain=5)
     other.raw(payload_of(1), topic="somebody/pose")
     for start in (f"0/{'x' * 200}", "ä"):
@@ -437,7 +507,9 @@ def test_invalid_values_are_reported(
 ) -> None:
     """A payload that is valid CDR but violates a rule is reported with its reason, as from any source."""
     serve()
-    reports = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
+    reports = zenoh_session.declare_subscriber(
+        "nedbus/@rejected/**", zenoh.handlers.FifoChannel(10)
+    )
     px4 = Px4(zenoh_session)
     px4.raw(payload_of(1, xy_valid=True))
     px4.raw(payload_of(1, eph=-1.0) + b"too long")
@@ -447,13 +519,17 @@ def test_invalid_values_are_reported(
     assert every.receive(DEADLINE).message.timestamp == 2
 
 
-def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, zenoh_session: Session) -> None:
+def test_two_publishers_of_one_key_are_not_mixed(
+    listener: Listener, zenoh_session: Session
+) -> None:
     """Two ROS 2 nodes on one topic have different gids: only the first one is received."""
     px4 = Px4(zenoh_session)
     for sequence in range(10):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
         px4.put(100 + sequence, attachment=bytes(Attachment(sequence, 0, GID[::-1])))
-    listener.step_until(lambda: len(listener.messages) + listener.rejected == 20, what="all messages")
+    listener.step_until(
+        lambda: len(listener.messages) + listener.rejected == 20, what="all messages"
+    )
     assert times(listener.receive(10)) == list(range(10))
 
 
@@ -473,7 +549,12 @@ def test_oversized_samples_are_not_queued(listener: Listener, zenoh_session: Ses
     """Keys that are too long for ROS 2, and large payloads, are not queued, but counted as rejected."""
     name = dds_type(ROS2_TYPE)
     wait_for_matching(zenoh_session, f"0/a/{name}/hash")
-    for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):
+    for topic, payload in (
+        ("a", bytes(300)),
+        ("b", bytes(5000)),
+        ("x" * 2000, bytes(300)),
+        ("last", bytes(300)),
+    ):
         zenoh_session.put(f"0/{topic}/{name}/hash", payload)
     listener.step_until(lambda: listener.rejected == 4, what="all rejections")
     listener.step()
@@ -512,9 +593,15 @@ def test_ended_source_undeclares_its_subscriber(zenoh_session: Session, endpoint
 def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
     """If the service is the router, its source uses the router's session, with or without an explicit endpoint."""
     own = free_endpoint()
-    service = run_nedbus("serve", "--listen", own, "-s", "px4-zenoh:", "-s", f"px4-zenoh:{own}?domain=3")
+    service = run_nedbus(
+        "serve", "--listen", own, "-s", "px4-zenoh:", "-s", f"px4-zenoh:{own}?domain=3"
+    )
     wait_for(lambda: service.err.count("listening") == 2, what="both sources")
-    with nedbus.connect(own, timeout=DEADLINE) as bus, bus.subscribe() as every, plain_session(own) as vehicle:
+    with (
+        nedbus.connect(own, timeout=DEADLINE) as bus,
+        bus.subscribe() as every,
+        plain_session(own) as vehicle,
+    ):
         Px4(vehicle).put(1)
         assert every.receive(DEADLINE).message.timestamp == 1
         [reply] = vehicle.get("@/*/router")
@@ -530,7 +617,11 @@ def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: P
     file.write_text(f'{{mode: "router", {listen}, scouting: {{multicast: {{enabled: false}}}}}}')
     for arguments in (["--router-config", str(file)], ["--listen", own, "--connect", down]):
         service = run_nedbus("serve", *arguments, "-s", "px4-zenoh:")
-        with nedbus.connect(own, timeout=DEADLINE) as bus, bus.subscribe() as every, plain_session(own) as vehicle:
+        with (
+            nedbus.connect(own, timeout=DEADLINE) as bus,
+            bus.subscribe() as every,
+            plain_session(own) as vehicle,
+        ):
             Px4(vehicle).put(1)
             assert every.receive(DEADLINE).message.timestamp == 1
         service.kill()
@@ -540,7 +631,10 @@ def test_unreachable_router_is_retried(run_nedbus: Start) -> None:
     """A router that does not answer is logged and retried, while other sources continue."""
     endpoint, other = free_endpoint(), free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", f"px4-zenoh:{other}", "-s", "sim:")
-    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(vehicle="7") as subscription:
+    with (
+        nedbus.connect(endpoint, timeout=DEADLINE) as bus,
+        bus.subscribe(vehicle="7") as subscription,
+    ):
         wait_for(lambda: "no Zenoh router answers;" in service.err, what="the first attempt")
         run_nedbus("router", "--listen", other)
         with plain_session(other) as vehicle:
@@ -550,7 +644,10 @@ def test_unreachable_router_is_retried(run_nedbus: Start) -> None:
 
 @pytest.mark.slow  # waits 3 s; nedbus/daemon/test_worker.py uses a fake clock
 def test_stale_vehicle_is_not_listed(
-    serve: Callable[[], Process], zenoh_session: Session, bus: nedbus.Bus, every: nedbus.Subscription
+    serve: Callable[[], Process],
+    zenoh_session: Session,
+    bus: nedbus.Bus,
+    every: nedbus.Subscription,
 ) -> None:
     """A vehicle that sends nothing for 3 s is stale in the status and not listed; others are not affected."""
     service = serve()
@@ -576,7 +673,12 @@ def test_restarted_ros_2_publisher_is_received_at_once(listener: Listener, peer:
     messages = flight()
     received: list[SourceMessage] = []
     for _ in range(2):
-        node = peer("talk", "1.16", topic=f"/fmu/out/{VLP}", rows=[downgrade(each, "1.16") for each in messages])
+        node = peer(
+            "talk",
+            "1.16",
+            topic=f"/fmu/out/{VLP}",
+            rows=[downgrade(each, "1.16") for each in messages],
+        )
         received += listener.receive(len(messages))
         node.kill()
     assert [upgrade(each.fields) for each in received] == 2 * messages
@@ -584,12 +686,16 @@ def test_restarted_ros_2_publisher_is_received_at_once(listener: Listener, peer:
     assert (sum(each.lost for each in received), listener.rejections) == (0, [])
 
 
-def test_ros_2_lists_source_as_subscriber(listener: Listener, peer: Peer, zenoh_session: Session) -> None:
+def test_ros_2_lists_source_as_subscriber(
+    listener: Listener, peer: Peer, zenoh_session: Session
+) -> None:
     """The tokens that `ros2 topic info -v` reads name the source as a subscriber while there is a publisher."""
 
     def subscriptions() -> list[dict[str, object]]:
         tokens = zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/MS/**")
-        return [_parse_liveliness_keyexpr(str(reply.ok.key_expr)) or {} for reply in tokens if reply.ok]
+        return [
+            _parse_liveliness_keyexpr(str(reply.ok.key_expr)) or {} for reply in tokens if reply.ok
+        ]
 
     node = peer("talk", "1.14", topic=f"/drone/{VLP}", rows=[], domain_id=4)
     listener.step_until(subscriptions, what="the subscription")
@@ -597,7 +703,11 @@ def test_ros_2_lists_source_as_subscriber(listener: Listener, peer: Peer, zenoh_
     assert str(found["node_name"]).startswith("nedbus_px4_zenoh_")
     topic = (found["qualified_name"], found["dds_type"], found["type_hash"])
     assert topic == (f"/drone/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
-    nodes = [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
+    nodes = [
+        str(reply.ok.key_expr)
+        for reply in zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/NN/**")
+        if reply.ok
+    ]
     assert any(name.endswith(f"/{found['node_name']}") for name in nodes)
     node.kill()
     listener.step_until(lambda: not subscriptions(), what="the subscription to be withdrawn")

@@ -15,7 +15,18 @@ GID = bytes(range(16))
 
 
 @pytest.mark.parametrize(
-    "key", ["", "0", "0/a/b", "x/fmu/out/a/b/c", "0//a/b/c", "0/*/a/b", f"{10**12}/a/b/c", "-1/a/b/c", "0/a/b/"]
+    "key",
+    [
+        "",
+        "0",
+        "0/a/b",
+        "x/fmu/out/a/b/c",
+        "0//a/b/c",
+        "0/*/a/b",
+        f"{10**12}/a/b/c",
+        "-1/a/b/c",
+        "0/a/b/",
+    ],
 )
 def test_invalid_key_raises(key: str) -> None:
     """A key that rmw_zenoh would not use raises DecodeError."""
@@ -32,7 +43,9 @@ def test_key_and_attachment_round_trip() -> None:
         assert Attachment.parse(bytes(attachment)) == attachment
 
 
-def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16", direction: str = "out") -> str:
+def key(
+    *, domain: int = 0, namespace: str = "", layout: str = "1.16", direction: str = "out"
+) -> str:
     """Return PX4's key of vehicle_local_position."""
     topic = f"{namespace and namespace + '/'}fmu/{direction}/{VLP}"
     return str(TopicKey(domain, topic, dds_type(ROS2_TYPE), type_hash(layout)))
@@ -80,12 +93,19 @@ def test_key_is_released_after_3_s(streams: StreamRegistry) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sequence", "lost", "rebooted"), [(11, 0, False), (15, 4, False), (10 + 1_000_001, 0, False), (1, 0, True)]
+    ("sequence", "lost", "rebooted"),
+    [(11, 0, False), (15, 4, False), (10 + 1_000_001, 0, False), (1, 0, True)],
 )
-def test_sequence_gap_counts_as_lost(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
+def test_sequence_gap_counts_as_lost(
+    streams: StreamRegistry, sequence: int, lost: int, rebooted: bool
+) -> None:
     """A gap counts as that many lost messages, unless it is implausibly large; a step back is a reboot."""
     stream = streams.on_message(key(), 100.0)
-    for each, expected in ((10, (0, False)), (sequence, (lost, rebooted)), (sequence + 1, (0, False))):
+    for each, expected in (
+        (10, (0, False)),
+        (sequence, (lost, rebooted)),
+        (sequence + 1, (0, False)),
+    ):
         assert streams.accept(stream, Attachment(each, 0, GID), 100.0) == expected
 
 
@@ -102,7 +122,9 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
 
 
 @pytest.mark.parametrize("namespace", ["", "px4_1"])
-def test_input_topic_has_the_vehicle_of_its_namespace(streams: StreamRegistry, namespace: str) -> None:
+def test_input_topic_has_the_vehicle_of_its_namespace(
+    streams: StreamRegistry, namespace: str
+) -> None:
     """/fmu/in/... belongs to the vehicle of /fmu/out/...; a restart of its publisher is not a reboot of the vehicle."""
     stream = streams.on_message(key(namespace=namespace, direction="in"), 100.0)
     assert (str(stream.address), stream.is_input) == (f"{namespace or 1}/{VLP}", True)

@@ -26,7 +26,9 @@ def streams() -> StreamRegistry:
     return streams
 
 
-def report_after_message(streams: StreamRegistry, topic: str, now: float, *, session: str = "a") -> UnavailableTopics:
+def report_after_message(
+    streams: StreamRegistry, topic: str, now: float, *, session: str = "a"
+) -> UnavailableTopics:
     """Return the unavailable topics after a message has arrived."""
     assert streams.on_message(str(token(topic, session=session).key), now).unsupported is None
     return streams.report(now)
@@ -35,9 +37,13 @@ def report_after_message(streams: StreamRegistry, topic: str, now: float, *, ses
 def test_topic_is_silent_after_5_s_while_others_arrive(streams: StreamRegistry) -> None:
     """A topic is silent after 5 s without a message, until one arrives or its token is withdrawn."""
     assert report_after_message(streams, "vehicle_attitude", 104.9) == UnavailableTopics()
-    assert report_after_message(streams, "vehicle_attitude", 105.0) == UnavailableTopics((), ("1/vehicle_odometry",))
+    assert report_after_message(streams, "vehicle_attitude", 105.0) == UnavailableTopics(
+        (), ("1/vehicle_odometry",)
+    )
     assert report_after_message(streams, "vehicle_odometry", 105.1) == UnavailableTopics()
-    assert report_after_message(streams, "vehicle_attitude", 110.2) == UnavailableTopics((), ("1/vehicle_odometry",))
+    assert report_after_message(streams, "vehicle_attitude", 110.2) == UnavailableTopics(
+        (), ("1/vehicle_odometry",)
+    )
     streams.remove_publisher(token("vehicle_odometry"), 110.2)
     assert streams.report(110.2) == UnavailableTopics()
 
@@ -46,14 +52,18 @@ def test_vehicle_without_any_message_has_no_silent_topics(streams: StreamRegistr
     """A vehicle whose link is down has no silent topics; messages of other vehicles are irrelevant."""
     streams.add_publisher(token("vehicle_status", session="b"), 100.0)
     assert streams.report(200.0) == UnavailableTopics()
-    assert report_after_message(streams, "vehicle_status", 200.0, session="b") == UnavailableTopics()
+    assert (
+        report_after_message(streams, "vehicle_status", 200.0, session="b") == UnavailableTopics()
+    )
 
 
 def test_topic_without_nominal_rate_is_never_reported_as_silent(streams: StreamRegistry) -> None:
     """A topic without a nominal rate, such as home_position, is never reported as silent."""
     streams.add_publisher(token("home_position"), 100.0)
     assert streams.report(200.0) == UnavailableTopics()
-    assert report_after_message(streams, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
+    assert report_after_message(streams, "vehicle_attitude", 200.0).silent == (
+        "1/vehicle_odometry",
+    )
 
 
 def test_unsupported_messages_are_listed(streams: StreamRegistry) -> None:
@@ -71,6 +81,8 @@ def test_unsupported_messages_are_listed(streams: StreamRegistry) -> None:
 
 def test_unselected_topics_are_not_listed() -> None:
     """With `topics=` all other topics are ignored silently."""
-    streams = StreamRegistry(Px4ZenohOptions.model_validate({"topics": "vehicle_attitude"}), vehicle="1")
+    streams = StreamRegistry(
+        Px4ZenohOptions.model_validate({"topics": "vehicle_attitude"}), vehicle="1"
+    )
     streams.add_publisher(token("rpm", "Rpm"), 100.0)
     assert streams.report(100.0) == UnavailableTopics()

@@ -75,15 +75,25 @@ class Px4Vision:
         interval, self._last = sample - self._last, sample
         if interval > STOP:
             self._is_fusing = False
-        has_reset, self._counter = self._counter not in (None, message.reset_counter), message.reset_counter
+        has_reset, self._counter = (
+            self._counter not in (None, message.reset_counter),
+            message.reset_counter,
+        )
         is_good = message.quality >= self.min_quality
         self._is_fusing = is_good and (self._is_fusing or interval < START_INTERVAL)
         can_fuse = self._is_fusing and not has_reset
         self._aid("pos", now, bit=1, can_fuse=can_fuse, is_valid=bool(frame))
         self._aid("hgt", now, bit=2, can_fuse=can_fuse, is_valid=bool(frame))
-        if self._is_fusing and frame and echo["velocity_frame"] and all(map(math.isfinite, velocity)):
+        if (
+            self._is_fusing
+            and frame
+            and echo["velocity_frame"]
+            and all(map(math.isfinite, velocity))
+        ):
             self._aid("vel", now, bit=4, can_fuse=True, is_valid=True, only_fused=True)
-        self._aid("yaw", now, bit=8, can_fuse=can_fuse, is_valid=abs(math.hypot(*message.q) - 1) <= 1e-5)
+        self._aid(
+            "yaw", now, bit=8, can_fuse=can_fuse, is_valid=abs(math.hypot(*message.q) - 1) <= 1e-5
+        )
 
     def _buffers(self, sample: float, now: float) -> bool:
         """Return whether EKF2's buffer takes a sample: newer than the newest, which a time ahead remains for good."""
@@ -93,7 +103,14 @@ class Px4Vision:
         return now - MAX_AGE <= sample <= now + MIN_INTERVAL
 
     def _aid(
-        self, name: str, now: float, *, bit: int, can_fuse: bool, is_valid: bool, only_fused: bool = False
+        self,
+        name: str,
+        now: float,
+        *,
+        bit: int,
+        can_fuse: bool,
+        is_valid: bool,
+        only_fused: bool = False,
     ) -> None:
         is_chosen = bool(self.control & bit)
         if only_fused and not is_chosen:
@@ -111,7 +128,9 @@ class Px4Vision:
 class Px4OnLink:
     """Such a PX4 at a UDP port of a source: it sends heartbeats and TIMESYNC, and receives on a thread."""
 
-    def __init__(self, port: int, *, system: int = 1, timesync_rate: float = 10.0, **options: int) -> None:
+    def __init__(
+        self, port: int, *, system: int = 1, timesync_rate: float = 10.0, **options: int
+    ) -> None:
         self.vision, self.tracker = Px4Vision(**options), FusionTracker()
         self.messages: list[tuple[float, Any]] = []  # ODOMETRY with its time of arrival
         self.timesyncs = 0  # answers
@@ -150,8 +169,14 @@ class Px4OnLink:
             if now >= next_heartbeat:
                 next_heartbeat = now + 0.2
                 kind, autopilot = dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4
-                self._send(dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3))
-                self._send(dialect.MAVLink_local_position_ned_message(round(1e3 * now) % 2**32, *[0.0] * 6))
+                self._send(
+                    dialect.MAVLink_heartbeat_message(
+                        kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3
+                    )
+                )
+                self._send(
+                    dialect.MAVLink_local_position_ned_message(round(1e3 * now) % 2**32, *[0.0] * 6)
+                )
             if now >= next_timesync:
                 next_timesync = now + self._interval
                 self._send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()))

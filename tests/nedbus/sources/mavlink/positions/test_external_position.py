@@ -69,7 +69,9 @@ def test_odometry_is_sent_as_published() -> None:
     assert [message.pose_covariance[each] for each in (0, 6, 11, 15, 18, 20)] == pytest.approx(
         [0.01, 0.02, 0.03, 0.04, 0.05, 0.06]
     )
-    assert [message.velocity_covariance[each] for each in (0, 6, 11)] == pytest.approx([0.07, 0.08, 0.09])
+    assert [message.velocity_covariance[each] for each in (0, 6, 11)] == pytest.approx(
+        [0.07, 0.08, 0.09]
+    )
     assert sum(map(math.isnan, message.pose_covariance)) == 15
     assert (message.reset_counter, message.quality) == (7, 90)
     assert (message.get_srcSystem(), message.get_srcComponent(), message.get_seq()) == (4, 197, 200)
@@ -83,7 +85,9 @@ def test_odometry_is_sent_as_published() -> None:
     }),
     st.integers(1, 250), st.integers(0, 255), st.integers(0, 2**60),
 )  # fmt: skip
-def test_frame_is_that_of_pymavlink(fields: dict[str, Any], system: int, sequence: int, time_usec: int) -> None:
+def test_frame_is_that_of_pymavlink(
+    fields: dict[str, Any], system: int, sequence: int, time_usec: int
+) -> None:
     """The frame is byte for byte the one that pymavlink packs from the same fields, also with zeros at its end."""
     packed = odometry_of(odometry(**fields))
     frame = packed.frame(time_usec, system=system, sequence=sequence)
@@ -102,7 +106,9 @@ def test_row_is_converted_like_its_model(model: Any) -> None:
     assert repr(odometry_of(row)) == repr(odometry_of(model))
 
 
-@pytest.mark.parametrize(("pose", "velocity", "frames"), [(2, 2, (20, 20)), (1, 3, (1, 12)), (2, 3, (20, 12))])
+@pytest.mark.parametrize(
+    ("pose", "velocity", "frames"), [(2, 2, (20, 20)), (1, 3, (1, 12)), (2, 3, (20, 12))]
+)
 def test_frames_are_those_that_px4_knows(pose: int, velocity: int, frames: tuple[int, int]) -> None:
     """FRD is MAV_FRAME_LOCAL_FRD (20), body FRD is MAV_FRAME_BODY_FRD (12)."""
     message = sent(send(odometry(pose_frame=pose, velocity_frame=velocity)))
@@ -124,7 +130,9 @@ def test_frames_are_those_that_px4_knows(pose: int, velocity: int, frames: tuple
         ({"orientation_variance": [0.1, 0.1, math.inf]}, "variance", "orientation_variance is inf"),
     ],
 )  # fmt: skip
-def test_position_that_px4_would_ignore_is_refused(changes: dict[str, Any], kind: str, words: str) -> None:
+def test_position_that_px4_would_ignore_is_refused(
+    changes: dict[str, Any], kind: str, words: str
+) -> None:
     """A refusal names the field, its value and the remedy."""
     found, text = refusal(odometry(**changes))
     assert found == kind
@@ -132,7 +140,8 @@ def test_position_that_px4_would_ignore_is_refused(changes: dict[str, Any], kind
 
 
 @given(
-    st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: math.hypot(*q) > 0.1), st.floats(0.991, 1.009)
+    st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: math.hypot(*q) > 0.1),
+    st.floats(0.991, 1.009),
 )
 def test_quaternion_is_normalised_within_a_hundredth(q: list[float], scale: float) -> None:
     """A quaternion of few decimals is sent with the norm that EKF2 requires: 1 within 1e-5."""
@@ -168,13 +177,21 @@ def test_local_position_is_sent_with_a_yaw_only_attitude() -> None:
     assert (message.frame_id, message.child_frame_id) == (1, 1)
     assert message.q == pytest.approx([math.cos(0.5), 0, 0, math.sin(0.5)])
     assert [message.pose_covariance[each] for each in (0, 6, 11)] == pytest.approx([2, 2, 9])
-    assert [message.pose_covariance[each] for each in (15, 18, 20)] == pytest.approx([1e6, 1e6, 0.25])
-    assert [message.velocity_covariance[each] for each in (0, 6, 11)] == pytest.approx([0.08, 0.08, 0.25])
+    assert [message.pose_covariance[each] for each in (15, 18, 20)] == pytest.approx(
+        [1e6, 1e6, 0.25]
+    )
+    assert [message.velocity_covariance[each] for each in (0, 6, 11)] == pytest.approx(
+        [0.08, 0.08, 0.25]
+    )
 
 
 def test_invalid_parts_of_a_local_position_get_a_large_variance() -> None:
     """What is not valid is no NaN: x and y keep their values with the variance of an unknown quantity."""
-    message = sent(send(local_position(xy_valid=False, v_z_valid=False, vz=NAN, heading_good_for_control=False)))
+    message = sent(
+        send(
+            local_position(xy_valid=False, v_z_valid=False, vz=NAN, heading_good_for_control=False)
+        )
+    )
     assert (message.x, message.y) == (1, 2)
     assert [message.pose_covariance[each] for each in (0, 6, 11)] == pytest.approx([1e6, 1e6, 9])
     assert message.vz == 0
@@ -225,7 +242,9 @@ def test_slow_publisher_is_warned() -> None:
 def test_old_position_is_left_out() -> None:
     """A position that waited more than 100 ms on its way is not sent; the next one is."""
     core = ExternalPosition()
-    outcomes = play(core, [(0.0, 100.0), (0.02, 100.02), (0.04, 100.16), (0.06, 100.165), (0.16, 100.17)])
+    outcomes = play(
+        core, [(0.0, 100.0), (0.02, 100.02), (0.04, 100.16), (0.06, 100.165), (0.16, 100.17)]
+    )
     assert [each.odometry is not None for each in outcomes] == [True, True, False, False, True]
     assert core.left_out == {"age": 2}
     assert "it is 120 ms old, more than 100" in (outcomes[2].refusal or ("", ""))[1]
@@ -278,7 +297,11 @@ def test_wild_time_of_one_message_does_not_stop_the_others() -> None:
 
 
 @given(
-    st.lists(st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), st.floats(0, 10)), min_size=1, max_size=50)
+    st.lists(
+        st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), st.floats(0, 10)),
+        min_size=1,
+        max_size=50,
+    )
 )
 def test_nothing_is_stamped_ahead(messages: list[tuple[int, int, float]]) -> None:
     """Whatever the times of a publisher are, time_usec is never later than the transmission, nor older than 100 ms."""
@@ -355,7 +378,10 @@ def test_second_sender_is_refused_with_the_name_of_the_first() -> None:
     core.add(odometry(0.0), "mocap (session 1)", 100.0)
     outcome = core.add(odometry(0.01), "vio (session 2)", 100.01)
     assert outcome.refusal is not None
-    assert "vio (session 2) publishes, too, but mocap (session 1) is the sender" in outcome.refusal.text
+    assert (
+        "vio (session 2) publishes, too, but mocap (session 1) is the sender"
+        in outcome.refusal.text
+    )
     assert core.add(odometry(7.0), "vio (session 2)", 101.5).odometry is not None
     assert core.sender == "vio (session 2)"
 
@@ -363,7 +389,12 @@ def test_second_sender_is_refused_with_the_name_of_the_first() -> None:
 def test_each_position_is_sent_or_counted() -> None:
     """The numbers of positions sent and left out add up."""
     core = ExternalPosition()
-    kinds: list[dict[str, Any]] = [{}, {"pose_frame": 0}, {"q": [0.95, 0.0, 0.0, 0.0]}, {"position": [NAN, 0.0, 0.0]}]
+    kinds: list[dict[str, Any]] = [
+        {},
+        {"pose_frame": 0},
+        {"q": [0.95, 0.0, 0.0, 0.0]},
+        {"position": [NAN, 0.0, 0.0]},
+    ]
     for index in range(100):
         core.add(odometry(index / 50, **kinds[index % 4]), "a", 100 + index / 50)
     assert core.sent + core.left_out.total() == 100

@@ -39,7 +39,9 @@ def put_positions(session: Session, quality: int, count: int = 1) -> None:
 
 
 @pytest.mark.parametrize("is_router", [True, False], ids=["own router", "client of a router"])
-def test_only_the_named_sender_may_send_a_position(start: Start, pki: Path, tmp_path: Path, is_router: bool) -> None:
+def test_only_the_named_sender_may_send_a_position(
+    start: Start, pki: Path, tmp_path: Path, is_router: bool
+) -> None:
     """The certificate of the sender reaches the vehicle; the router drops the position of another vehicle's."""
     endpoint, port = secure_endpoint(), free_port()
     readers = {'cert_common_names: ["reader"]': 'cert_common_names: ["reader", "vehicle-1"]'}
@@ -55,10 +57,14 @@ def test_only_the_named_sender_may_send_a_position(start: Start, pki: Path, tmp_
             start("-m", "nedbus", "serve", "--source", source, *options)
 
         def join(name: str) -> Session:
-            return opened.enter_context(open_client([endpoint], tls=client_tls(pki, name), timeout=DEADLINE))
+            return opened.enter_context(
+                open_client([endpoint], tls=client_tls(pki, name), timeout=DEADLINE)
+            )
 
         sender, other, reader = join("vehicle-mocap"), join("vehicle-1"), join("reader")
-        bus = opened.enter_context(nedbus.connect(endpoint, tls=client_tls(pki, "reader"), timeout=DEADLINE))
+        bus = opened.enter_context(
+            nedbus.connect(endpoint, tls=client_tls(pki, "reader"), timeout=DEADLINE)
+        )
         ring: zenoh.handlers.RingChannel[RawSample] = zenoh.handlers.RingChannel(1)
         markers = reader.declare_subscriber(MARKER, ring)
         px4 = opened.enter_context(Px4OnLink(port))
@@ -70,7 +76,9 @@ def test_only_the_named_sender_may_send_a_position(start: Start, pki: Path, tmp_
         wait_for(markers.handler.try_recv, what="the message after the positions")
         put_positions(sender, quality=77)
         wait_for(lambda: px4.count() > 0, what="the position of the sender")
-        wait_for(lambda: any(status.sent for status in source_status(bus).positions), what="the status")
+        wait_for(
+            lambda: any(status.sent for status in source_status(bus).positions), what="the status"
+        )
         [status] = source_status(bus).positions
         assert {message.quality for _, message in px4.messages} == {77}
         assert (status.sent, status.left_out) == (1, ())

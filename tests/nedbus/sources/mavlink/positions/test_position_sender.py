@@ -17,7 +17,13 @@ from nedbus import VehicleOdometry
 from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink import position_sender
-from nedbus.sources.mavlink.position_sender import BusAccess, PositionSender, SenderName, Target, choose_target
+from nedbus.sources.mavlink.position_sender import (
+    BusAccess,
+    PositionSender,
+    SenderName,
+    Target,
+    choose_target,
+)
 from nedbus.sources.options import MavlinkOptions
 from nedbus.transport import KeyReader, open_client, open_router
 from nedbus_msgs import Address, provenance_of
@@ -42,7 +48,9 @@ class Script:
         self, bus: nedbus.Bus, *, rate: float = 50.0, source: str = "mocap", vehicle: str = "mocap",
         change: Callable[[int], dict[str, Any]] = lambda _: {},
     ) -> None:  # fmt: skip
-        self._publisher = bus.publisher(VehicleOdometry, topic=TOPIC, vehicle=vehicle, source=source)
+        self._publisher = bus.publisher(
+            VehicleOdometry, topic=TOPIC, vehicle=vehicle, source=source
+        )
         self._interval, self._change, self._stop = 1 / rate, change, threading.Event()
         self.sent: dict[int, float] = {}  # time of publication [s], by quality, which numbers them
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -73,17 +81,23 @@ class Setup:
     def __init__(self, start: Start, **options: object) -> None:
         self.port, self.endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
         query = "&".join(f"{name}={value}" for name, value in options.items())
-        self.source = f"mavlink:udpin:127.0.0.1:{self.port}?position=mocap/{TOPIC}&{query}".rstrip("&")
+        self.source = f"mavlink:udpin:127.0.0.1:{self.port}?position=mocap/{TOPIC}&{query}".rstrip(
+            "&"
+        )
         self._start = start
         self.service = self.serve()
 
     def serve(self) -> Process:
-        return self._start("-m", "nedbus", "serve", "--source", self.source, "--listen", self.endpoint)
+        return self._start(
+            "-m", "nedbus", "serve", "--source", self.source, "--listen", self.endpoint
+        )
 
 
 def left_out(bus: nedbus.Bus) -> dict[str, int]:
     """Return the numbers of positions that the service left out, by kind; {} before its first status."""
-    return {kind: count for status in source_status(bus).positions for kind, count in status.left_out}
+    return {
+        kind: count for status in source_status(bus).positions for kind, count in status.left_out
+    }
 
 
 @pytest.fixture
@@ -102,7 +116,10 @@ def test_position_of_a_script_is_fused(setup: Setup, bus: nedbus.Bus) -> None:
     with Px4OnLink(setup.port) as px4, Script(bus) as script:
         wait_for(lambda: px4.state() == ALL, what="fusion")
         wait_for(lambda: px4.count() >= 100, what="100 positions")
-        wait_for(lambda: any(status.sent >= 100 for status in source_status(bus).positions), what="status")
+        wait_for(
+            lambda: any(status.sent >= 100 for status in source_status(bus).positions),
+            what="status",
+        )
     [status] = source_status(bus).positions
     assert (status.vehicle, status.address, status.clock) == ("1", f"mocap/{TOPIC}", "arrival")
     assert status.sender.startswith("mocap (session ")
@@ -128,7 +145,11 @@ def test_without_the_option_nothing_is_sent(start: Start) -> None:
     setup._start, setup.port, setup.endpoint = start, free_port(), f"tcp/127.0.0.1:{free_port()}"
     setup.source = f"mavlink:udpin:127.0.0.1:{setup.port}"
     service = setup.serve()
-    with nedbus.connect(setup.endpoint, timeout=20) as bus, Px4OnLink(setup.port) as px4, Script(bus) as script:
+    with (
+        nedbus.connect(setup.endpoint, timeout=20) as bus,
+        Px4OnLink(setup.port) as px4,
+        Script(bus) as script,
+    ):
         wait_for(lambda: source_status(bus).published > 2, what="the vehicle")
         wait_for(lambda: len(script.sent) > 50, what="published positions")
         assert px4.count() == 0
@@ -161,13 +182,18 @@ def test_another_client_that_answers_timesync_is_named(start: Start) -> None:
     """timesync_status in the log stream of a real PX4, whose TIMESYNC a second client answered, causes a warning."""
     setup = Setup(start, log=1)
     recording = read_recording(REFUSED)
-    with nedbus.connect(setup.endpoint, timeout=20) as bus, Px4LogStream(recording, setup.port, speed=10.0):
+    with (
+        nedbus.connect(setup.endpoint, timeout=20) as bus,
+        Px4LogStream(recording, setup.port, speed=10.0),
+    ):
 
         def warnings() -> list[str]:
             return [text for status in source_status(bus).positions for text in status.warnings]
 
         wait_for(warnings, what="the warning")
-        assert warnings()[0].startswith("another client answers TIMESYNC: if it does so on this link, PX4 stamps")
+        assert warnings()[0].startswith(
+            "another client answers TIMESYNC: if it does so on this link, PX4 stamps"
+        )
 
 
 @pytest.mark.parametrize(("protocol", "is_warned"), [(0, True), (1, True), (2, False)])
@@ -191,14 +217,20 @@ def test_wrong_positions_are_counted_and_not_sent(setup: Setup, bus: nedbus.Bus)
         wait_for(lambda: px4.count() >= 20, what="positions")
         wait_for(lambda: "pose_frame" in left_out(bus), what="refusals")
         assert all(message.frame_id == 1 for _, message in px4.messages)
-        [reason] = [each for each in source_status(bus).positions[0].reasons if "pose_frame" in each]
+        [reason] = [
+            each for each in source_status(bus).positions[0].reasons if "pose_frame" in each
+        ]
         assert reason.startswith("pose_frame is 0: set it to POSE_FRAME_NED")
 
 
 def test_undecodable_position_is_counted_and_not_sent(setup: Setup, bus: nedbus.Bus) -> None:
     """A payload that is no position is left out as invalid, with the reason, and the positions around it are sent."""
     key = Address("mocap", TOPIC).key()
-    with open_client([setup.endpoint], timeout=DEADLINE) as session, Px4OnLink(setup.port) as px4, Script(bus):
+    with (
+        open_client([setup.endpoint], timeout=DEADLINE) as session,
+        Px4OnLink(setup.port) as px4,
+        Script(bus),
+    ):
         wait_for(lambda: px4.count() >= 10, what="positions")
 
         def is_counted() -> bool:
@@ -223,7 +255,9 @@ def test_second_script_is_refused(setup: Setup, bus: nedbus.Bus) -> None:
         wait_for(lambda: px4.count() >= 10, what="the first script")
         with Script(other, source="second", change=lambda _: {"quality": 2}):
             wait_for(lambda: left_out(bus).get("sender", 0) > 5, what="refusals")
-            [reason] = [each for each in source_status(bus).positions[0].reasons if "second" in each]
+            [reason] = [
+                each for each in source_status(bus).positions[0].reasons if "second" in each
+            ]
             assert "publishes, too, but first (session " in reason
         assert {message.quality for _, message in px4.messages} == {1}
 
@@ -234,7 +268,9 @@ def test_end_of_the_script_ends_sending(setup: Setup, bus: nedbus.Bus) -> None:
         with Script(bus) as script:
             wait_for(lambda: px4.count() >= 20, what="positions")
         last = max(script.sent.values())
-        wait_for(lambda: [each.rate for each in source_status(bus).positions] == [0], what="the end")
+        wait_for(
+            lambda: [each.rate for each in source_status(bus).positions] == [0], what="the end"
+        )
         assert px4.messages[-1][0] < last + 0.1
         with Script(bus, change=lambda _: {"reset_counter": 8}):
             count = px4.count()
@@ -264,7 +300,11 @@ def test_several_vehicles_on_a_link_get_none() -> None:
 def test_own_name_of_the_vehicle_is_refused(start: Start) -> None:
     """Under the vehicle's own name, its echo would be sent back."""
     setup = Setup(start, vehicles="1:mocap")
-    with nedbus.connect(setup.endpoint, timeout=20) as bus, Px4OnLink(setup.port) as px4, Script(bus):
+    with (
+        nedbus.connect(setup.endpoint, timeout=20) as bus,
+        Px4OnLink(setup.port) as px4,
+        Script(bus),
+    ):
         wait_for(lambda: "address" in left_out(bus), what="the refusal")
         assert px4.count() == 0
 
@@ -292,7 +332,10 @@ def test_publisher_is_described_only_when_it_changes(monkeypatch: pytest.MonkeyP
         key = Address("mocap", TOPIC).key()
         reader = KeyReader(session, key)
         misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
-        publishers = [zenoh.ext.declare_advanced_publisher(session, key, sample_miss_detection=misses) for _ in "ab"]
+        publishers = [
+            zenoh.ext.declare_advanced_publisher(session, key, sample_miss_detection=misses)
+            for _ in "ab"
+        ]
         for publisher in (publishers[0], publishers[0], publishers[0], publishers[1]):
             publisher.put(b"")
             names.append(sender.of(reader.receive()))

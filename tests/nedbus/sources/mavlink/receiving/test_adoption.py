@@ -39,12 +39,19 @@ class Link:
     def introduce(self, now: float, boot: float) -> None:
         """Receive a HEARTBEAT and a message with the vehicle's time [s since boot]."""
         armed = dialect.MAV_MODE_FLAG_SAFETY_ARMED
-        self.receive(dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, armed, 0, 4, 3), now)
+        self.receive(
+            dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, armed, 0, 4, 3), now
+        )
         self.receive(dialect.MAVLink_local_position_ned_message(round(1000 * boot), *range(6)), now)
 
-    def data(self, sequence: int, now: float, *, target: tuple[int, int] = OURS) -> Received | Rejection:
+    def data(
+        self, sequence: int, now: float, *, target: tuple[int, int] = OURS
+    ) -> Received | Rejection:
         """Receive LOGGING_DATA in which a record begins."""
-        return self.receive(dialect.MAVLink_logging_data_message(*target, sequence, 3, 0, [1, 2, 3, *[0] * 246]), now)
+        return self.receive(
+            dialect.MAVLink_logging_data_message(*target, sequence, 3, 0, [1, 2, 3, *[0] * 246]),
+            now,
+        )
 
     @property
     def state(self) -> str:
@@ -69,7 +76,9 @@ def test_running_stream_is_continued_with_its_gap(tmp_path: Path) -> None:
 def test_stream_is_continued_once_its_boot_is_known(tmp_path: Path) -> None:
     """Until a message with the vehicle's time has arrived, data of a running stream is neither used nor rejected."""
     link = Link(tmp_path)
-    link.receive(dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 128, 0, 4, 3), SAVED + 2)
+    link.receive(
+        dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 128, 0, 4, 3), SAVED + 2
+    )
     assert chunk_of(link.data(1500, SAVED + 2.1)) is None
     link.introduce(SAVED + 2.2, 62.2)
     assert chunk_of(link.data(1501, SAVED + 2.3)) == Chunk("delivered", DEFINITIONS, begins=True)

@@ -56,11 +56,17 @@ class Px4:
             before = now
             if now >= next_heartbeat:
                 next_heartbeat = now + 0.5
-                self._send(dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3))
+                self._send(
+                    dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+                )
             if start:
                 record = struct.pack("<HBHQi", 14, ord("D"), 0, round((now - self.boot) * 1e6), 4)
                 data = [*record.ljust(249, b"\0")]
-                self._send(dialect.MAVLink_logging_data_message(*IDS, sequence % 2**16, len(record), 0, data))
+                self._send(
+                    dialect.MAVLink_logging_data_message(
+                        *IDS, sequence % 2**16, len(record), 0, data
+                    )
+                )
                 sequence += 1
                 self.ready[min(19, int(2 * (now - start)))].set()
             with suppress(TimeoutError):
@@ -68,27 +74,47 @@ class Px4:
                     if each.get_type() == "TIMESYNC" and not each.tc1:
                         vehicle_time = round((time.monotonic() - self.boot) * 1e9)
                         self._send(dialect.MAVLink_timesync_message(vehicle_time, each.ts1))
-                    elif each.get_type() == "COMMAND_LONG" and each.command == dialect.MAV_CMD_LOGGING_STOP:
+                    elif (
+                        each.get_type() == "COMMAND_LONG"
+                        and each.command == dialect.MAV_CMD_LOGGING_STOP
+                    ):
                         self._send(dialect.MAVLink_command_ack_message(each.command, 0, 0, 0, *IDS))
-                    elif each.get_type() == "COMMAND_LONG" and each.command == dialect.MAV_CMD_LOGGING_START:
+                    elif (
+                        each.get_type() == "COMMAND_LONG"
+                        and each.command == dialect.MAV_CMD_LOGGING_START
+                    ):
                         self._send(dialect.MAVLink_command_ack_message(each.command, 0, 0, 0, *IDS))
                         data = [*self._header.ljust(249, b"\0")]
-                        self._send(dialect.MAVLink_logging_data_acked_message(*IDS, 0, len(self._header), 0, data))
+                        self._send(
+                            dialect.MAVLink_logging_data_acked_message(
+                                *IDS, 0, len(self._header), 0, data
+                            )
+                        )
                         sequence, start = 1, time.monotonic()
 
 
-def test_delay_includes_the_time_that_messages_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delay_includes_the_time_that_messages_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """While the publisher waits for half of each second, `delay` is that of the publication, and no late data is ok."""
     monkeypatch.setattr(mavlink_source, "_STATUS_INTERVAL", 0.25)
     monkeypatch.setattr(log_stream, "_WINDOW", 0.75)
-    path = write_raw_log(tmp_path / "a.ulg", {"battery_status": ("uint64_t timestamp;int32_t cell_count;", "Qi")}, [])
+    path = write_raw_log(
+        tmp_path / "a.ulg", {"battery_status": ("uint64_t timestamp;int32_t cell_count;", "Qi")}, []
+    )
     port = free_port()
-    source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?log=1").open_source(vehicle="1"))
-    youngest: list[float] = []  # ages when the source was asked for the message: it is published later
+    source = cast(
+        "LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?log=1").open_source(vehicle="1")
+    )
+    # ages when the source was asked for the message: it is published later
+    youngest: list[float] = []
     oldest: list[float] = []  # ages when the source had returned the message
     compared: list[tuple[float, float, float]] = []
     load, last = LinkLoad(), 0.0
-    with closing(cast("Any", source.listen(None))) as items, closing(Px4(port, path.read_bytes())) as px4:
+    with (
+        closing(cast("Any", source.listen(None))) as items,
+        closing(Px4(port, path.read_bytes())) as px4,
+    ):
         half = 1
         asked = time.monotonic()
         for item in items:
@@ -106,14 +132,17 @@ def test_delay_includes_the_time_that_messages_wait(tmp_path: Path, monkeypatch:
             elif isinstance(item, LogStreamStatus) and oldest:
                 if item.delay not in (None, last):
                     last = item.delay
-                    compared.append((sum(youngest) / len(youngest), last, sum(oldest) / len(oldest)))
+                    compared.append(
+                        (sum(youngest) / len(youngest), last, sum(oldest) / len(oldest))
+                    )
                     youngest.clear()
                     oldest.clear()
                 if len(compared) == 2:
                     break
             asked = time.monotonic()
     least, delay, most = compared[1]  # the clock is measured during the first second
-    tolerance = 0.05 + px4.lateness  # the vehicle's time is measured by its replies, which a busy machine delays
+    # the vehicle's time is measured by its replies, which a busy machine delays
+    tolerance = 0.05 + px4.lateness
     assert least - tolerance <= delay <= most + tolerance
     assert delay > 0.1
 

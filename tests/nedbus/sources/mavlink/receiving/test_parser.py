@@ -21,7 +21,11 @@ def example(kind: Any) -> Any:
         length = kind.array_lengths[kind.ordered_fieldnames.index(name)]
         value = 1 + number % 90
         values.append(
-            b"text" if c_type == "char" else [(value + each) % 100 for each in range(length)] if length else value
+            b"text"
+            if c_type == "char"
+            else [(value + each) % 100 for each in range(length)]
+            if length
+            else value
         )
     return kind(*values)
 
@@ -61,6 +65,8 @@ def test_field_that_a_message_lacks_is_an_attribute_error_except_its_times() -> 
 
 def test_message_with_a_wrong_checksum_is_bad_data() -> None:
     """A damaged frame is not decoded, even if none of its fields is ever read."""
-    frame = dialect.MAVLink_attitude_message(1, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0).pack(dialect.MAVLink(None))
+    frame = dialect.MAVLink_attitude_message(1, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0).pack(
+        dialect.MAVLink(None)
+    )
     (message,) = new_parser().parse_buffer(frame[:-1] + bytes([frame[-1] ^ 1]))
     assert message.get_type() == "BAD_DATA"

@@ -31,7 +31,14 @@ class Host:
         self.loads: list[LinkLoad] = []
         self.rejections: list[Rejection] = []
 
-    def put(self, sequence: int, chunk: Chunk | None = None, *, system: int = 1, message: Any = HEARTBEAT) -> None:
+    def put(
+        self,
+        sequence: int,
+        chunk: Chunk | None = None,
+        *,
+        system: int = 1,
+        message: Any = HEARTBEAT,
+    ) -> None:
         self.queue.put(Received(message, system, sequence, None, self.time, chunk=chunk))
 
     def read(self, count: int | None = None, *, lost_by_host: int = 0) -> list[Received]:
@@ -110,7 +117,9 @@ def test_messages_that_wait_are_limited(monkeypatch: pytest.MonkeyPatch, host: H
     assert [(each.sequence, each.lost) for each in read if each.system == 2] == [(0, 0)]
 
 
-def received(data: bytes, *, system: int = 1, message: Any = DATA, lost: int = 0, **chunk: Any) -> Received:
+def received(
+    data: bytes, *, system: int = 1, message: Any = DATA, lost: int = 0, **chunk: Any
+) -> Received:
     return Received(message, system, 7, None, 100.0, lost, Chunk("delivered", data, **chunk))
 
 
@@ -135,8 +144,12 @@ def test_contiguous_data_is_joined() -> None:
     assert join_data(lost_data) == lost_data
 
 
-@pytest.mark.parametrize(("offsets", "offset"), [((0, 1), 0), ((255, 1), 4), ((255, 255), 258), ((2, 255), 2)])
-def test_joined_data_has_the_offset_of_its_first_record(offsets: tuple[int, int], offset: int) -> None:
+@pytest.mark.parametrize(
+    ("offsets", "offset"), [((0, 1), 0), ((255, 1), 4), ((255, 255), 258), ((2, 255), 2)]
+)
+def test_joined_data_has_the_offset_of_its_first_record(
+    offsets: tuple[int, int], offset: int
+) -> None:
     """The first record that begins in joined data is that of the first part, or else that of the second."""
     (joined,) = join_data([received(b"abc", offset=offsets[0]), received(b"de", offset=offsets[1])])
     assert isinstance(joined, Received)
@@ -174,7 +187,9 @@ def test_stream_resumes_at_a_record_after_dropped_data(host: Host) -> None:
     ]
 
 
-def test_stream_whose_beginning_was_dropped_is_not_decoded(monkeypatch: pytest.MonkeyPatch, host: Host) -> None:
+def test_stream_whose_beginning_was_dropped_is_not_decoded(
+    monkeypatch: pytest.MonkeyPatch, host: Host
+) -> None:
     """Without the first message of a stream nothing is delivered until the next stream."""
     monkeypatch.setattr(receive_queue, "_MAX_WAITING", 3)
     host.put(0, Chunk("delivered", b"header", begins=True), message=ACKED)
@@ -247,11 +262,15 @@ def test_error_is_raised_after_the_last_message() -> None:
         list(host.queue.read(DEADLINE, lost_by_host=0))
 
 
-def test_rejections_beyond_the_limit_are_counted_apart(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejections_beyond_the_limit_are_counted_apart(
+    host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Beyond the limit of different rejections, further ones are counted together, and not for an unrelated place."""
     monkeypatch.setattr(receive_queue, "_MAX_REJECTIONS", 3)
     host.queue.put(*(Rejection(f"{number} x", "bad") for number in range(3)))
-    host.queue.put(*(Rejection("99 y", "worse", count=2) for _ in range(5)), Rejection("1 x", "bad"))
+    host.queue.put(
+        *(Rejection("99 y", "worse", count=2) for _ in range(5)), Rejection("1 x", "bad")
+    )
     host.read()
     assert [(each.where, each.count) for each in host.rejections] == [
         ("0 x", 1), ("1 x", 2), ("2 x", 1), ("further places", 10),

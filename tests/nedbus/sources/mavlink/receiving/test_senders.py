@@ -19,11 +19,26 @@ from tests.peers.command_line import run_command
 from tests.peers.live_source import Listener
 from tests.peers.ports import free_port
 
-PX4, ARDUPILOT, INVALID = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, dialect.MAV_AUTOPILOT_INVALID
+PX4, ARDUPILOT, INVALID = (
+    dialect.MAV_AUTOPILOT_PX4,
+    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+    dialect.MAV_AUTOPILOT_INVALID,
+)
 QUADROTOR, SUBMARINE, UNKNOWN = dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_SUBMARINE, 250
-STATION, COMPANION, GIMBAL = dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_TYPE_GIMBAL
+STATION, COMPANION, GIMBAL = (
+    dialect.MAV_TYPE_GCS,
+    dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+    dialect.MAV_TYPE_GIMBAL,
+)
 EPOCH = 1_760_000_000_000_000  # us
-OTHERS = [(STATION, INVALID), (STATION, 0), (COMPANION, INVALID), (GIMBAL, INVALID), (QUADROTOR, INVALID), (UNKNOWN, 0)]
+OTHERS = [
+    (STATION, INVALID),
+    (STATION, 0),
+    (COMPANION, INVALID),
+    (GIMBAL, INVALID),
+    (QUADROTOR, INVALID),
+    (UNKNOWN, 0),
+]
 
 
 def heartbeat(kind: int = QUADROTOR, autopilot: int = PX4, *, armed: bool = False) -> Any:
@@ -41,7 +56,9 @@ def received(*messages: tuple[int, int, Any]) -> list[str]:
     for system, component, message in messages:
         data = message.pack(dialect.MAVLink(None, system, component))
         found += [
-            each.message.get_type() for each in parse(parser, data, "link", None, 0) if isinstance(each, Received)
+            each.message.get_type()
+            for each in parse(parser, data, "link", None, 0)
+            if isinstance(each, Received)
         ]
     return found
 
@@ -51,7 +68,9 @@ def write_tlog(path: Path, messages: Iterable[tuple[float, int, Any]]) -> None:
     encoders = {system: dialect.MAVLink(None, system, 1) for system in range(1, 256)}
     with path.open("wb") as file:
         for seconds, system, message in messages:
-            file.write(struct.pack(">Q", EPOCH + round(1e6 * seconds)) + message.pack(encoders[system]))
+            file.write(
+                struct.pack(">Q", EPOCH + round(1e6 * seconds)) + message.pack(encoders[system])
+            )
 
 
 @pytest.mark.parametrize(("kind", "autopilot"), OTHERS)
@@ -71,7 +90,10 @@ def test_heartbeats_of_others_with_ids_of_the_autopilot_are_ignored(
     write_tlog(path, messages)
     assert len(nedbus.read(path)) == 100
     states = nedbus.read(path, "vehicle_status")["arming_state"].tolist()
-    disarmed, armed = nedbus.VehicleStatus.ARMING_STATE_DISARMED, nedbus.VehicleStatus.ARMING_STATE_ARMED
+    disarmed, armed = (
+        nedbus.VehicleStatus.ARMING_STATE_DISARMED,
+        nedbus.VehicleStatus.ARMING_STATE_ARMED,
+    )
     assert states == [disarmed] * 4 + [armed] * 5, "the time is not known at the first HEARTBEAT"
 
 
@@ -79,21 +101,35 @@ def test_heartbeats_of_others_with_ids_of_the_autopilot_are_ignored(
 def test_sender_that_is_no_autopilot_is_ignored(kind: int, autopilot: int) -> None:
     """Of a sender with component 1 and another's heartbeat nothing is used, also what it sent before."""
     before = dialect.MAVLink_timesync_message(0, 1)
-    vision = dialect.MAVLink_odometry_message(0, 1, 1, 0, 0, 0, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21)
-    assert received((42, 1, before), (42, 1, heartbeat(kind, autopilot)), (42, 1, before), (42, 1, vision)) == []
+    vision = dialect.MAVLink_odometry_message(
+        0, 1, 1, 0, 0, 0, [1, 0, 0, 0], *[0] * 6, [0] * 21, [0] * 21
+    )
+    assert (
+        received(
+            (42, 1, before), (42, 1, heartbeat(kind, autopilot)), (42, 1, before), (42, 1, vision)
+        )
+        == []
+    )
 
 
-@pytest.mark.parametrize("kind", [QUADROTOR, SUBMARINE, dialect.MAV_TYPE_GENERIC, dialect.MAV_TYPE_VTOL_TILTROTOR])
+@pytest.mark.parametrize(
+    "kind", [QUADROTOR, SUBMARINE, dialect.MAV_TYPE_GENERIC, dialect.MAV_TYPE_VTOL_TILTROTOR]
+)
 @pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT, dialect.MAV_AUTOPILOT_GENERIC])
 def test_autopilots_are_used(kind: int, autopilot: int) -> None:
     """Vehicles of all kinds and autopilots are used; component ids other than 1 are not."""
-    assert received((9, 1, heartbeat(kind, autopilot)), (9, 100, heartbeat(kind, autopilot))) == ["HEARTBEAT"]
+    assert received((9, 1, heartbeat(kind, autopilot)), (9, 100, heartbeat(kind, autopilot))) == [
+        "HEARTBEAT"
+    ]
 
 
 def test_autopilot_is_used_before_its_first_heartbeat() -> None:
     """A sender of flight data is presumed to be an autopilot until its heartbeat arrives."""
     pressure = dialect.MAVLink_scaled_pressure_message(1, 1.0, 1.0, 1)
-    assert received((9, 1, pressure), (9, 1, position(1)), (9, 1, pressure)) == ["LOCAL_POSITION_NED", "UNKNOWN_29"]
+    assert received((9, 1, pressure), (9, 1, position(1)), (9, 1, pressure)) == [
+        "LOCAL_POSITION_NED",
+        "UNKNOWN_29",
+    ]
 
 
 def test_router_with_component_1_is_not_requested() -> None:
@@ -130,7 +166,9 @@ def test_damaged_messages_of_ignored_senders_are_no_damage() -> None:
     ("autopilot", "author"),
     [(PX4, "PX4"), (ARDUPILOT, "ArduPilot"), (dialect.MAV_AUTOPILOT_PPZ, "autopilot"), (0, "PX4")],
 )
-def test_texts_name_the_autopilot_of_the_heartbeat(tmp_path: Path, autopilot: int, author: str) -> None:
+def test_texts_name_the_autopilot_of_the_heartbeat(
+    tmp_path: Path, autopilot: int, author: str
+) -> None:
     """A text is quoted after its author, which HEARTBEAT names; also in an MCAP file of the log."""
     path, copied = tmp_path / "flight.tlog", tmp_path / "flight.mcap"
     messages: list[tuple[float, int, Any]] = []
@@ -144,9 +182,14 @@ def test_texts_name_the_autopilot_of_the_heartbeat(tmp_path: Path, autopilot: in
     write_tlog(path, messages)
     assert run_command("convert", "--topics", "*", str(path), str(copied)).exit_code == 0
     for file in (path, copied):
-        texts = [event.words for event in read_file_events(file).event_log.events if event.kind == "text"]
+        texts = [
+            event.words for event in read_file_events(file).event_log.events if event.kind == "text"
+        ]
         assert texts == [f'{author}: "Leak Detected"'], file
         shown = run_command("events", str(file)).out
         assert f'{author}: "Leak Detected"' in shown
         rows = list(csv.DictReader(run_command("events", str(file), "--csv").out.splitlines()))
-        assert {(row["kind"] == "text", row["author"]) for row in rows} <= {(True, author), (False, "")}
+        assert {(row["kind"] == "text", row["author"]) for row in rows} <= {
+            (True, author),
+            (False, ""),
+        }

@@ -17,7 +17,17 @@ HEADER = b"ULog\x01\x12\x35\x01" + bytes(20)
 def test_reordered_and_duplicate_messages_do_not_count_as_lost() -> None:
     """Datagrams that arrive out of order, or twice, do not count as lost."""
     counter = SequenceCounter()
-    arrivals = [(10, 0.0), (12, 0.2), (11, 0.2), (13, 0.3), (13, 0.3), (14, 0.4), (100, 3.0), (200, 5.9), (0, 8.0)]
+    arrivals = [
+        (10, 0.0),
+        (12, 0.2),
+        (11, 0.2),
+        (13, 0.3),
+        (13, 0.3),
+        (14, 0.4),
+        (100, 3.0),
+        (200, 5.9),
+        (0, 8.0),
+    ]
     found = [counter.add(sequence, 100.0 + seconds) for sequence, seconds in arrivals]
     assert found == [0, 1, -1, 0, 0, 0, 85, 0, 0]
 
@@ -52,9 +62,12 @@ def test_random_sequence_numbers_lose_little() -> None:
 
 @pytest.mark.logs
 @pytest.mark.slow
-@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
+@pytest.mark.skipif(
+    not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}"
+)
 @pytest.mark.parametrize(("path", "lost", "lost_data"), [
-    (STREAMS.parent / "link_cut_20s_in_flight.bin.gz", 21, 1475),  # MAVLink's sequence is unknown after the cut
+    # MAVLink's sequence is unknown after the cut
+    (STREAMS.parent / "link_cut_20s_in_flight.bin.gz", 21, 1475),
     (STREAMS.parent / "foreign_stop_in_flight.bin.gz", 0, 0),
     (STREAMS / "ulog_stream_lossy1.bin.gz", 607, 237),
     (STREAMS / "ulog_stream_session.bin.gz", 84, 615 + 3433),  # a reader that paused for 5 s
@@ -115,7 +128,10 @@ def two_links(late: float, *, offset: int, loss: float) -> list[tuple[float, int
 def test_second_link_loses_nothing(late: float, offset: int) -> None:
     """Two modems of one vehicle number their packets on their own: those of the second are no losses."""
     counter = SequenceCounter()
-    assert sum(counter.add(number, now) for now, number, _ in two_links(late, offset=offset, loss=0.0)) == 0
+    assert (
+        sum(counter.add(number, now) for now, number, _ in two_links(late, offset=offset, loss=0.0))
+        == 0
+    )
 
 
 @pytest.mark.parametrize("late", [0.3, 1.5, 3.0, 5.0])
