@@ -16,21 +16,18 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
+from nedbus import limits
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, Selection
 
 from .liveliness import LivelinessTokens, query_tokens
-from .queries import MAX_REPLIES, Replies
+from .queries import Replies
 from .session import Session
 
 _log = logging.getLogger(__name__)
 
-# of one vehicle; two services that publish all topics of a PX4 declare 500
-_MAX_TOKENS: Final = 1000
-# 64 per character of an excluded name; further vehicles are not excluded
-_MAX_KEY_EXPRS: Final = 5000
 _CHARACTERS: Final = string.ascii_letters + string.digits + "_-"
 _LONGEST_NAME: Final = 64  # characters; peers may use longer ones
 _QUERY_TIMEOUT: Final = 60.0  # s
@@ -85,14 +82,17 @@ class FleetTokens:
         ]
         now = time.monotonic()
         crowded = (
-            {name for name, number in self._numbers.items() if number > _MAX_TOKENS}
+            {name for name, number in self._numbers.items() if number > limits.TOKENS_OF_VEHICLE}
             if changes
             else set()
         )
-        if crowded and len(self._key_exprs(self._excluded | crowded)) <= _MAX_KEY_EXPRS:
+        if crowded and len(self._key_exprs(self._excluded | crowded)) <= limits.EXCLUDING_KEY_EXPRS:
             text = "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
             _log.warning(
-                text, ", ".join(map(repr, sorted(crowded))), _MAX_TOKENS, extra=about("incomplete")
+                text,
+                ", ".join(map(repr, sorted(crowded))),
+                limits.TOKENS_OF_VEHICLE,
+                extra=about("incomplete"),
             )
             self._excluded |= crowded
             self._retry = now + TIMINGS.excluded
@@ -100,7 +100,7 @@ class FleetTokens:
             changes += [change for change in gone if self._apply(*change)]
             self._restart(self._subscribe)
         elif self._survey and all(each.ended for each in self._survey):
-            is_complete = len(self._keys) < MAX_REPLIES and not any(
+            is_complete = len(self._keys) < limits.REPLIES and not any(
                 each.failed for each in self._survey
             )
             self._restart(partial(self._subscribe, is_surveyed=is_complete))
@@ -140,7 +140,7 @@ class FleetTokens:
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
-        if (key in self._keys) == alive or (alive and len(self._keys) >= MAX_REPLIES):
+        if (key in self._keys) == alive or (alive and len(self._keys) >= limits.REPLIES):
             return False
         (self._keys.add if alive else self._keys.remove)(key)
         self._numbers[vehicle := self._vehicle_of(key)] += 1 if alive else -1

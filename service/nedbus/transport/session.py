@@ -15,6 +15,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.endpoints import check_endpoints, resolution_error, split_endpoint
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 from nedbus.timings import TIMINGS
@@ -53,8 +54,6 @@ COMMON_SETTINGS: Final = {
         },
     ],
 }
-# payload of a reply: services split longer ones, clients reject them
-MAX_REPLY_BYTES: Final = 2**18
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # backoff between the first attempts to connect [s]
 
@@ -111,7 +110,7 @@ def open_client(
         # Longer than any wait for tokens: at this timeout, Zenoh reports an unfinished list as complete.
         "routing/interests/timeout": 120_000,
         # Including key and headers; larger messages from peers are rejected.
-        "transport/link/rx/max_message_size": MAX_REPLY_BYTES + 2**12,
+        "transport/link/rx/max_message_size": limits.REPLY_BYTES + 2**12,
     }
     timeout = math.inf if timeout is None else timeout
     end = time.monotonic() + timeout

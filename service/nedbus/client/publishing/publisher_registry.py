@@ -13,6 +13,7 @@ from typing import Any, Final, cast
 import zenoh
 from pydantic_core import to_json
 
+from nedbus import limits
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
@@ -37,8 +38,6 @@ from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-# definitions kept after their publisher closed, for readers with unread messages
-_MAX_UNUSED: Final = 64
 # s between acknowledgement requests: time for three round trips over a radio link
 _FLUSH_POLL: Final = 2.0
 
@@ -113,7 +112,7 @@ class PublisherRegistry:
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = (
                 definition
             )
-            if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
+            if len(self._definitions) > len(self.publishers) + limits.UNUSED_DEFINITIONS:
                 used = {each.definition for each in self.publishers.values()}
                 del self._definitions[
                     next(key for key, each in self._definitions.items() if each not in used)

@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 _TIMEOUT: Final = 2.0  # s for the queries of last messages
 _CHECK: Final = 1.0  # s between checks for publishers that do not downsample
 _LAST_POLL: Final = 0.02  # s between polls for last messages
-_MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
+_OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
 
 # listing publishers may open a session, which would block the I/O thread
 _checks = CallThread("nedbus-publishers")
@@ -71,8 +71,7 @@ class MaxRateInbox(Inbox):
                 if arrival.payload and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
                     last.append(detach(arrival, retained=True))
-            self.gaps.delivered = last
-            super()._queue()
+            super()._queue(last)
         self.wake()
 
     def has_downsampled(self, address: Address) -> bool:
@@ -84,14 +83,13 @@ class MaxRateInbox(Inbox):
     def _rate_key(self, address: Address) -> str:
         return address.rate_key(self.rate, prefix=self.decoder.prefix)
 
-    def _queue(self) -> int:
-        self.gaps.delivered = [arrival for arrival in self.gaps.delivered if self._passes(arrival)]
-        return super()._queue()
+    def _queue(self, arrivals: list[Arrival]) -> None:
+        super()._queue([arrival for arrival in arrivals if self._passes(arrival)])
 
     def _passes(self, arrival: Arrival) -> bool:
         stream = arrival.stream
         stream.gate = stream.gate or RateGate(self._max_rate)
-        passes = not 0 <= stream.last_sent - _sent(arrival) <= _MAX_OVERTAKE
+        passes = not 0 <= stream.last_sent - _sent(arrival) <= _OVERTAKEN
         if self.rate > self._max_rate:  # below the lowest rate of publishers
             passes = passes and stream.gate.passes(time.monotonic_ns())
         if not passes:

@@ -9,6 +9,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.client.io_thread import TICK
 from nedbus.errors import NedbusError
 from nedbus.log_event import UnexpectedErrors
@@ -20,9 +21,6 @@ from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
 
-_MAX_OPEN: Final = 64  # requests in flight
-_MAX_OPEN_HISTORY: Final = 16  # requests in flight to publishers that have delivered no message yet
-_MAX_OPEN_OF_KEY: Final = 4  # requests in flight on one key, whose publishers may never answer
 _TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
@@ -59,7 +57,7 @@ class Retransmission:
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
         if self._inbox.may_recover:
             for writer in list(self._inbox.gaps.requesting):  # copied: other threads add to it
-                if len(self._open) >= _MAX_OPEN:
+                if len(self._open) >= limits.REQUESTS:
                     break
                 if writer in self._open or not self._may_open(writer):
                     continue
@@ -99,5 +97,5 @@ class Retransmission:
     def _may_open(self, writer: WriterProxy) -> bool:
         share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]
         if writer.history_end:
-            return len(share) < _MAX_OPEN_HISTORY
-        return sum(each.stream is writer.stream for each in share) < _MAX_OPEN_OF_KEY
+            return len(share) < limits.HISTORY_REQUESTS
+        return sum(each.stream is writer.stream for each in share) < limits.REQUESTS_OF_KEY
