@@ -99,7 +99,7 @@ class SourceStatus(UntrustedReply):
             *self.addresses,
             *self.stale,
             *self.silent,
-            *(each.address for each in self.streams),
+            *(stream.address for stream in self.streams),
         )
         return {_vehicle_of(each) for each in addresses} | {
             each.vehicle for each in self.log_streams
@@ -119,9 +119,11 @@ class SourceStatus(UntrustedReply):
             addresses=tuple(filter(is_named, self.addresses)),
             stale=tuple(filter(is_about, self.stale)),
             silent=tuple(filter(is_about, self.silent)),
-            streams=tuple(each for each in self.streams if is_named(each.address)),
-            log_streams=tuple(each for each in self.log_streams if each.vehicle == vehicle),
-            positions=tuple(each for each in self.positions if each.vehicle == vehicle),
+            streams=tuple(stream for stream in self.streams if is_named(stream.address)),
+            log_streams=tuple(
+                log_stream for log_stream in self.log_streams if log_stream.vehicle == vehicle
+            ),
+            positions=tuple(position for position in self.positions if position.vehicle == vehicle),
         )
 
     @property
@@ -184,11 +186,11 @@ class ServiceStatus(UntrustedReply):
     def split(self, _: int) -> list[ServiceStatus]:
         """Split into one status per source, or omit the stream health of the only one; return [] if neither applies."""
         if len(self.sources) > 1:
-            return [replace(self, sources=(each,)) for each in self.sources]
+            return [replace(self, sources=(source,)) for source in self.sources]
         return [
-            replace(self, sources=(replace(each, streams=()),))
-            for each in self.sources
-            if each.streams
+            replace(self, sources=(replace(source, streams=()),))
+            for source in self.sources
+            if source.streams
         ]
 
 
@@ -211,7 +213,7 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     The list begins with one status of each vehicle and ends with older services. A program that shows only its
     beginning thus leaves out no vehicle because another one claims many services.
     """
-    found: dict[tuple[str | None, str], ServiceStatus] = {}
+    statuses: dict[tuple[str | None, str], ServiceStatus] = {}
     for vehicle, service, content in _find(
         session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout
     ):
@@ -219,20 +221,20 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
             continue
         given = _status_type().validate_python(content)
         if vehicle is None:
-            found[vehicle, service] = ServiceStatus(
+            statuses[vehicle, service] = ServiceStatus(
                 service=service, host=given.host, version=given.version
             )
             continue
         part = replace(given.about(vehicle), service=service)
-        known = found.get((vehicle, service))
+        known = statuses.get((vehicle, service))
         sources = part.sources if known is None else (*known.sources, *part.sources)
-        found[vehicle, service] = replace(part, sources=sources)
+        statuses[vehicle, service] = replace(part, sources=sources)
     known_of = Counter[str]()
     ranked: list[tuple[bool, int, ServiceStatus]] = []
-    for status in found.values():
+    for status in statuses.values():
         ranked.append((status.is_outdated, known_of[status.vehicle], status))
         known_of[status.vehicle] += 1
-    ranked.sort(key=lambda each: each[:2])
+    ranked.sort(key=lambda rank: rank[:2])
     return [status for _, _, status in ranked]
 
 
@@ -246,14 +248,14 @@ def find_reports(
     from nedbus.vehicle_events import ACCOUNT_PARAMETER, from_json, joined
 
     selector = f"{all_status_keys(prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
-    found: dict[tuple[str, str], list[AccountReport]] = {}
+    parts: dict[tuple[str, str], list[AccountReport]] = {}
     for vehicle, service, content in _find(session, selector, prefix=prefix, timeout=timeout):
         part = from_json(content)
         if vehicle is not None and part is not None:
-            found.setdefault((vehicle, service), []).append(
+            parts.setdefault((vehicle, service), []).append(
                 replace(part.about(vehicle), service=service)
             )
-    return list(map(joined, found.values()))
+    return list(map(joined, parts.values()))
 
 
 def _find(

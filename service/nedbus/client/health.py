@@ -275,10 +275,12 @@ class StreamHealth:
             if latency is not None:
                 window.add_latency(latency)
                 self._latencies.add(latency)
-        for each, absent, arrived in zip(values, missing, received, strict=True):
-            rebooted = self._add_time(int(each[0]), arrived)
+        for fields, absent, arrived in zip(values, missing, received, strict=True):
+            rebooted = self._add_time(int(fields[0]), arrived)
             if self._is_position:
-                self._add_position(each[1:_COUNTERS], each[_COUNTERS:], absent, rebooted=rebooted)
+                self._add_position(
+                    fields[1:_COUNTERS], fields[_COUNTERS:], absent, rebooted=rebooted
+                )
 
     def _begin_window(self, received: int) -> None:
         if self._window.messages:

@@ -316,7 +316,7 @@ class NewestBase(Monitor):
         ended = self._inbox.ended  # before `pop`, as in Subscription
         self._view.number += 1
         popped = (self._inbox.pop() for _ in range(self._inbox.waiting))
-        arrived = [*samples, *(each for each in popped if each is not None)]
+        arrived = [*samples, *(sample for sample in popped if sample is not None)]
         if ended and not arrived:
             raise self._inbox.end_error
         # two samples of a stream are one piece of news

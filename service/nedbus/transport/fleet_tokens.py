@@ -73,11 +73,11 @@ class FleetTokens:
 
     def poll(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, like LivelinessTokens."""
-        tokens = [reply.ok for each in self._survey for reply in each.poll()]
-        found = [(str(token.key_expr), True) for token in tokens if token is not None]
+        tokens = [reply.ok for query in self._survey for reply in query.poll()]
+        listed = [(str(token.key_expr), True) for token in tokens if token is not None]
         changes = [
             change
-            for change in (found if self._survey else self._tokens.poll())
+            for change in (listed if self._survey else self._tokens.poll())
             if self._apply(*change)
         ]
         now = time.monotonic()
@@ -99,9 +99,9 @@ class FleetTokens:
             gone = [(key, False) for key in self._keys if self._vehicle_of(key) in crowded]
             changes += [change for change in gone if self._apply(*change)]
             self._restart(self._subscribe)
-        elif self._survey and all(each.ended for each in self._survey):
+        elif self._survey and all(query.ended for query in self._survey):
             is_complete = len(self._keys) < limits.REPLIES and not any(
-                each.failed for each in self._survey
+                query.failed for query in self._survey
             )
             self._restart(partial(self._subscribe, is_surveyed=is_complete))
             self._slow = math.inf  # no vehicle has too many
@@ -132,7 +132,7 @@ class FleetTokens:
     def _query(self) -> None:
         key_exprs = self._key_exprs(self._excluded)
         self._survey = [
-            query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in key_exprs
+            query_tokens(self._session, key_expr, timeout=_QUERY_TIMEOUT) for key_expr in key_exprs
         ]
 
     def _key_exprs(self, excluded: Set[str]) -> list[str]:
@@ -160,8 +160,8 @@ def key_exprs_without(excluded: Set[str], selection: Selection, *, prefix: str) 
             return [f"{prefix}/{selection.vehicles[0]}/@alive/-"]  # no token
         return Selection(selection.topics, kept, selection.instance).alive_key_exprs(prefix=prefix)
     starts = {name[:length] for name in excluded for length in range(len(name) + 1)}
-    short = [each for each in starts if len(each) <= _LONGEST_NAME]
-    names = {f"{each}{c}$*" for each in short for c in _CHARACTERS if each + c not in starts}
+    short = [start for start in starts if len(start) <= _LONGEST_NAME]
+    names = {f"{start}{c}$*" for start in short for c in _CHARACTERS if start + c not in starts}
     names |= starts - excluded - {""}
     return [
         tokens.replace(f"/{ANY}/", f"/{name}/", 1)

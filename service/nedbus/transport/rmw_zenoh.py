@@ -46,10 +46,10 @@ class TopicKey:
     @classmethod
     def parse(cls, key: str) -> Self:
         """Parse a key of rmw_zenoh; raise DecodeError for any other key."""
-        found = _KEY.fullmatch(key) if len(key) <= limits.KEY_TEXT and "//" not in key else None
-        if found is None:
+        match = _KEY.fullmatch(key) if len(key) <= limits.KEY_TEXT and "//" not in key else None
+        if match is None:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
-        return cls(int(found[1]), found[2], found[3], found[4])
+        return cls(int(match[1]), match[2], match[3], match[4])
 
     def token(self, kind: Literal["MP", "MS"], session: str, node: str, entity: int) -> str:
         """Return the liveliness token of a node's publisher (MP), which ROS 2 lists, or of its subscription (MS)."""
@@ -117,8 +117,8 @@ class PublisherToken:
     @property
     def gid(self) -> bytes | None:
         """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same gid."""
-        found = _PX4_NODE.fullmatch(self.node)
-        return bytes.fromhex(found[1]) if found else None
+        match = _PX4_NODE.fullmatch(self.node)
+        return bytes.fromhex(match[1]) if match else None
 
 
 def gid_of_token(token: str) -> bytes:

@@ -174,8 +174,8 @@ def _get(config: zenoh.Config, key: str) -> Any:
 
 
 def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
-    found = _get(config, f"{name}/endpoints")
-    return tuple(found.get("router", ()) if isinstance(found, dict) else found or ())
+    endpoints = _get(config, f"{name}/endpoints")
+    return tuple(endpoints.get("router", ()) if isinstance(endpoints, dict) else endpoints or ())
 
 
 def _tls_files(config: zenoh.Config) -> dict[str, Path]:
@@ -255,15 +255,15 @@ def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
 
 def parse_state(key: str, payload: bytes) -> RouterState | None:
     """Parse a reply of the admin space; return None if it is malformed, because any peer may reply."""
-    found = _ADMIN_KEY.fullmatch(key)
+    match = _ADMIN_KEY.fullmatch(key)
     try:
         state = json.loads(payload)
     except (ValueError, RecursionError):
         return None
     sessions = state.get("sessions") if isinstance(state, dict) else None
-    if found is None or not isinstance(sessions, list):
+    if match is None or not isinstance(sessions, list):
         return None
     metadata = state.get("metadata")
     limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
     is_limit = type(limit) is int and 0 < limit <= _LARGEST_LIMIT  # not a bool
-    return RouterState(found[1], len(sessions), limit if is_limit else None)
+    return RouterState(match[1], len(sessions), limit if is_limit else None)

@@ -149,10 +149,10 @@ def _tls_ports(endpoints: Sequence[str]) -> list[str]:
     parts = {endpoint: split_endpoint(endpoint) for endpoint in endpoints}
     return [
         endpoint
-        for endpoint, found in parts.items()
-        if found is not None
-        and found[0] == "tcp"
-        and read_certificate(found[1], found[2], TIMINGS.tls_hint)
+        for endpoint, part in parts.items()
+        if part is not None
+        and part[0] == "tcp"
+        and read_certificate(part[1], part[2], TIMINGS.tls_hint)
     ]
 
 
@@ -207,5 +207,5 @@ def translate_error(error: zenoh.ZError) -> NedbusError:
 def error_reason(error: zenoh.ZError) -> str:
     """Return the reason reported by the operating system, else the whole text without source paths."""
     text = re.sub(r" at /\S+", "", str(error)).strip()
-    found = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
-    return found[1].lower() if found else text
+    match = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
+    return match[1].lower() if match else text

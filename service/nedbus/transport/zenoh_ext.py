@@ -59,8 +59,8 @@ def follow_heartbeats(
 
 @lru_cache(1024)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
-    found = _KEY.fullmatch(heartbeat)
-    return None if found is None else (found[1], f"{found[2]}:{found[3]}")
+    match = _KEY.fullmatch(heartbeat)
+    return None if match is None else (match[1], f"{match[2]}:{match[3]}")
 
 
 class RetransmitRequest:

@@ -53,7 +53,9 @@ class SharedWindow:
         """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
         with self._lock:
             recent = {
-                other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL
+                other: unread
+                for other, unread in self._unread.items()
+                if now - unread[1] < _STALE_POLL
             }
             self._unread = recent | {key: (unread, now)}
             others = sum(number for number, _ in self._unread.values()) - unread

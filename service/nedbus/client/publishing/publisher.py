@@ -158,17 +158,17 @@ class Publisher(AbstractContextManager["Publisher"]):
             )
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
-        each = [payloads[start : start + size] for start in range(0, len(payloads), size)]
+        encoded = [payloads[start : start + size] for start in range(0, len(payloads), size)]
         if self._group is not None:
             self._group.hand_over()
         sent = 0
-        while sent < len(each):
+        while sent < len(encoded):
             room = (
                 self._flow_control.check_at - self._writer.published
                 if self.lossless
                 else limits.GROUP_MESSAGES
             )
-            group = each[sent : sent + max(1, min(limits.GROUP_MESSAGES, room))]
+            group = encoded[sent : sent + max(1, min(limits.GROUP_MESSAGES, room))]
             self._put([(payload, self._new_timestamp(), self._encoding) for payload in group])
             self._wait_for_credit()
             sent += len(group)

@@ -109,9 +109,9 @@ class Decoder:
 
         This is the only wait for a definition, and all arrivals get the same answer.
         """
-        if arrivals[0].stream.codec is not None or all(each.codec for each in arrivals):
+        if arrivals[0].stream.codec is not None or all(arrival.codec for arrival in arrivals):
             return arrivals
-        known = next((each.codec for each in arrivals if each.codec), None)
+        known = next((arrival.codec for arrival in arrivals if arrival.codec), None)
         codec = known or self._find_codec(arrivals[0].stream, arrivals[0].raw, wait=True)
         return [arrival._replace(codec=codec) for arrival in arrivals]
 

@@ -177,12 +177,12 @@ class Inbox:
             return writer.next_request(now)
 
     def on_retransmission(
-        self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float
+        self, writer: WriterProxy, answers: Mapping[int, RawSample], *, ended: bool, now: float
     ) -> bool:
         """Queue recovered messages and those held back behind them; return True if there are any."""
         with self._lock:
             received = clock.utc_ns()
-            admitted = {number: self._admit(raw, received) for number, raw in found.items()}
+            admitted = {number: self._admit(raw, received) for number, raw in answers.items()}
             arrivals = {
                 number: arrival for number, arrival in admitted.items() if arrival is not None
             }

@@ -151,9 +151,11 @@ class LayoutLookup:
                 queried = dict(islice(self._open.items(), limits.UNKNOWN_DEFINITIONS))
             added: list[SchemaId] = []
             with self._errors, suppress(NedbusError):  # the session is closed
-                found = self._find(queried)
+                schemas = self._find(queried)
                 added = [
-                    each for each in queried if each in found and self._add(*each, found[each])
+                    schema_id
+                    for schema_id in queried
+                    if schema_id in schemas and self._add(*schema_id, schemas[schema_id])
                 ]
             self._finish_query(queried, added)
 
@@ -235,24 +237,24 @@ def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: st
     Fields are accepted from any peer, because they must have the requested hash. Returns once all are found, without
     waiting for stopped publishers or bad links.
     """
-    found: dict[SchemaId, dict[str, str]] = {}
+    schemas: dict[SchemaId, dict[str, str]] = {}
     for to_all in (False, True):
         keys = {
             f"{schema_key(name, vehicle=ANY if to_all else sender.vehicle, prefix=prefix)}?hash={identity}"
             for (name, identity), sender in ids.items()
-            if (name, identity) not in found
+            if (name, identity) not in schemas
         }
         queries = [send_query(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
         replies = islice(wait_for_replies(queries), limits.REPLIES)
         for key, content in parse_replies(reply.ok for reply in replies if reply.ok is not None):
-            found |= {
-                each: fields
-                for each, fields in _parse(key.rpartition("/")[2], content)
-                if each in ids
+            schemas |= {
+                schema_id: fields
+                for schema_id, fields in _parse(key.rpartition("/")[2], content)
+                if schema_id in ids
             }
-            if len(found) == len(ids):
-                return found
-    return found
+            if len(schemas) == len(ids):
+                return schemas
+    return schemas
 
 
 def _parse(name: str, reply: object) -> Iterator[tuple[SchemaId, dict[str, str]]]:

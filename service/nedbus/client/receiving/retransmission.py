@@ -34,7 +34,7 @@ class Retransmission:
         text = "%s: unexpected error, recovered messages discarded (logged once)"
         self._errors = UnexpectedErrors(_log, text, inbox.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}
-        self._followed = [follow_heartbeats(session, each) for each in inbox.key_exprs]
+        self._followed = [follow_heartbeats(session, key_expr) for key_expr in inbox.key_exprs]
         self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
@@ -77,7 +77,7 @@ class Retransmission:
                 undeclare()
 
     def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
-        found = {
+        samples = {
             number: raw
             for number, raw in answers.poll().items()
             if len(raw.payload) <= PAYLOAD_LIMIT
@@ -85,17 +85,21 @@ class Retransmission:
         ended, key = answers.ended, writer.stream.wire_key
         if ended:
             del self._open[writer]
-        elif not found:
+        elif not samples:
             return ""
         with self._errors:
-            return key if self._inbox.on_retransmission(writer, found, ended=ended, now=now) else ""
+            return (
+                key if self._inbox.on_retransmission(writer, samples, ended=ended, now=now) else ""
+            )
         self._open.pop(writer, None)
         return (
             key if self._inbox.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
         )
 
     def _may_open(self, writer: WriterProxy) -> bool:
-        share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]
+        share = [
+            other for other in self._open if bool(other.history_end) == bool(writer.history_end)
+        ]
         if writer.history_end:
             return len(share) < limits.HISTORY_REQUESTS
-        return sum(each.stream is writer.stream for each in share) < limits.REQUESTS_OF_KEY
+        return sum(other.stream is writer.stream for other in share) < limits.REQUESTS_OF_KEY

@@ -80,7 +80,9 @@ class Unread:
         )
         taken = list(newest.values())[:count] or [every.popleft() for _ in range(count)]
         if len({arrival.stream.codec for arrival in taken}) > 1 or taken[0].stream.codec is None:
-            kinds = [each.codec if each.stream.codec else _identity(each) for each in taken]
+            kinds = [
+                arrival.codec if arrival.stream.codec else _identity(arrival) for arrival in taken
+            ]
             others = [
                 arrival for arrival, kind in zip(taken, kinds, strict=True) if kind != kinds[0]
             ]

@@ -137,20 +137,20 @@ class WriterProxy:
         return request.requested
 
     def on_retransmission(
-        self, found: Mapping[int, Arrival], *, ended: bool, now: float
+        self, answers: Mapping[int, Arrival], *, ended: bool, now: float
     ) -> list[Arrival]:
         """Accept answers to the open request, and return what is in order now; `ended`: no more answers follow."""
         request = self.request
         if request is None:
             return []
-        for number, arrival in found.items():
+        for number, arrival in answers.items():
             if self.expected <= number < request.stop and number not in self.held:
                 self._hold(number, arrival)
-        if found:
+        if answers:
             lowest = request.first_available
-            request.first_available = min(found) if lowest is None else min(lowest, *found)
+            request.first_available = min(answers) if lowest is None else min(lowest, *answers)
             request.last_answered |= (
-                request.requested is not None and request.requested[-1] in found
+                request.requested is not None and request.requested[-1] in answers
             )
         released: list[Arrival] = []
         # else wait for the end, which reveals the lowest number available
