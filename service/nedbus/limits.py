@@ -27,9 +27,129 @@ UNREAD_BYTES: Final = 64 * 2**20
 BATCH_MESSAGES: Final = 4096
 """Messages in a batch in mode `every`, unless `max_messages` is set. Further ones wait for the next batch."""
 
+RING: Final = 16_384
+"""Samples that Zenoh's ring holds between two polls: more than 0.2 s of the largest fleet. Then the oldest drop."""
+
+KEYS: Final = 10_000
+"""Keys tracked by a reader, to bound its memory. Beyond it the least recently active are evicted and counted."""
+
+KEPT_KEYS: Final = 1_000
+"""Keys kept however long they are silent, to count the losses of a long outage. Others follow KEY_SILENCE."""
+
+KEY_SILENCE: Final = 600.0
+"""Seconds without a message or heartbeat. After it a key is evicted, if there are more than KEPT_KEYS."""
+
+DECLARED_KEYS: Final = 1024
+"""Exact keys that a subscription declares to Zenoh, about 1.5 kB each. The messages of others cost more CPU time."""
+
+PUBLISHERS_OF_KEY: Final = 8
+"""Publishers per key. Beyond it the oldest without a gap is evicted; while all have gaps, none is added."""
+
+HELD_MESSAGES: Final = 131_072
+"""Messages held back behind gaps, about 90 MB. Beyond it gaps count as lost, those with most messages first."""
+
+REQUESTING_PUBLISHERS: Final = 10_000
+"""Publishers with open gaps. Beyond it the heartbeat of an unknown publisher opens none."""
+
+ACK_REQUESTS: Final = 1000
+"""Pending acknowledgement requests: a publisher has one per key. Beyond it the oldest gets no answer."""
+
+LOGGED_KEYS: Final = 100
+"""Keys with a logged warning about invalid messages. Those of further keys are only counted."""
+
+BUFFERED_MESSAGES: Final = 1024
+"""Unread messages that keep Zenoh's receive buffer, which saves a copy. Later ones are copied."""
+
+ENCODING_TEXT: Final = 512
+"""Characters kept of an encoding: nedbus's own have at most 250. A longer one is cut, and names no message."""
+
+DEFINITION_FIELDS: Final = 65_536
+"""Fields of all definitions from publishers: PX4's messages have 15 on average. Beyond it unused ones are evicted."""
+
+LAYOUT_FIELDS: Final = 256
+"""Fields of one definition from a publisher. A longer one is ignored."""
+
+REPLY_LAYOUTS: Final = 32
+"""Layouts in one reply of a publisher: five exist. Further ones are ignored."""
+
+UNKNOWN_DEFINITIONS: Final = 64
+"""Definitions per query. As many more may wait for the next one; then the message is invalid."""
+
+FAILED_DEFINITIONS: Final = 1024
+"""Definitions with a failed query, which is repeated with a backoff. Beyond it the oldest backoff is discarded."""
+
+REQUESTS: Final = 64
+"""Retransmission requests in flight for one subscription. Further ones wait."""
+
+HISTORY_REQUESTS: Final = 16
+"""Requests in flight to publishers that have delivered no message yet. Further ones wait."""
+
+REQUESTS_OF_KEY: Final = 4
+"""Requests in flight on one key, whose publishers may never answer. Further ones wait."""
+
+UNREAD_REPORTS: Final = 250
+"""Unread rejection reports, each of at most 16 kB. Beyond it the oldest are dropped."""
+
+REPORT_BYTES: Final = 2**16
+"""Bytes of a rejection report from a peer. A longer one is ignored."""
+
+REPLY_MEMORY: Final = 2**28
+"""Bytes of all parsed replies, estimated: parsed JSON takes up to 32 times its length. Further replies are ignored."""
+
+LINK_CHANGES: Final = 64
+"""Changes of a link between two polls of 0.1 s. Beyond it the oldest are dropped."""
+
+MEASURED_LATENCIES: Final = 1000
+"""Latencies measured per second and stream, to bound the cost. Further messages are only counted."""
+
 # --- Publishers ---
 
+GROUP_MESSAGES: Final = 64
+"""Messages that a lossless publisher hands to Zenoh together, at full speed. Then the next group begins."""
+
+UNUSED_DEFINITIONS: Final = 64
+"""Definitions kept after their publisher closed, for readers with unread messages. Beyond it the oldest goes."""
+
+KNOWN_VEHICLES: Final = 10_000
+"""Vehicles whose permission is remembered. Beyond it the oldest is asked for again."""
+
+QUEUED_QUERIES: Final = 1000
+"""Queued queries per key expression. Beyond it the oldest get no answer."""
+
 # --- Zenoh ---
+
+REPLIES: Final = 10_000
+"""Replies, or tokens, accepted per query: well-behaved peers send fewer. Further ones are ignored and reported."""
+
+QUERY_BYTES: Final = 2**26
+"""Payload and key bytes accepted per query, so that no peer exhausts the memory. Further replies are ignored."""
+
+REPLY_BYTES: Final = 2**18
+"""Bytes of the payload of one reply. Services split longer ones, clients reject them."""
+
+KEY_TEXT: Final = 1024
+"""Characters of a heartbeat's key or a key of ROS 2: twice the longest ones. Longer keys are ignored."""
+
+HEARTBEATS: Final = 4096
+"""Heartbeats in the channel, each of which may keep a receive buffer of 4 kB. Beyond it the oldest is dropped."""
+
+ROUTER_STATE_BYTES: Final = 2**20
+"""Bytes of the state of a router, which then has about 5,700 sessions. A longer reply is ignored."""
+
+ROUTERS: Final = 1000
+"""Routers in an answer: any peer may claim to be one. Further ones are ignored."""
+
+LISTED_TOKENS: Final = 131_072
+"""Replies that wait in Zenoh, which holds its session lock while it waits for a free slot. Further ones wait there."""
+
+TOKEN_CHANGES: Final = 16_384
+"""Queued changes of tokens, more than the tokens stored. Beyond it the oldest is dropped, and all are listed again."""
+
+TOKENS_OF_VEHICLE: Final = 1000
+"""Tokens of one vehicle: two services with all topics of a PX4 declare 500. A vehicle with more is not listed."""
+
+EXCLUDING_KEY_EXPRS: Final = 5000
+"""Key expressions that exclude vehicles, 64 per character of a name. Further vehicles are not excluded."""
 
 # --- Services ---
 

@@ -10,13 +10,13 @@ from contextlib import AbstractAsyncContextManager, suppress
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, Unpack, cast, overload
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, Unpack, overload
 
 from nedbus.errors import ClosedError
 from nedbus.samples import M2, M3, M_co, Mode, Query, Sample, Subscribe
 from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, Definition, Message, Selection, VehicleNames
+from nedbus_msgs import ANY, Definition, Message, VehicleNames
 
 from .async_newest import AsyncNewest
 from .async_subscription import AsyncSubscription
@@ -97,15 +97,19 @@ class AsyncBus:
     def subscribe(
         self, *messages: type[Message] | str, **options: Unpack[Subscribe]
     ) -> AsyncSubscription[Message]: ...
-    def subscribe(self, *message: Any, **options: Any) -> Any:
-        """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
-        # uses only `_subscribe` of `self`
-        return Bus.subscribe(cast("Bus", self), *message, **options)
-
-    def _subscribe(
-        self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None
+    def subscribe(
+        self,
+        *messages: type[Message] | str,
+        topic: str | None = None,
+        vehicle: VehicleNames = ANY,
+        instance: int | None = None,
+        mode: Mode = "latest",
+        max_rate: float | None = None,
+        limit: int | None = None,
     ) -> AsyncSubscription[Any]:
+        """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
         bus = self._blocking
+        selection = select(messages, vehicle, instance, topic)
         inbox = bus._make_inbox(selection, mode, max_rate, limit)
         return AsyncSubscription(partial(self._in_thread, bus._open_receiver, inbox), inbox)
 

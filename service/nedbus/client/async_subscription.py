@@ -17,7 +17,7 @@ from nedbus.transport import require_unforked
 
 from .closing import Finalizer
 from .receiving import Inbox, Receiver
-from .subscription import SubscriptionBase
+from .subscription import Pop, SubscriptionBase
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
@@ -90,7 +90,7 @@ class AsyncSubscription(SubscriptionBase[M_co]):
     async def __aexit__(self, *exc: object) -> None:
         await self.close()
 
-    async def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
+    async def _next(self, pop: Pop[_T], timeout: float | None = None) -> _T:
         self._received += 1
         if self._received % 64 == 0:
             await asyncio.sleep(0)  # otherwise a reader that never waits would starve other tasks
@@ -109,7 +109,7 @@ class AsyncSubscription(SubscriptionBase[M_co]):
         except TimeoutError:
             raise NoDataError(self.name, timeout or 0.0) from None
 
-    async def _each(self, pop: Callable[[], _T | None]) -> AsyncIterator[_T]:
+    async def _each(self, pop: Pop[_T]) -> AsyncIterator[_T]:
         with suppress(ClosedError):
             while True:
                 yield await self._next(pop)

@@ -163,11 +163,7 @@ class Bus(AbstractContextManager["Bus"]):
         Raises ArgumentError for an invalid `mode` or `limit`, if `max_rate` is not a finite number above 0, and for
         `topic` with several messages.
         """
-        return self._subscribe(select(messages, vehicle, instance, topic), mode, max_rate, limit)
-
-    def _subscribe(
-        self, selection: Selection, mode: Mode, max_rate: float | None, limit: int | None
-    ) -> Subscription[Any]:
+        selection = select(messages, vehicle, instance, topic)
         inbox = self._make_inbox(selection, mode, max_rate, limit)
         return Subscription(self._open_receiver(inbox), inbox, owner=self)
 
@@ -303,13 +299,13 @@ class Bus(AbstractContextManager["Bus"]):
         if not is_received:
             raise NoDataError(f"{name}: topics {', '.join(FUSION_TOPICS)}", duration)
         positions = [
-            each
+            position
             for service in self.services()
             for source in service.sources
-            for each in source.positions
+            for position in source.positions
         ]
         return tracker.fusion(
-            name, next((each for each in positions if each.vehicle == name), None)
+            name, next((position for position in positions if position.vehicle == name), None)
         )
 
     def rejections(self) -> Rejections:
@@ -385,7 +381,9 @@ class Bus(AbstractContextManager["Bus"]):
         try:
             if not self.closed and timeout > 0:
                 lossless = [
-                    each for each in tuple(self._publishers.publishers.values()) if each.lossless
+                    publisher
+                    for publisher in tuple(self._publishers.publishers.values())
+                    if publisher.lossless
                 ]
                 with suppress(NedbusError):
                     self._publishers.flush(lossless, timeout=timeout)
@@ -487,5 +485,5 @@ def _vehicle_of(start: str, key: str) -> str:
 
 def _close_all(opened: Iterable[Receiver | LinkWatch]) -> None:
     with ExitStack() as closing:  # closes all, even if one fails
-        for each in list(opened):
-            closing.callback(each.close)
+        for resource in list(opened):
+            closing.callback(resource.close)

@@ -10,32 +10,25 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import zenoh
 from pydantic import TypeAdapter
 from pydantic_core import to_json
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.client.closing import Finalizer
 from nedbus.client.health import Health
 from nedbus.errors import AddressError
 from nedbus.log_event import about
 from nedbus.samples import LogStreamStatus, PositionStatus, UntrustedReply
-from nedbus.transport import MAX_REPLY_BYTES, RawSample, Session, query, translate_zenoh_errors
+from nedbus.transport import RawSample, Session, query, translate_zenoh_errors
 from nedbus_msgs import REJECTED, Address, all_status_keys, parse_status_key
 
 if TYPE_CHECKING:
     from nedbus.vehicle_events import AccountReport
 
 _log = logging.getLogger(__name__)
-
-_MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
-_MAX_REPORT_BYTES: Final = 2**16
-# bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
-_MAX_MEMORY: Final = 2**28
-# Queued reports, each of at most 16 kB, the size limit of sessions; beyond that the oldest are dropped.
-_MAX_REPORTS: Final = 250
 
 
 class Vehicles(dict[str, list[Address]]):
@@ -106,7 +99,7 @@ class SourceStatus(UntrustedReply):
             *self.addresses,
             *self.stale,
             *self.silent,
-            *(each.address for each in self.streams),
+            *(stream.address for stream in self.streams),
         )
         return {_vehicle_of(each) for each in addresses} | {
             each.vehicle for each in self.log_streams
@@ -126,9 +119,11 @@ class SourceStatus(UntrustedReply):
             addresses=tuple(filter(is_named, self.addresses)),
             stale=tuple(filter(is_about, self.stale)),
             silent=tuple(filter(is_about, self.silent)),
-            streams=tuple(each for each in self.streams if is_named(each.address)),
-            log_streams=tuple(each for each in self.log_streams if each.vehicle == vehicle),
-            positions=tuple(each for each in self.positions if each.vehicle == vehicle),
+            streams=tuple(stream for stream in self.streams if is_named(stream.address)),
+            log_streams=tuple(
+                log_stream for log_stream in self.log_streams if log_stream.vehicle == vehicle
+            ),
+            positions=tuple(position for position in self.positions if position.vehicle == vehicle),
         )
 
     @property
@@ -191,11 +186,11 @@ class ServiceStatus(UntrustedReply):
     def split(self, _: int) -> list[ServiceStatus]:
         """Split into one status per source, or omit the stream health of the only one; return [] if neither applies."""
         if len(self.sources) > 1:
-            return [replace(self, sources=(each,)) for each in self.sources]
+            return [replace(self, sources=(source,)) for source in self.sources]
         return [
-            replace(self, sources=(replace(each, streams=()),))
-            for each in self.sources
-            if each.streams
+            replace(self, sources=(replace(source, streams=()),))
+            for source in self.sources
+            if source.streams
         ]
 
 
@@ -218,7 +213,7 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     The list begins with one status of each vehicle and ends with older services. A program that shows only its
     beginning thus leaves out no vehicle because another one claims many services.
     """
-    found: dict[tuple[str | None, str], ServiceStatus] = {}
+    statuses: dict[tuple[str | None, str], ServiceStatus] = {}
     for vehicle, service, content in _find(
         session, all_status_keys(prefix=prefix), prefix=prefix, timeout=timeout
     ):
@@ -226,20 +221,20 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
             continue
         given = _status_type().validate_python(content)
         if vehicle is None:
-            found[vehicle, service] = ServiceStatus(
+            statuses[vehicle, service] = ServiceStatus(
                 service=service, host=given.host, version=given.version
             )
             continue
         part = replace(given.about(vehicle), service=service)
-        known = found.get((vehicle, service))
+        known = statuses.get((vehicle, service))
         sources = part.sources if known is None else (*known.sources, *part.sources)
-        found[vehicle, service] = replace(part, sources=sources)
+        statuses[vehicle, service] = replace(part, sources=sources)
     known_of = Counter[str]()
     ranked: list[tuple[bool, int, ServiceStatus]] = []
-    for status in found.values():
+    for status in statuses.values():
         ranked.append((status.is_outdated, known_of[status.vehicle], status))
         known_of[status.vehicle] += 1
-    ranked.sort(key=lambda each: each[:2])
+    ranked.sort(key=lambda rank: rank[:2])
     return [status for _, _, status in ranked]
 
 
@@ -253,14 +248,14 @@ def find_reports(
     from nedbus.vehicle_events import ACCOUNT_PARAMETER, from_json, joined
 
     selector = f"{all_status_keys(prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
-    found: dict[tuple[str, str], list[AccountReport]] = {}
+    parts: dict[tuple[str, str], list[AccountReport]] = {}
     for vehicle, service, content in _find(session, selector, prefix=prefix, timeout=timeout):
         part = from_json(content)
         if vehicle is not None and part is not None:
-            found.setdefault((vehicle, service), []).append(
+            parts.setdefault((vehicle, service), []).append(
                 replace(part.about(vehicle), service=service)
             )
-    return list(map(joined, found.values()))
+    return list(map(joined, parts.values()))
 
 
 def _find(
@@ -284,7 +279,7 @@ def _find(
         try:
             vehicle, service = parse_status_key(key, prefix=prefix)
         except AddressError:
-            _log.debug("%r: ignored a status with an invalid key", key[:_MAX_TEXT])
+            _log.debug("%r: ignored a status with an invalid key", key[: limits.PEER_TEXT])
         else:
             yield vehicle, service, content
 
@@ -292,14 +287,14 @@ def _find(
 def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
     """Yield a report in JSON parts small enough for readers, which join them; log and omit an oversized part."""
     content = to_json(report, inf_nan_mode="constants")
-    if len(content) <= MAX_REPLY_BYTES:
+    if len(content) <= limits.REPLY_BYTES:
         yield content
-    elif parts := report.split(5 * len(content) // (4 * MAX_REPLY_BYTES) + 1):
+    elif parts := report.split(5 * len(content) // (4 * limits.REPLY_BYTES) + 1):
         for part in parts:
             yield from reply_parts(part)
     else:
         text = "omitted %d bytes of a reply, because readers accept at most %d per part: use fewer or shorter names"
-        _log.warning(text, len(content), MAX_REPLY_BYTES, extra=about("incomplete"))
+        _log.warning(text, len(content), limits.REPLY_BYTES, extra=about("incomplete"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +320,7 @@ class Rejections:
         self._prefix, self._owner = prefix, owner  # the owner keeps the bus open
         with translate_zenoh_errors():
             subscriber = session.declare_subscriber(
-                f"{prefix}{REJECTED}/**", zenoh.handlers.RingChannel(_MAX_REPORTS)
+                f"{prefix}{REJECTED}/**", zenoh.handlers.RingChannel(limits.UNREAD_REPORTS)
             )
         self._handler = subscriber.handler
         self._finalizer = Finalizer(self, subscriber.undeclare)
@@ -333,20 +328,22 @@ class Rejections:
     def take(self) -> list[RejectionReport]:
         """Return the reports received since the last call, at most 250, without waiting."""
         with translate_zenoh_errors():
-            samples = list(islice(iter(self._handler.try_recv, None), _MAX_REPORTS))
+            samples = list(islice(iter(self._handler.try_recv, None), limits.UNREAD_REPORTS))
         reports: list[RejectionReport] = []
         for sample in samples:
             try:
                 address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
                 content = (
                     json.loads(sample.payload.to_bytes())
-                    if len(sample.payload) <= _MAX_REPORT_BYTES
+                    if len(sample.payload) <= limits.REPORT_BYTES
                     else None
                 )
             except (AddressError, ValueError, RecursionError):
                 continue
             if isinstance(content, dict) and (reason := content.get("reason")):
-                reports.append(RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()))
+                reports.append(
+                    RejectionReport(address, str(reason)[: limits.PEER_TEXT], clock.utc_ns())
+                )
         return reports
 
     def close(self) -> None:
@@ -356,7 +353,7 @@ class Rejections:
 
 def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     """Yield key and content of JSON replies within the memory limit; log the discarded ones, one line per reason."""
-    free = _MAX_MEMORY
+    free = limits.REPLY_MEMORY
     oversized = 0
     invalid = ""
     for raw in replies:
@@ -365,19 +362,19 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
         size = (
             4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
         )
-        if len(text) > MAX_REPLY_BYTES or size > free:
+        if len(text) > limits.REPLY_BYTES or size > free:
             oversized += 1
             continue
         free -= size
         try:
             content = json.loads(text)
         except (ValueError, RecursionError):
-            invalid = invalid or key[:_MAX_TEXT]
+            invalid = invalid or key[: limits.PEER_TEXT]
         else:
             yield key, content
     if oversized:
         warning = "ignored replies over %d bytes or over the memory limit (%d in total): the result is incomplete"
-        _log.warning(warning, MAX_REPLY_BYTES, oversized, extra=about("incomplete"))
+        _log.warning(warning, limits.REPLY_BYTES, oversized, extra=about("incomplete"))
     if invalid:
         _log.warning(
             "%r: ignored a reply that is not JSON",

@@ -15,7 +15,7 @@ from itertools import pairwise
 from statistics import fmean, median
 from typing import Any, Final, Literal, get_args
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.clock import format_duration
 from nedbus.samples import Sample
 from nedbus.timings import TIMINGS
@@ -40,14 +40,13 @@ _MIN_STEPS: Final = 5  # intervals before the usual one is known
 # latest intervals, whose median is the usual one: half as many long ones are a lasting change
 _USUAL: Final = 15
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual rate
-_MAX_MEASURED: Final = 1000  # latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 # messages that wait to be measured together, which takes half the time of one after the other
 _BATCH: Final = 32
 # Hz; below it, a topic without a nominal rate may be published on change
 _MIN_PERIODIC_RATE: Final = 1.0
 # share of intervals over three times or under a third of the usual one; more: on change
-_MAX_IRREGULAR: Final = 0.2
+_IRREGULAR: Final = 0.2
 _RECENT: Final = 60.0  # s after a reboot until a description no longer mentions it
 # s, bucket limits
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -147,7 +146,7 @@ class _Window:
     messages: int = 0
     # number, mean [s], sum of squared differences from the mean
     intervals: tuple[int, float, float] = (0, 0.0, 0.0)
-    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=limits.MEASURED_LATENCIES))
     flags: _FlagCounts = field(default_factory=Counter)
     _sorted: list[float] | None = None  # the latencies; None after a new one
 
@@ -276,10 +275,12 @@ class StreamHealth:
             if latency is not None:
                 window.add_latency(latency)
                 self._latencies.add(latency)
-        for each, absent, arrived in zip(values, missing, received, strict=True):
-            rebooted = self._add_time(int(each[0]), arrived)
+        for fields, absent, arrived in zip(values, missing, received, strict=True):
+            rebooted = self._add_time(int(fields[0]), arrived)
             if self._is_position:
-                self._add_position(each[1:_COUNTERS], each[_COUNTERS:], absent, rebooted=rebooted)
+                self._add_position(
+                    fields[1:_COUNTERS], fields[_COUNTERS:], absent, rebooted=rebooted
+                )
 
     def _begin_window(self, received: int) -> None:
         if self._window.messages:
@@ -428,7 +429,7 @@ class StreamHealth:
 def _is_regular(steps: Collection[int], usual: float) -> bool:
     """Return whether these intervals are those of a periodic stream; `usual`: their median."""
     outliers = sum(not usual / _FACTOR <= step <= usual * _FACTOR for step in steps)
-    return usual > 0 and outliers <= _MAX_IRREGULAR * len(steps)
+    return usual > 0 and outliers <= _IRREGULAR * len(steps)
 
 
 @dataclass(frozen=True, slots=True)

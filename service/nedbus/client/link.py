@@ -4,16 +4,13 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from itertools import islice
-from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.transport import Session, translate_zenoh_errors
 
 from .io_thread import TICK, CallThread, Job
-
-MAX_LINK_CHANGES: Final = 64
-"""Changes of a link between two polls of 0.1 s; beyond that the oldest are dropped."""
 
 _calls = CallThread("nedbus-callbacks")
 
@@ -57,7 +54,7 @@ class LinkWatch:
         self.callbacks: set[LinkCallback] = set()  # changed by single atomic calls
         with translate_zenoh_errors():
             changes: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(
-                MAX_LINK_CHANGES
+                limits.LINK_CHANGES
             )
             self._listener = session.info.declare_transport_events_listener(changes, history=False)
         _calls.start()
@@ -77,7 +74,7 @@ class LinkWatch:
 
     def _poll(self, _: float) -> float:
         with suppress(zenoh.ZError):  # undeclared
-            for event in islice(iter(self._listener.handler.try_recv, None), MAX_LINK_CHANGES):
+            for event in islice(iter(self._listener.handler.try_recv, None), limits.LINK_CHANGES):
                 for callback in tuple(self.callbacks):
                     callback.on_state(event.kind == zenoh.SampleKind.PUT)
         return TICK

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.errors import ArgumentError, ClosedError, NoDataError
 from nedbus.log_event import about
 from nedbus.samples import Counts, M_co, Sample
@@ -21,7 +21,7 @@ from nedbus.transport import Publishers, require_unforked
 from nedbus_msgs import ANY, Address, Message, topic_of
 
 from .health import ABSENT, Health, Histogram, StreamHealth, health_of_last, silence_of
-from .receiving import MAX_KEYS, Inbox, Receiver
+from .receiving import Inbox, Receiver
 from .subscription import Subscription
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ _log = logging.getLogger(__name__)
 
 _M = TypeVar("_M", bound=Message)
 _NETWORK_INTERVAL: Final = 1.0  # s between two looks at the link and at the list of publishers
-_MAX_NAMED: Final = 5  # streams in an error
 
 
 @dataclass(slots=True)
@@ -181,7 +180,7 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
                 )
             streams = self._by_topic.get(topic, {})
             if len(streams) > 1:
-                names = ", ".join(map(str, islice(sorted(streams), _MAX_NAMED)))
+                names = ", ".join(map(str, islice(sorted(streams), limits.SHOWN_NAMES)))
                 raise ArgumentError(
                     "topic", topic, f"an address, such as {names}", problem="has several streams"
                 )
@@ -239,7 +238,7 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         with self._lock:
             stream = self._streams.pop(address, None)
             if stream is None:
-                if len(self._streams) >= MAX_KEYS:
+                if len(self._streams) >= limits.KEYS:
                     self._evict()
                 stream = self._by_topic[address.topic][address] = NewestMessage(sample, self._view)
                 self._sorted = None
@@ -277,7 +276,7 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
     def _evict(self) -> None:
         if not self.evicted:
             text = "more than %d streams: the least recently updated ones are discarded, with their health"
-            _log.warning(text, MAX_KEYS, extra=about("incomplete"))
+            _log.warning(text, limits.KEYS, extra=about("incomplete"))
         self.evicted += 1
         self._remove(next(iter(self._streams)))
 
@@ -317,7 +316,7 @@ class NewestBase(Monitor):
         ended = self._inbox.ended  # before `pop`, as in Subscription
         self._view.number += 1
         popped = (self._inbox.pop() for _ in range(self._inbox.waiting))
-        arrived = [*samples, *(each for each in popped if each is not None)]
+        arrived = [*samples, *(sample for sample in popped if sample is not None)]
         if ended and not arrived:
             raise self._inbox.end_error
         # two samples of a stream are one piece of news

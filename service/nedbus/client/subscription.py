@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
+# returns the next item, first that of the given message; None if there is none
+Pop = Callable[..., _T | None]
+
 
 class SubscriptionBase(Generic[M_co]):
     """State and counts of a subscription, blocking or asynchronous."""
@@ -30,7 +33,7 @@ class SubscriptionBase(Generic[M_co]):
     def __init__(self, inbox: Inbox) -> None:
         self.name = inbox.name
         self._inbox = inbox
-        self._pop_row = partial(inbox.pop, True)
+        self._pop_row = partial(inbox.pop, rows=True)
 
     @property
     def closed(self) -> bool:
@@ -47,9 +50,9 @@ class SubscriptionBase(Generic[M_co]):
         """Number of received messages not yet read."""
         return self._inbox.waiting
 
-    def _pop_batch(self, max_messages: int | None) -> Callable[[], Batch | None]:
+    def _pop_batch(self, max_messages: int | None) -> Pop[Batch]:
         check_count("max_messages", max_messages)
-        return partial(self._inbox.pop_batch, max_messages)
+        return partial(self._inbox.pop_batch, max_messages=max_messages)
 
 
 class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[M_co]"]):
@@ -117,24 +120,27 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
+    def _next(self, pop: Pop[_T], timeout: float | None = None) -> _T:
         require_unforked()
-        deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
+        deadline = None
+        if timeout is not None and timeout != math.inf:
+            deadline = time.monotonic() + timeout
         if self._inbox.newest_only:
             self._receiver.receive()  # newer samples may be in the ring
+        arrival = None
         while True:
             ended = self._inbox.ended  # before `pop`: all that was received is in the inbox then
-            item = pop()
+            item = pop(arrival)
             if item is not None:
                 return item
             if ended:
                 raise self._inbox.end_error
-            if not self._receiver.wait(
-                None if deadline is None else max(0.0, deadline - time.monotonic())
-            ):
+            if deadline is None:
+                arrival = self._receiver.receive_next()
+            elif not self._receiver.wait(max(0.0, deadline - time.monotonic())):
                 raise NoDataError(self.name, timeout or 0.0)
 
-    def _each(self, pop: Callable[[], _T | None]) -> Iterator[_T]:
+    def _each(self, pop: Pop[_T]) -> Iterator[_T]:
         with suppress(ClosedError):
             while True:
                 yield self._next(pop)

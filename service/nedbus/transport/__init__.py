@@ -6,7 +6,7 @@ from nedbus.extras import lazy_exports
 
 from .key_reader import KeyReader
 from .liveliness import LivelinessTokens, token_keys
-from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
+from .queries import Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
@@ -29,7 +29,6 @@ from .router import (
 )
 from .router_log import Uplinks, log_refusals
 from .session import (
-    MAX_REPLY_BYTES,
     RawSample,
     Session,
     entity_name,

@@ -77,9 +77,9 @@ class AccessControl:
                 self._subjects[certificate].append(subject["id"])
         self._limited = [
             zenoh.KeyExpr(key)
-            for each in filters
-            if "put" in each["messages"] and "ingress" in (each["flows"] or _BOTH_FLOWS)
-            for key in each["key_exprs"]
+            for rule in filters
+            if "put" in rule["messages"] and "ingress" in (rule["flows"] or _BOTH_FLOWS)
+            for key in rule["key_exprs"]
         ]
 
     @property

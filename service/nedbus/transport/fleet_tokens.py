@@ -16,21 +16,18 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
+from nedbus import limits
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, Selection
 
 from .liveliness import LivelinessTokens, query_tokens
-from .queries import MAX_REPLIES, Replies
+from .queries import Replies
 from .session import Session
 
 _log = logging.getLogger(__name__)
 
-# of one vehicle; two services that publish all topics of a PX4 declare 500
-_MAX_TOKENS: Final = 1000
-# 64 per character of an excluded name; further vehicles are not excluded
-_MAX_KEY_EXPRS: Final = 5000
 _CHARACTERS: Final = string.ascii_letters + string.digits + "_-"
 _LONGEST_NAME: Final = 64  # characters; peers may use longer ones
 _QUERY_TIMEOUT: Final = 60.0  # s
@@ -76,32 +73,35 @@ class FleetTokens:
 
     def poll(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, like LivelinessTokens."""
-        tokens = [reply.ok for each in self._survey for reply in each.poll()]
-        found = [(str(token.key_expr), True) for token in tokens if token is not None]
+        tokens = [reply.ok for query in self._survey for reply in query.poll()]
+        listed = [(str(token.key_expr), True) for token in tokens if token is not None]
         changes = [
             change
-            for change in (found if self._survey else self._tokens.poll())
+            for change in (listed if self._survey else self._tokens.poll())
             if self._apply(*change)
         ]
         now = time.monotonic()
         crowded = (
-            {name for name, number in self._numbers.items() if number > _MAX_TOKENS}
+            {name for name, number in self._numbers.items() if number > limits.TOKENS_OF_VEHICLE}
             if changes
             else set()
         )
-        if crowded and len(self._key_exprs(self._excluded | crowded)) <= _MAX_KEY_EXPRS:
+        if crowded and len(self._key_exprs(self._excluded | crowded)) <= limits.EXCLUDING_KEY_EXPRS:
             text = "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
             _log.warning(
-                text, ", ".join(map(repr, sorted(crowded))), _MAX_TOKENS, extra=about("incomplete")
+                text,
+                ", ".join(map(repr, sorted(crowded))),
+                limits.TOKENS_OF_VEHICLE,
+                extra=about("incomplete"),
             )
             self._excluded |= crowded
             self._retry = now + TIMINGS.excluded
             gone = [(key, False) for key in self._keys if self._vehicle_of(key) in crowded]
             changes += [change for change in gone if self._apply(*change)]
             self._restart(self._subscribe)
-        elif self._survey and all(each.ended for each in self._survey):
-            is_complete = len(self._keys) < MAX_REPLIES and not any(
-                each.failed for each in self._survey
+        elif self._survey and all(query.ended for query in self._survey):
+            is_complete = len(self._keys) < limits.REPLIES and not any(
+                query.failed for query in self._survey
             )
             self._restart(partial(self._subscribe, is_surveyed=is_complete))
             self._slow = math.inf  # no vehicle has too many
@@ -132,7 +132,7 @@ class FleetTokens:
     def _query(self) -> None:
         key_exprs = self._key_exprs(self._excluded)
         self._survey = [
-            query_tokens(self._session, each, timeout=_QUERY_TIMEOUT) for each in key_exprs
+            query_tokens(self._session, key_expr, timeout=_QUERY_TIMEOUT) for key_expr in key_exprs
         ]
 
     def _key_exprs(self, excluded: Set[str]) -> list[str]:
@@ -140,7 +140,7 @@ class FleetTokens:
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
-        if (key in self._keys) == alive or (alive and len(self._keys) >= MAX_REPLIES):
+        if (key in self._keys) == alive or (alive and len(self._keys) >= limits.REPLIES):
             return False
         (self._keys.add if alive else self._keys.remove)(key)
         self._numbers[vehicle := self._vehicle_of(key)] += 1 if alive else -1
@@ -160,8 +160,8 @@ def key_exprs_without(excluded: Set[str], selection: Selection, *, prefix: str) 
             return [f"{prefix}/{selection.vehicles[0]}/@alive/-"]  # no token
         return Selection(selection.topics, kept, selection.instance).alive_key_exprs(prefix=prefix)
     starts = {name[:length] for name in excluded for length in range(len(name) + 1)}
-    short = [each for each in starts if len(each) <= _LONGEST_NAME]
-    names = {f"{each}{c}$*" for each in short for c in _CHARACTERS if each + c not in starts}
+    short = [start for start in starts if len(start) <= _LONGEST_NAME]
+    names = {f"{start}{c}$*" for start in short for c in _CHARACTERS if start + c not in starts}
     names |= starts - excluded - {""}
     return [
         tokens.replace(f"/{ANY}/", f"/{name}/", 1)

@@ -11,18 +11,16 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
-from .queries import MAX_QUERY_BYTES, MAX_REPLIES, Replies, wait_for_replies, zenoh_timeout
+from .queries import Replies, wait_for_replies, zenoh_timeout
 from .session import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-# replies; large, because Zenoh holds its session lock while it waits for a free slot
-_MAX_PENDING: Final = 131_072
-_MAX_CHANGES: Final = 16_384  # queued changes; more than the tokens stored
-_MAX_KEY_LENGTH: Final = MAX_QUERY_BYTES // MAX_REPLIES
+_LONGEST_KEY: Final = limits.QUERY_BYTES // limits.REPLIES
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
 
 
@@ -30,7 +28,7 @@ def token_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
     replies = wait_for_replies([query_tokens(session, key_expr, timeout=timeout)])
     return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[
-        :MAX_REPLIES
+        : limits.REPLIES
     ]
 
 
@@ -93,7 +91,7 @@ class LivelinessTokens:
                     (str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
                     for sample in received
                 ]
-        is_retry_due = len(self._keys) < MAX_REPLIES and time.monotonic() >= self._retry
+        is_retry_due = len(self._keys) < limits.REPLIES and time.monotonic() >= self._retry
         if is_overflow or is_retry_due:  # changes were dropped, or there is room again
             self.undeclare()
             self._subscribe()
@@ -104,7 +102,9 @@ class LivelinessTokens:
         return [change for change in changes if self._apply(*change)]
 
     def _subscribe(self) -> None:
-        self._capacity = max(_MAX_CHANGES // len(self._key_exprs), min(_MAX_CHANGES, 256))
+        self._capacity = max(
+            limits.TOKEN_CHANGES // len(self._key_exprs), min(limits.TOKEN_CHANGES, 256)
+        )
         with translate_zenoh_errors():
             declare = self._session.liveliness().declare_subscriber
             self._subscribers = [
@@ -118,12 +118,12 @@ class LivelinessTokens:
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
-        if (key in self._keys) == alive or len(key) > _MAX_KEY_LENGTH:
+        if (key in self._keys) == alive or len(key) > _LONGEST_KEY:
             return False
-        if alive and len(self._keys) >= MAX_REPLIES:
+        if alive and len(self._keys) >= limits.REPLIES:
             if self._retry == math.inf:
                 text = "%s: more than %d liveliness tokens, so some streams are missing"
-                _log.warning(text, self._key_exprs[0], MAX_REPLIES, extra=about("incomplete"))
+                _log.warning(text, self._key_exprs[0], limits.REPLIES, extra=about("incomplete"))
             self._retry = time.monotonic() + TIMINGS.tokens_retry
             return False
         (self._keys.add if alive else self._keys.remove)(key)
@@ -135,6 +135,6 @@ def query_tokens(session: Session, key_expr: str, *, timeout: float) -> Replies:
     timeout = zenoh_timeout(timeout)
     with translate_zenoh_errors():
         replies = session.liveliness().get(
-            key_expr, zenoh.handlers.FifoChannel(_MAX_PENDING), timeout=timeout
+            key_expr, zenoh.handlers.FifoChannel(limits.LISTED_TOKENS), timeout=timeout
         )
     return Replies(replies, timeout=timeout)

@@ -13,17 +13,12 @@ from typing import Any, Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.log_event import about
 
 from .session import RawSample, Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
-
-MAX_REPLIES: Final = 10_000
-"""Replies accepted per query; well-behaved peers send fewer."""
-
-MAX_QUERY_BYTES: Final = 2**26
-"""Payload and key bytes accepted per query."""
 
 _GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
 _PAUSES: Final = (0.0005, 0.01)  # s between polls for replies: first and longest pause
@@ -43,7 +38,9 @@ class Replies:
         """Return the replies received since the last call."""
         received: list[zenoh.Reply] = []
         try:
-            while len(received) < MAX_REPLIES and (reply := self._handler.try_recv()) is not None:
+            while (
+                len(received) < limits.REPLIES and (reply := self._handler.try_recv()) is not None
+            ):
                 received.append(reply)
                 self.failed |= reply.ok is None
             if time.monotonic() > self._end:
@@ -113,7 +110,7 @@ class _Accepted:
         self._count(group, sample, 1)
         if self._used[group] >= self._used[self._largest]:
             self._largest = group
-        while self._size > MAX_QUERY_BYTES or self.count > MAX_REPLIES:
+        while self._size > limits.QUERY_BYTES or self.count > limits.REPLIES:
             self._count(self._largest, self.groups[self._largest].pop(), -1)
             self.dropped += 1
             if self._largest != group:  # else the next reply of a flood needs no search
@@ -128,7 +125,7 @@ class _Accepted:
         size = len(sample.payload) + len(str(sample.key_expr))
         self.count += sign
         self._size += sign * size
-        self._used[group] += sign * (size + MAX_QUERY_BYTES // MAX_REPLIES)
+        self._used[group] += sign * (size + limits.QUERY_BYTES // limits.REPLIES)
 
 
 def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:

@@ -15,6 +15,7 @@ from typing import Final, Literal, Self
 
 import xxhash
 
+from nedbus import limits
 from nedbus_msgs import DecodeError
 
 NO_HASH: Final = "TypeHashNotSupported"
@@ -26,10 +27,9 @@ BRIDGED_ENCODING: Final = "application/cdr;nedbus"
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10, as PX4 publishes
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16  # bytes
-_MAX_KEY: Final = 512  # characters; twice the longest keys of PX4 and ROS 2
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
-LONGEST_TOKEN: Final = 2 * _MAX_KEY  # characters; tokens of ROS 2 are shorter
+LONGEST_TOKEN: Final = limits.KEY_TEXT  # characters; tokens of ROS 2 are shorter
 # key expression chunk for the DDS types of PX4 and of its message translation node
 PX4_TYPES: Final = "px4_msgs$*"
 
@@ -46,10 +46,10 @@ class TopicKey:
     @classmethod
     def parse(cls, key: str) -> Self:
         """Parse a key of rmw_zenoh; raise DecodeError for any other key."""
-        found = _KEY.fullmatch(key) if len(key) <= _MAX_KEY and "//" not in key else None
-        if found is None:
+        match = _KEY.fullmatch(key) if len(key) <= limits.KEY_TEXT and "//" not in key else None
+        if match is None:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
-        return cls(int(found[1]), found[2], found[3], found[4])
+        return cls(int(match[1]), match[2], match[3], match[4])
 
     def token(self, kind: Literal["MP", "MS"], session: str, node: str, entity: int) -> str:
         """Return the liveliness token of a node's publisher (MP), which ROS 2 lists, or of its subscription (MS)."""
@@ -117,8 +117,8 @@ class PublisherToken:
     @property
     def gid(self) -> bytes | None:
         """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same gid."""
-        found = _PX4_NODE.fullmatch(self.node)
-        return bytes.fromhex(found[1]) if found else None
+        match = _PX4_NODE.fullmatch(self.node)
+        return bytes.fromhex(match[1]) if match else None
 
 
 def gid_of_token(token: str) -> bytes:

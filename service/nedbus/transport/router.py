@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
+from nedbus import limits
 from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
@@ -40,9 +41,7 @@ _log = logging.getLogger(__name__)
 # open files other than sessions: 21 of a router, plus sources and HTTP clients of a service
 _OTHER_FILES: Final = 100
 _ADMIN_KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
-_MAX_STATE_BYTES: Final = 2**20  # a reply with about 5,700 sessions
-_MAX_SESSIONS: Final = 2**32  # largest limit accepted from a router
-_MAX_ROUTERS: Final = 1000  # routers returned, because any peer may claim to be one
+_LARGEST_LIMIT: Final = 2**32  # of sessions, accepted from a router
 
 
 def open_router(
@@ -175,8 +174,8 @@ def _get(config: zenoh.Config, key: str) -> Any:
 
 
 def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
-    found = _get(config, f"{name}/endpoints")
-    return tuple(found.get("router", ()) if isinstance(found, dict) else found or ())
+    endpoints = _get(config, f"{name}/endpoints")
+    return tuple(endpoints.get("router", ()) if isinstance(endpoints, dict) else endpoints or ())
 
 
 def _tls_files(config: zenoh.Config) -> dict[str, Path]:
@@ -246,25 +245,25 @@ def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     2**18 bytes for a client, about 1,400 sessions.
     """
     replies = query(session, "@/*/router", timeout=timeout)
-    small = (reply for reply in replies if len(reply.payload) <= _MAX_STATE_BYTES)
+    small = (reply for reply in replies if len(reply.payload) <= limits.ROUTER_STATE_BYTES)
     states = filter(
         None, (parse_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small)
     )
     by_zid = {state.zid: state for state in states}
-    return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
+    return [by_zid[zid] for zid in sorted(islice(by_zid, limits.ROUTERS))]
 
 
 def parse_state(key: str, payload: bytes) -> RouterState | None:
     """Parse a reply of the admin space; return None if it is malformed, because any peer may reply."""
-    found = _ADMIN_KEY.fullmatch(key)
+    match = _ADMIN_KEY.fullmatch(key)
     try:
         state = json.loads(payload)
     except (ValueError, RecursionError):
         return None
     sessions = state.get("sessions") if isinstance(state, dict) else None
-    if found is None or not isinstance(sessions, list):
+    if match is None or not isinstance(sessions, list):
         return None
     metadata = state.get("metadata")
     limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
-    is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # not a bool
-    return RouterState(found[1], len(sessions), limit if is_limit else None)
+    is_limit = type(limit) is int and 0 < limit <= _LARGEST_LIMIT  # not a bool
+    return RouterState(match[1], len(sessions), limit if is_limit else None)

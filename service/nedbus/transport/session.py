@@ -15,6 +15,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.endpoints import check_endpoints, resolution_error, split_endpoint
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 from nedbus.timings import TIMINGS
@@ -53,8 +54,6 @@ COMMON_SETTINGS: Final = {
         },
     ],
 }
-# payload of a reply: services split longer ones, clients reject them
-MAX_REPLY_BYTES: Final = 2**18
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # backoff between the first attempts to connect [s]
 
@@ -111,7 +110,7 @@ def open_client(
         # Longer than any wait for tokens: at this timeout, Zenoh reports an unfinished list as complete.
         "routing/interests/timeout": 120_000,
         # Including key and headers; larger messages from peers are rejected.
-        "transport/link/rx/max_message_size": MAX_REPLY_BYTES + 2**12,
+        "transport/link/rx/max_message_size": limits.REPLY_BYTES + 2**12,
     }
     timeout = math.inf if timeout is None else timeout
     end = time.monotonic() + timeout
@@ -150,10 +149,10 @@ def _tls_ports(endpoints: Sequence[str]) -> list[str]:
     parts = {endpoint: split_endpoint(endpoint) for endpoint in endpoints}
     return [
         endpoint
-        for endpoint, found in parts.items()
-        if found is not None
-        and found[0] == "tcp"
-        and read_certificate(found[1], found[2], TIMINGS.tls_hint)
+        for endpoint, part in parts.items()
+        if part is not None
+        and part[0] == "tcp"
+        and read_certificate(part[1], part[2], TIMINGS.tls_hint)
     ]
 
 
@@ -208,5 +207,5 @@ def translate_error(error: zenoh.ZError) -> NedbusError:
 def error_reason(error: zenoh.ZError) -> str:
     """Return the reason reported by the operating system, else the whole text without source paths."""
     text = re.sub(r" at /\S+", "", str(error)).strip()
-    found = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
-    return found[1].lower() if found else text
+    match = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
+    return match[1].lower() if match else text

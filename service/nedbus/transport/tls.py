@@ -93,7 +93,8 @@ class Tls:
             if not peer.get_ca_certs():
                 return f"{self.ca} is not a CA certificate: it cannot sign others"
             until = max(
-                ssl.cert_time_to_seconds(str(each["notAfter"])) for each in peer.get_ca_certs()
+                ssl.cert_time_to_seconds(str(certificate["notAfter"]))
+                for certificate in peer.get_ca_certs()
             )
             return f"{self.ca} has expired" if until < clock.utc() else None
         ours.check_hostname = False
@@ -134,11 +135,11 @@ def check_pem(path: str | Path, kind: str) -> None:
     text = Path(path).read_text(errors="replace")
     labels = _LABEL.findall(text)
     if not any(label.endswith(kind) for label in labels):
-        found = (
+        problem = (
             f"contains a {labels[0].lower()}" if labels else "is not PEM" if text else "is empty"
         )
         hint = "check whether two files are swapped" if labels else "create one with 'nedbus pki'"
-        raise ConfigError("tls", f"{path} {found}, but a {kind.lower()} is required: {hint}")
+        raise ConfigError("tls", f"{path} {problem}, but a {kind.lower()} is required: {hint}")
 
 
 def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:

@@ -13,17 +13,14 @@ from typing import Final
 
 import zenoh
 
-from .queries import MAX_REPLIES, send_query
+from nedbus import limits
+
+from .queries import send_query
 from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
 Heartbeats = dict[tuple[str, str], int]  # newest sequence number by key and publisher
 
-# Heartbeats in the channel. Each may keep a receive buffer in memory, of which 4 kB or more are in use.
-# A lost heartbeat is followed by another.
-_MAX_HEARTBEATS: Final = 4096
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
-# characters of a heartbeat key; longer keys are ignored, because keys are cached
-_MAX_KEY: Final = 1024
 _PAYLOAD_BYTES: Final = 4
 _SPARE: Final = 64  # slots for unexpected replies of other publishers
 
@@ -44,14 +41,14 @@ def follow_heartbeats(
     """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
     with translate_zenoh_errors():
         key = f"{key_expr}/@adv/pub/**"
-        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_MAX_HEARTBEATS))
+        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(limits.HEARTBEATS))
 
     def drain() -> Heartbeats:
         newest: Heartbeats = {}
         with suppress(zenoh.ZError):  # already undeclared
-            for heartbeat in islice(iter(subscriber.handler.try_recv, None), _MAX_HEARTBEATS):
+            for heartbeat in islice(iter(subscriber.handler.try_recv, None), limits.HEARTBEATS):
                 key, payload = str(heartbeat.key_expr), heartbeat.payload.to_bytes()
-                publisher = _parse_key(key) if len(key) <= _MAX_KEY else None
+                publisher = _parse_key(key) if len(key) <= limits.KEY_TEXT else None
                 # peers may send malformed heartbeats
                 if publisher is not None and len(payload) == _PAYLOAD_BYTES:
                     newest[publisher] = int.from_bytes(payload, "little")
@@ -62,8 +59,8 @@ def follow_heartbeats(
 
 @lru_cache(1024)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
-    found = _KEY.fullmatch(heartbeat)
-    return None if found is None else (found[1], f"{found[2]}:{found[3]}")
+    match = _KEY.fullmatch(heartbeat)
+    return None if match is None else (match[1], f"{match[2]}:{match[3]}")
 
 
 class RetransmitRequest:
@@ -80,7 +77,7 @@ class RetransmitRequest:
         self._publisher = publisher
         self._numbers = numbers
         selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
-        capacity = min(len(numbers), MAX_REPLIES) + _SPARE
+        capacity = min(len(numbers), limits.REPLIES) + _SPARE
         any_key = zenoh.ReplyKeyExpr.ANY
         self._replies = send_query(
             session, selector, timeout=timeout, capacity=capacity, accept_replies=any_key

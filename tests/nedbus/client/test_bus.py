@@ -221,7 +221,7 @@ def test_truncated_list_of_vehicles_is_incomplete_and_logged(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A list of vehicles truncated at the limit is incomplete and logged once; it is complete once all vehicles fit."""
-    monkeypatch.setattr(liveliness, "MAX_REPLIES", 2)
+    monkeypatch.setattr("nedbus.limits.REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with nedbus.connect(endpoint) as other:
@@ -353,7 +353,7 @@ def test_memory_for_parsed_status_is_bounded(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Parsed JSON may need 30 times its length: replies beyond the memory limit, here 4 MiB, are ignored and logged."""
-    monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
+    monkeypatch.setattr("nedbus.limits.REPLY_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
     with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with_statuses(many)):
@@ -407,7 +407,7 @@ def test_bytes_of_replies_are_bounded(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The bytes of replies to one query are bounded, and the number of ignored replies is logged."""
-    monkeypatch.setattr("nedbus.transport.queries.MAX_QUERY_BYTES", 10_500)
+    monkeypatch.setattr("nedbus.limits.QUERY_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
     with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with_statuses(many)):
@@ -421,7 +421,7 @@ def test_flood_of_statuses_hides_no_other_vehicle(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, *, key: str
 ) -> None:
     """Statuses on keys of one vehicle, or on those without a vehicle, use up the limits without hiding vehicle 2."""
-    monkeypatch.setattr("nedbus.transport.queries.MAX_REPLIES", 40)
+    monkeypatch.setattr("nedbus.limits.REPLIES", 40)
     own = json.dumps(
         {"host": "h", "refused": ["3"], "sources": [{"warnings": ["x" * 500]}]}
     ).encode()
@@ -439,7 +439,7 @@ def test_memory_for_replies_is_taken_from_the_largest_vehicle(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Statuses of vehicle 1 that fill the memory for parsed replies, and arrive first, leave that of vehicle 2."""
-    monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**14)
+    monkeypatch.setattr("nedbus.limits.REPLY_MEMORY", 2**14)
     flood = {f"nedbus/@service/1/x{number}/status": b'{"host": "h"}' for number in range(200)}
     answers = {**flood, "nedbus/@service/2/own/status": b'{"host": "honest"}'}
     with answer_queries(zenoh_session, "nedbus/@service/**/status", reply_with(answers)):
@@ -477,7 +477,7 @@ def test_vehicle_with_many_streams_hides_no_other(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Beyond the limits of a query for last messages, the vehicle with the most loses some; no other vehicle does."""
-    monkeypatch.setattr("nedbus.transport.queries.MAX_REPLIES", 5)
+    monkeypatch.setattr("nedbus.limits.REPLIES", 5)
     for instance in range(20):
         bus.publisher("estimator_local_position", vehicle="loud", instance=instance).publish(
             {"timestamp": 1}

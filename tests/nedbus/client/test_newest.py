@@ -14,8 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 import nedbus
-from nedbus import Sample, SensorGps, VehicleAttitude
-from nedbus.client.receiving import MAX_KEYS
+from nedbus import Sample, SensorGps, VehicleAttitude, limits
 from nedbus.errors import AddressError, ArgumentError, ClosedError, ReceiveError
 from nedbus.health import Monitor
 from nedbus.timings import Timings
@@ -105,12 +104,12 @@ def test_number_of_monitored_streams_is_bounded() -> None:
             monitor.add(real)
     streams = monitor.snapshot()
     assert (len(streams), streams[real.address].messages, monitor.evicted) == (
-        MAX_KEYS,
+        limits.KEYS,
         1090,
-        10_901 - MAX_KEYS,
+        10_901 - limits.KEYS,
     )
-    assert flood[1 - MAX_KEYS].address in streams
-    assert flood[-MAX_KEYS].address not in streams
+    assert flood[1 - limits.KEYS].address in streams
+    assert flood[-limits.KEYS].address not in streams
     monitor.forget(real.address)
     assert real.address not in monitor.snapshot()
 
@@ -259,7 +258,7 @@ def test_network_is_asked_again_after_a_second(monkeypatch: pytest.MonkeyPatch) 
 
 def test_messages_are_read_while_others_are_added(monkeypatch: pytest.MonkeyPatch) -> None:
     """One thread adds and evicts streams; others iterate, look up and measure meanwhile."""
-    monkeypatch.setattr("nedbus.client.newest.MAX_KEYS", 20)
+    monkeypatch.setattr("nedbus.limits.KEYS", 20)
     monitor, first = Monitor(), sample("1")
 
     def add() -> None:
@@ -370,7 +369,7 @@ def test_more_streams_than_the_limit_in_one_update(
     bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`update` returns every message that it has read, although the least recently updated streams are evicted."""
-    monkeypatch.setattr("nedbus.client.newest.MAX_KEYS", 3)
+    monkeypatch.setattr("nedbus.limits.KEYS", 3)
     publishers = [bus.publisher(VLP, vehicle=number) for number in range(5)]
     with bus.newest() as view:
         for publisher in publishers:

@@ -11,10 +11,10 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
+from nedbus import limits
 from nedbus.client import ServiceStatus, SourceStatus, StreamHealth, StreamStatus, reply_parts
 from nedbus.monitoring.pages import vehicles_page
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_REPLY_BYTES
 from nedbus.vehicle_events import (
     ALL,
     KEPT,
@@ -142,8 +142,8 @@ def test_large_report_is_sent_in_parts() -> None:
             flight.send(vehicle=f"vehicle-{number}", **faults)
     sent = report(flight)
     parts = list(reply_parts(sent))
-    assert sum(map(len, parts)) > 2 * MAX_REPLY_BYTES
-    assert max(map(len, parts)) <= MAX_REPLY_BYTES
+    assert sum(map(len, parts)) > 2 * limits.REPLY_BYTES
+    assert max(map(len, parts)) <= limits.REPLY_BYTES
     read = [from_json(json.loads(part)) for part in parts]
     assert asdict(joined([each for each in read if each])) == asdict(sent)
 
@@ -169,7 +169,8 @@ def test_large_status_is_split_by_source() -> None:
 def test_vehicle_with_too_large_report_is_omitted(caplog: pytest.LogCaptureFixture) -> None:
     """A vehicle whose report alone exceeds the size limit is omitted, which is logged."""
     vehicles = {
-        name: VehicleReport("bad", "x" * size) for name, size in (("1", MAX_REPLY_BYTES), ("2", 9))
+        name: VehicleReport("bad", "x" * size)
+        for name, size in (("1", limits.REPLY_BYTES), ("2", 9))
     }
     [part] = reply_parts(AccountReport("s", "h", 1.0, vehicles))
     assert json.loads(part)["vehicles"].keys() == {"2"}

@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 # unacknowledged messages of a session; this many fit into the queues of a link and of a reader
 WINDOW: Final = 2000
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
-_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; at this limit even the trickle stops
+_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; at this limit even the trickle stops
 _MIN_WINDOW: Final = 100  # messages per publisher, however many publishers share the window
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
@@ -53,7 +53,9 @@ class SharedWindow:
         """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
         with self._lock:
             recent = {
-                other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL
+                other: unread
+                for other, unread in self._unread.items()
+                if now - unread[1] < _STALE_POLL
             }
             self._unread = recent | {key: (unread, now)}
             others = sum(number for number, _ in self._unread.values()) - unread
@@ -164,7 +166,7 @@ class FlowControl:
         """Wait while readers have more than a window of unread messages; raise ClosedError once closed.
 
         Call it after each message from number `check_at` on.
-        Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
+        Below _UNACKNOWLEDGED unread messages, it returns after one trickle period.
         """
         if (
             self._listener
@@ -184,7 +186,7 @@ class FlowControl:
         if not self._logged:
             _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow_reader"))
         self._logged = True
-        self._wait(published, _MAX_UNACKNOWLEDGED, read=True, timeout=math.inf)
+        self._wait(published, _UNACKNOWLEDGED, read=True, timeout=math.inf)
 
     def wait_for_reception(self, published: int, *, timeout: float) -> bool:
         """Wait until readers have received all messages; return False after `timeout` s. Raises ClosedError."""

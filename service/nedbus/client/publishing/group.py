@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.errors import NedbusError
 
 if TYPE_CHECKING:
     from .writer import Heartbeats, Writer
 
-MAX_GROUP: Final = 64
-"""Messages that a lossless publisher hands to Zenoh together, at full speed."""
-
-MAX_HOLD: Final = 0.005
+HOLD: Final = 0.005
 """Seconds for which a lossless publisher waits for more messages of a group; longer on a busy machine only."""
 
 _QUICK: Final = 0.0002  # s between two messages of a quick succession
@@ -59,7 +57,7 @@ class Group:
             return self._writer.published + len(self._held)
 
     def add(self, message: Outgoing) -> bool:
-        """Add a message; return True if the group is complete, else it is handed over within MAX_HOLD."""
+        """Add a message; return True if the group is complete, else it is handed over within HOLD."""
         now = monotonic()
         if now - self._last > _QUICK:
             self._successive, self._left = 0, 1
@@ -72,7 +70,7 @@ class Group:
 
     def begin(self, room: int) -> None:
         """Begin the next group, of up to `room` messages."""
-        self._left = 1 if self._successive < _AT_ONCE else max(1, min(MAX_GROUP, room))
+        self._left = 1 if self._successive < _AT_ONCE else max(1, min(limits.GROUP_MESSAGES, room))
 
     def hand_over(self) -> None:
         """Put all messages. They are discarded if the bus is closed. Raises the errors of `put`."""

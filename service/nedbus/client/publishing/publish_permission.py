@@ -3,8 +3,8 @@
 import threading
 from collections.abc import Sequence
 from functools import partial
-from typing import Final
 
+from nedbus import limits
 from nedbus.errors import RefusedError
 from nedbus.transport import (
     Session,
@@ -15,8 +15,6 @@ from nedbus.transport import (
     routers_of,
     secure_endpoints,
 )
-
-_MAX_KNOWN: Final = 10_000  # vehicles whose permission is remembered
 
 
 class PublishPermission:
@@ -55,7 +53,7 @@ class PublishPermission:
         """
         with self._lock:
             routers = routers_of(self._session)
-            if routers != self._routers or len(self._refused) > _MAX_KNOWN:
+            if routers != self._routers or len(self._refused) > limits.KNOWN_VEHICLES:
                 self._routers, self._refused = routers, {}
             if vehicle not in self._refused:
                 refused = is_refused(partial(self._probe, vehicle))

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import zenoh
 
+from nedbus import limits
 from nedbus.errors import NedbusError
 from nedbus.transport import require_unforked, translate_error, translate_zenoh_errors
 from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, encoding_of, get_topic
 
 from .downsampler import Downsampler, MatchingListener
 from .flow_control import CACHE, FlowControl
-from .group import MAX_GROUP, Group, Outgoing
+from .group import Group, Outgoing
 from .writer import Writer
 
 if TYPE_CHECKING:
@@ -157,15 +158,17 @@ class Publisher(AbstractContextManager["Publisher"]):
             )
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
-        each = [payloads[start : start + size] for start in range(0, len(payloads), size)]
+        encoded = [payloads[start : start + size] for start in range(0, len(payloads), size)]
         if self._group is not None:
             self._group.hand_over()
         sent = 0
-        while sent < len(each):
+        while sent < len(encoded):
             room = (
-                self._flow_control.check_at - self._writer.published if self.lossless else MAX_GROUP
+                self._flow_control.check_at - self._writer.published
+                if self.lossless
+                else limits.GROUP_MESSAGES
             )
-            group = each[sent : sent + max(1, min(MAX_GROUP, room))]
+            group = encoded[sent : sent + max(1, min(limits.GROUP_MESSAGES, room))]
             self._put([(payload, self._new_timestamp(), self._encoding) for payload in group])
             self._wait_for_credit()
             sent += len(group)

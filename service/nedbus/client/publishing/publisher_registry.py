@@ -13,6 +13,7 @@ from typing import Any, Final, cast
 import zenoh
 from pydantic_core import to_json
 
+from nedbus import limits
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
@@ -37,8 +38,6 @@ from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-# definitions kept after their publisher closed, for readers with unread messages
-_MAX_UNUSED: Final = 64
 # s between acknowledgement requests: time for three round trips over a radio link
 _FLUSH_POLL: Final = 2.0
 
@@ -113,10 +112,14 @@ class PublisherRegistry:
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = (
                 definition
             )
-            if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
-                used = {each.definition for each in self.publishers.values()}
+            if len(self._definitions) > len(self.publishers) + limits.UNUSED_DEFINITIONS:
+                used = {publisher.definition for publisher in self.publishers.values()}
                 del self._definitions[
-                    next(key for key, each in self._definitions.items() if each not in used)
+                    next(
+                        key
+                        for key, definition in self._definitions.items()
+                        if definition not in used
+                    )
                 ]
         return publisher
 
@@ -129,7 +132,10 @@ class PublisherRegistry:
     def shared_vehicles(self) -> set[str]:
         """Return the vehicles that another process also publishes; log new ones."""
         with self._lock:  # several threads call this, and `forget` closes directories
-            counts = {name: each.publishers(timeout=0) for name, each in self._directories.items()}
+            counts = {
+                name: directory.publishers(timeout=0)
+                for name, directory in self._directories.items()
+            }
             shared = {
                 name for name, numbers in counts.items() if max(numbers.values(), default=0) > 1
             }
@@ -177,7 +183,7 @@ class PublisherRegistry:
         """Free the address of a closed publisher."""
         with self._lock:
             self.publishers.pop(address, None)
-            if not any(each.vehicle == address.vehicle for each in self.publishers):
+            if not any(publisher.vehicle == address.vehicle for publisher in self.publishers):
                 self._forget_vehicle(address.vehicle)
 
     def _add_vehicle(self, vehicle: str) -> None:
@@ -212,10 +218,10 @@ class PublisherRegistry:
 
 def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:
     """Reply with the last messages of a vehicle; a strong reference would keep the registry and its bus alive."""
-    found = registry()
-    if found is None or (found.permission is not None and found.permission.is_refused(vehicle)):
+    owner = registry()
+    if owner is None or (owner.permission is not None and owner.permission.is_refused(vehicle)):
         return  # this process sees what others see
-    for publisher in tuple(found.publishers.values()):
+    for publisher in tuple(owner.publishers.values()):
         matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
         if matches and publisher.last is not None:
             payload, stamp, encoding = publisher.last

@@ -9,13 +9,13 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.client.io_thread import TICK, CallThread, Job
 from nedbus.log_event import UnexpectedErrors
 from nedbus.transport import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-_MAX_PENDING: Final = 1000  # queued queries per key expression; beyond that the oldest are dropped
 _TURN: Final = 0.02  # s of replies on one key expression before others get their turn
 _POLL: Final = 0.01  # s between polls; TICK after _BUSY seconds without a query
 _BUSY: Final = 1.0
@@ -69,7 +69,7 @@ class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
         with translate_zenoh_errors():
             self._queryable = session.declare_queryable(
-                key_expr, zenoh.handlers.RingChannel(_MAX_PENDING)
+                key_expr, zenoh.handlers.RingChannel(limits.QUEUED_QUERIES)
             )
         self._try_recv, self._reply = self._queryable.handler.try_recv, reply
         self._query: zenoh.Query | None = None  # the next one to reply to

@@ -23,7 +23,7 @@ from nedbus.transport import (
 )
 from nedbus_msgs import Topic
 
-from .group import MAX_HOLD, Group, Outgoing
+from .group import HOLD, Group, Outgoing
 
 # s of silence before the first heartbeat, and between the following ones
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)
@@ -140,7 +140,7 @@ class Heartbeats:
             job.wake(writer.heartbeat_due)
 
     def watch(self, group: Group) -> bool:
-        """Hand over the messages of a group within MAX_HOLD, now and later; return False once closed."""
+        """Hand over the messages of a group within HOLD, now and later; return False once closed."""
         group.is_watched = True
         self._groups.add(group)
         if self._job is not None:  # `resume` has created it for the first message
@@ -167,7 +167,7 @@ class Heartbeats:
         due = now + self.send_due(now)
         if self._job is not None and due < math.inf:  # without a job yet, `resume` wakes it
             self._job.wake(due)  # at the next tick; a returned pause would end at the tick before
-        return MAX_HOLD if self._groups else math.inf
+        return HOLD if self._groups else math.inf
 
     def _hand_over(self) -> None:
         for group in tuple(self._groups):

@@ -5,4 +5,3 @@ from .inbox import Inbox, check_count
 from .layout_lookup import LayoutLookup, find_schemas
 from .max_rate import MaxRateInbox, MaxRateReceiver
 from .receiver import Receiver
-from .streams import MAX_KEYS

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
+from nedbus import limits
 from nedbus.client.rate_gate import RateGate
 from nedbus.transport import RawSample
 from nedbus_msgs import Address, Codec, Provenance
@@ -16,8 +17,6 @@ from nedbus_msgs import Address, Codec, Provenance
 if TYPE_CHECKING:
     from .writer_proxy import WriterProxy
 
-# characters kept of an encoding; nedbus's own encodings have at most 250
-_MAX_ENCODING: Final = 512
 
 Layouts = Mapping[int, Sequence[str]]  # names of the fields by layout
 NO_LAYOUTS: Final[Layouts] = {}
@@ -92,7 +91,7 @@ def encoding_of(stream: Stream, raw: RawSample | DetachedSample) -> str:
     encoding = raw.encoding
     known, text = stream.encoding
     if encoding != known:
-        text = str(encoding)[:_MAX_ENCODING]
+        text = str(encoding)[: limits.ENCODING_TEXT]
         # a copy: the original keeps its receive buffer in memory
         stream.encoding = zenoh.Encoding(text), text
     return text

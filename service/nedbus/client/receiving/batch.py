@@ -45,7 +45,8 @@ class ReceivedBatch(Batch):
         """Provenance of each message: its source and the fields that the source did not provide."""
         definition = self.message.DEFINITION
         return [
-            provenance_of(definition, encoding_of(each.stream, each.raw)) for each in self._arrivals
+            provenance_of(definition, encoding_of(arrival.stream, arrival.raw))
+            for arrival in self._arrivals
         ]
 
 
@@ -61,7 +62,7 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> R
         own, blank = codec_of(definition).size, bytes(codec_of(definition).size)
         # Payloads of other layouts are replaced by an invalid placeholder, and decoded below.
         messages, valid = arrays.decode(
-            b"".join([each if len(each) == own and codec else blank for each in payloads])
+            b"".join([payload if len(payload) == own and codec else blank for payload in payloads])
         )
         if not valid.all():
             for index in np.flatnonzero(~valid).tolist():

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import zenoh
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
@@ -34,8 +34,6 @@ _log = logging.getLogger(__name__)
 
 # encoding of a session-local sample that wakes a reader blocked on the ring
 WAKE_UP: Final = "nedbus/wake-up"
-_MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
-_MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 
 class Decoder:
@@ -111,22 +109,22 @@ class Decoder:
 
         This is the only wait for a definition, and all arrivals get the same answer.
         """
-        if arrivals[0].stream.codec is not None or all(each.codec for each in arrivals):
+        if arrivals[0].stream.codec is not None or all(arrival.codec for arrival in arrivals):
             return arrivals
-        known = next((each.codec for each in arrivals if each.codec), None)
+        known = next((arrival.codec for arrival in arrivals if arrival.codec), None)
         codec = known or self._find_codec(arrivals[0].stream, arrivals[0].raw, wait=True)
         return [arrival._replace(codec=codec) for arrival in arrivals]
 
-    def decode(self, arrival: Arrival, rows: bool, lost: int = 0) -> Sample[Any] | None:
+    def decode(self, arrival: Arrival, rows: bool) -> Sample[Any] | None:
         """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
-        stream, payload, raw, codec, _, received, newer = arrival
+        stream, payload, raw, codec, lost, received, newer = arrival
         known, encoding = stream.encoding
         if raw.encoding != known:  # rare
             encoding = encoding_of(stream, raw)
         if codec is None:
             self.reject(
                 stream.key,
-                DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"),
+                DecodeError(f"received no definition of {encoding[: limits.PEER_TEXT]!r}"),
                 stream,
             )
             return None
@@ -155,18 +153,22 @@ class Decoder:
         """Count an invalid sample and log the reason once per key, for the first 100 keys only."""
         with self._counting:
             self.invalid += 1
-            if len(self._warned) >= _MAX_LOGGED_KEYS or hash(key) in self._warned:
+            if len(self._warned) >= limits.LOGGED_KEYS or hash(key) in self._warned:
                 return
             self._warned.add(hash(key))
             last = (
-                "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
+                "; further keys are only counted" if len(self._warned) == limits.LOGGED_KEYS else ""
             )
-            reason = str(error)[:_MAX_TEXT]
+            reason = str(error)[: limits.PEER_TEXT]
             if stream is not None:
                 self.reasons[stream.address] = reason
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning(
-            "ignored an invalid message on %r (%s)%s", key[:_MAX_TEXT], reason, last, extra=extra
+            "ignored an invalid message on %r (%s)%s",
+            key[: limits.PEER_TEXT],
+            reason,
+            last,
+            extra=extra,
         )
 
     def _find_layout(

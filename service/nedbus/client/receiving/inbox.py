@@ -37,9 +37,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-MAX_ACK_REQUESTS: Final = 1000
-"""Pending acknowledgement requests; a well-behaved publisher has one per key."""
-
 _SLOW: Final = "the reader is slower than the data, so messages are dropped"
 
 
@@ -75,13 +72,16 @@ class Inbox:
         if mode not in get_args(Mode):
             raise ArgumentError("mode", mode, f"one of {', '.join(get_args(Mode))}")
         check_count("limit", limit)
-        self.newest_only, self.ended = mode == "latest", False
+        self.newest_only = mode == "latest"
+        self.ended = False
         self._discards = False  # closed: nothing can be read any more
         self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
         # wakes a reader on an event loop; called on any thread
         self.on_wake: Callable[[], object] | None = None
-        self.key_exprs, self.name, self.decoder = key_exprs, ", ".join(key_exprs), decoder
+        self.key_exprs = key_exprs
+        self.name = ", ".join(key_exprs)
+        self.decoder = decoder
         self._warned: set[str] = set()
         self._clock = clock
         self._lock = threading.RLock()  # reentrant, because log handlers may read the counts
@@ -93,13 +93,13 @@ class Inbox:
             self.streams, self._admit, self._counters, recovers=recovers, clock=clock
         )
         self.gaps = self._reorder.gaps
-        limit = limit or (streams.MAX_KEYS if self.newest_only else limits.UNREAD_MESSAGES)
+        limit = limit or (limits.KEYS if self.newest_only else limits.UNREAD_MESSAGES)
         more_keys = f"more keys than the limit of {limit:,} have an unread message, so the oldest messages are dropped"
         self._max_before_recovery = limit // 2
         self._limited = more_keys if self.newest_only else _SLOW
         self._unread = Unread(self._counters, newest_only=self.newest_only, limit=limit)
         # the oldest may go unanswered
-        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)
+        self._ack_requests: deque[AckRequest] = deque(maxlen=limits.ACK_REQUESTS)
 
     @property
     def counts(self) -> Counts:
@@ -125,8 +125,7 @@ class Inbox:
         """
         with self._lock:
             opened = self.gaps.opened
-            self._reorder.accept(batch, overflowed)
-            self._queue()
+            self._queue(self._reorder.accept(batch, overflowed=overflowed))
             has_gap = self.gaps.opened > opened
         if has_gap and self.on_gap is not None:
             self.on_gap()
@@ -138,6 +137,29 @@ class Inbox:
             self._warn_once(_SLOW)
         if self._ack_requests:
             self.acknowledge(drained=len(self.key_exprs) <= 1)  # else other rings may have more
+
+    def take(self, sample: RawSample) -> Arrival | None:
+        """Accept a sample on the reading thread; return its message if it is the next to be read, for `pop`.
+
+        That is the common case of a paced reader, which so needs no queue. Otherwise queue what is in order, as `put`.
+        """
+        with self._lock:
+            opened = self.gaps.opened
+            arrivals = self._reorder.accept([sample])
+            if len(arrivals) == 1 and not self._unread and not self._discards:
+                self._unread.arrived += 1
+                taken = self._start_reading(arrivals[0])
+            else:
+                self._queue(arrivals)
+                taken = None
+            has_gap = self.gaps.opened > opened
+        if taken is None:
+            self.wake()  # other readers
+        if has_gap and self.on_gap is not None:
+            self.on_gap()
+        if self._ack_requests:
+            self.acknowledge(drained=True)
+        return taken
 
     def on_link_change(self) -> None:
         """Handle a link that broke or came back."""
@@ -155,23 +177,23 @@ class Inbox:
             return writer.next_request(now)
 
     def on_retransmission(
-        self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float
+        self, writer: WriterProxy, answers: Mapping[int, RawSample], *, ended: bool, now: float
     ) -> bool:
         """Queue recovered messages and those held back behind them; return True if there are any."""
         with self._lock:
             received = clock.utc_ns()
-            admitted = {number: self._admit(raw, received) for number, raw in found.items()}
+            admitted = {number: self._admit(raw, received) for number, raw in answers.items()}
             arrivals = {
                 number: arrival for number, arrival in admitted.items() if arrival is not None
             }
-            writer.on_retransmission(arrivals, ended=ended, now=now)
-            return self._queue() > 0
+            released = writer.on_retransmission(arrivals, ended=ended, now=now)
+            self._queue(released)
+            return bool(released)
 
     def give_up(self) -> None:
         """Count all gaps as lost."""
         with self._lock:
-            self._reorder.give_up()
-            self._queue()
+            self._queue(self._reorder.give_up())
 
     def acknowledge(self, *requests: AckRequest, drained: bool) -> None:
         """Add acknowledgement requests, and answer all that are ready.
@@ -200,7 +222,8 @@ class Inbox:
                 self._failure = failure
             self.ended = True
             self._discards |= discard
-            self._queue()
+            if self._discards:
+                self._unread.discard()
         self.acknowledge(drained=True)
         self.wake()
 
@@ -227,49 +250,72 @@ class Inbox:
             self.wake()  # pass it on: `put` wakes a single thread per batch
         return True
 
-    def pop(self, rows: bool = False) -> Sample[Any] | None:
-        """Return the next sample, None if there is none; invalid ones are counted and skipped."""
+    def pop(self, arrival: Arrival | None = None, *, rows: bool = False) -> Sample[Any] | None:
+        """Return the next sample, None if there is none; invalid ones are counted and skipped.
+
+        `arrival`: the message that `take` returned, which is read before the queue.
+        """
         while True:
-            with self._lock:  # several threads may read
-                arrival = self._unread.pop()
-                if arrival is None:
-                    return None
-                stream, lost = arrival.stream, arrival.lost
-                if stream.unreported:
-                    lost, stream.unreported = lost + stream.unreported, 0
-                if arrival.codec is not None:
-                    self._counters.received += 1  # here, to lock only once per sample
-            if self._ack_requests:
-                self.acknowledge(drained=False)
-            if arrival.codec is None:  # counted after the wait for its definition
+            if arrival is None:
+                with self._lock:  # several threads may read
+                    arrival = self._unread.pop()
+                    if arrival is None:
+                        return None
+                    arrival = self._start_reading(arrival)
+                if self._ack_requests:
+                    self.acknowledge(drained=False)
+            if arrival.codec is None:
                 [arrival] = self.decoder.define([arrival])
                 with self._lock:
                     self._counters.received += 1
-            sample = self.decoder.decode(arrival, rows, lost)
+            sample = self.decoder.decode(arrival, rows)
             if sample is not None:
                 return sample
             with self._lock:
                 self._counters.received -= 1
-                stream.unreported += lost
+                arrival.stream.unreported += arrival.lost
+            arrival = None
 
-    def pop_batch(self, max_messages: int | None = None) -> Batch | None:
-        """Return unread messages of one type, up to `max_messages`; None if there are none."""
+    def pop_batch(
+        self, arrival: Arrival | None = None, *, max_messages: int | None = None
+    ) -> Batch | None:
+        """Return unread messages of one type, up to `max_messages`; None if there are none. `arrival`: as in `pop`."""
         while True:
-            with self._lock:
-                taken = self._unread.pop_batch(max_messages) if self._unread else []
-                losses = _take_losses(taken)
-            if self._ack_requests:
-                self.acknowledge(drained=False)
-            if not taken:
-                return None
+            counted = 0
+            if arrival is not None:
+                taken = [arrival]
+                losses = Counter({arrival.stream: arrival.lost})
+                counted = 0 if arrival.codec is None else 1  # by `_start_reading`
+            else:
+                with self._lock:
+                    taken = self._unread.pop_batch(max_messages) if self._unread else []
+                    losses = _take_losses(taken)
+                if self._ack_requests:
+                    self.acknowledge(drained=False)
+                if not taken:
+                    return None
             batch = _batch_maker()(taken, self.decoder, lost=losses.total())
             with self._lock:
+                self._counters.received += len(batch) - counted
                 if len(batch):
-                    self._counters.received += len(batch)
                     return batch
                 # the next valid message of each stream reports them
                 for stream, lost in losses.items():
                     stream.unreported += lost
+            arrival = None
+
+    def _start_reading(self, arrival: Arrival) -> Arrival:
+        """Return a message with the losses that its stream has not reported, and count it as received.
+
+        One whose definition is being looked up counts after the wait for it.
+        """
+        if arrival.codec is not None:
+            self._counters.received += 1
+        stream = arrival.stream
+        if stream.unreported:
+            arrival = arrival._replace(lost=arrival.lost + stream.unreported)
+            stream.unreported = 0
+        return arrival
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
         arrived, stream = self._unread.arrived, self.streams.get(request.key)
@@ -301,21 +347,19 @@ class Inbox:
             return None if stream is None else Arrival(stream, b"", raw, None, 0, received)
         return Arrival(stream, payload, raw, codec, 0, received, newer)
 
-    def _queue(self) -> int:
-        """Make the messages that are in order readable, and return their number."""
-        arrivals, self.gaps.delivered = self.gaps.delivered, []
+    def _queue(self, arrivals: list[Arrival]) -> None:
+        """Make messages readable."""
         if self._unread.add(arrivals):
             self._warn_once(self._limited)
         if self._discards:
             self._unread.discard()
-        return len(arrivals)
 
     def _on_evict(self, stream: Stream, at_limit: bool) -> None:
-        self._reorder.forget(stream)
+        self._queue(self._reorder.forget(stream))
         if at_limit:
             self._counters.forgotten += 1
             text = "the least recently active are evicted, and their next gap is not counted"
-            self._warn_once(f"there are more than {streams.MAX_KEYS:,} keys, so {text}")
+            self._warn_once(f"there are more than {limits.KEYS:,} keys, so {text}")
 
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:

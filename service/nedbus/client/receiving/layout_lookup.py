@@ -12,28 +12,22 @@ from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import ConfigDict, Field, TypeAdapter
 
+from nedbus import limits
 from nedbus.client.closing import join_thread
 from nedbus.client.discovery import parse_replies
 from nedbus.errors import NedbusError
 from nedbus.log_event import UnexpectedErrors, about
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_REPLIES, Session, send_query, wait_for_replies
+from nedbus.transport import Session, send_query, wait_for_replies
 from nedbus_msgs import ANY, MESSAGES, Codec, codec_of, define, field_type, schema_key, short_hash
 
 _log = logging.getLogger(__name__)
 
-_MAX_FIELDS: Final = 65_536  # of all definitions from publishers; PX4's messages have 15 on average
 _IN_USE: Final = 60.0  # s after its last message during which a definition is not evicted
 _BASE: Final = 48  # memory of an empty definition, in units of one field
-_MAX_UNKNOWN: Final = 64  # definitions per query; as many more may wait for the next one
-# definitions with a failed query; beyond that the oldest backoff is discarded
-_MAX_FAILED: Final = 1024
 # s, backoff after failed queries for a definition
 _PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
 _QUERY_PAUSE: Final = 0.2  # s between a query without a result and the next one
-_MAX_REPLY_FIELDS: Final = 256  # per layout
-_MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
-_MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
 # s of wait budget regained per second; peers cannot make readers wait longer
 _BUDGET_RATE: Final = 0.1
 
@@ -138,7 +132,7 @@ class LayoutLookup:
                 self._closed
                 or schema_id in self._known
                 or not is_due
-                or len(self._open) >= 2 * _MAX_UNKNOWN
+                or len(self._open) >= 2 * limits.UNKNOWN_DEFINITIONS
             ):
                 return
             self._open[schema_id] = sender
@@ -154,12 +148,14 @@ class LayoutLookup:
                 if self._closed or not self._open:
                     self._thread = None
                     return
-                queried = dict(islice(self._open.items(), _MAX_UNKNOWN))
+                queried = dict(islice(self._open.items(), limits.UNKNOWN_DEFINITIONS))
             added: list[SchemaId] = []
             with self._errors, suppress(NedbusError):  # the session is closed
-                found = self._find(queried)
+                schemas = self._find(queried)
                 added = [
-                    each for each in queried if each in found and self._add(*each, found[each])
+                    schema_id
+                    for schema_id in queried
+                    if schema_id in schemas and self._add(*schema_id, schemas[schema_id])
                 ]
             self._finish_query(queried, added)
 
@@ -175,7 +171,7 @@ class LayoutLookup:
                 elif schema_id not in added:
                     pause = _PAUSES[min(failures, len(_PAUSES) - 1)]
                     self._failed[schema_id] = failures + 1, self._now() + pause, sender
-            while len(self._failed) > _MAX_FAILED:
+            while len(self._failed) > limits.FAILED_DEFINITIONS:
                 del self._failed[next(iter(self._failed))]
             self._changed.notify_all()
             if not added:
@@ -195,7 +191,7 @@ class LayoutLookup:
             _log.warning(
                 "ignored a peer's definition of %s: %s",
                 name,
-                str(exc)[:_MAX_TEXT],
+                str(exc)[: limits.PEER_TEXT],
                 extra=about("invalid"),
             )
             return False
@@ -203,7 +199,7 @@ class LayoutLookup:
         if name in MESSAGES:
             unknown = (
                 ", ".join(field for field in fields if field not in MESSAGES[name].types)[
-                    :_MAX_TEXT
+                    : limits.PEER_TEXT
                 ]
                 or "nothing"
             )
@@ -215,7 +211,7 @@ class LayoutLookup:
 
     def _evict(self, size: int) -> bool:
         """Evict unused definitions, least recently used first; return False if that frees too little."""
-        free = _MAX_FIELDS - sum(known.size for known in self._known.values())
+        free = limits.DEFINITION_FIELDS - sum(known.size for known in self._known.values())
         for schema_id, known in sorted(self._known.items(), key=lambda item: item[1].used):
             if free >= size or self._now() - known.used < _IN_USE:
                 break
@@ -230,7 +226,7 @@ class _Field:
 
 
 _FIELDS: Final = TypeAdapter(
-    Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)],
+    Annotated[list[_Field], Field(max_length=limits.LAYOUT_FIELDS)],
     config=ConfigDict(defer_build=True),
 )
 
@@ -241,30 +237,30 @@ def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: st
     Fields are accepted from any peer, because they must have the requested hash. Returns once all are found, without
     waiting for stopped publishers or bad links.
     """
-    found: dict[SchemaId, dict[str, str]] = {}
+    schemas: dict[SchemaId, dict[str, str]] = {}
     for to_all in (False, True):
         keys = {
             f"{schema_key(name, vehicle=ANY if to_all else sender.vehicle, prefix=prefix)}?hash={identity}"
             for (name, identity), sender in ids.items()
-            if (name, identity) not in found
+            if (name, identity) not in schemas
         }
         queries = [send_query(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
-        replies = islice(wait_for_replies(queries), MAX_REPLIES)
+        replies = islice(wait_for_replies(queries), limits.REPLIES)
         for key, content in parse_replies(reply.ok for reply in replies if reply.ok is not None):
-            found |= {
-                each: fields
-                for each, fields in _parse(key.rpartition("/")[2], content)
-                if each in ids
+            schemas |= {
+                schema_id: fields
+                for schema_id, fields in _parse(key.rpartition("/")[2], content)
+                if schema_id in ids
             }
-            if len(found) == len(ids):
-                return found
-    return found
+            if len(schemas) == len(ids):
+                return schemas
+    return schemas
 
 
 def _parse(name: str, reply: object) -> Iterator[tuple[SchemaId, dict[str, str]]]:
     """Yield the definitions of a reply by the hash of their fields; the hash that the peer states is untrusted."""
     layouts = reply.get("layouts") if isinstance(reply, dict) else None
-    for layout in layouts[:_MAX_REPLY_LAYOUTS] if isinstance(layouts, list) else ():
+    for layout in layouts[: limits.REPLY_LAYOUTS] if isinstance(layouts, list) else ():
         with suppress(ValueError):
             parsed = _FIELDS.validate_python(
                 layout.get("fields") if isinstance(layout, dict) else None

@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 _TIMEOUT: Final = 2.0  # s for the queries of last messages
 _CHECK: Final = 1.0  # s between checks for publishers that do not downsample
 _LAST_POLL: Final = 0.02  # s between polls for last messages
-_MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
+_OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
 
 # listing publishers may open a session, which would block the I/O thread
 _checks = CallThread("nedbus-publishers")
@@ -71,8 +71,7 @@ class MaxRateInbox(Inbox):
                 if arrival.payload and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
                     last.append(detach(arrival, retained=True))
-            self.gaps.delivered = last
-            super()._queue()
+            super()._queue(last)
         self.wake()
 
     def has_downsampled(self, address: Address) -> bool:
@@ -84,14 +83,13 @@ class MaxRateInbox(Inbox):
     def _rate_key(self, address: Address) -> str:
         return address.rate_key(self.rate, prefix=self.decoder.prefix)
 
-    def _queue(self) -> int:
-        self.gaps.delivered = [arrival for arrival in self.gaps.delivered if self._passes(arrival)]
-        return super()._queue()
+    def _queue(self, arrivals: list[Arrival]) -> None:
+        super()._queue([arrival for arrival in arrivals if self._passes(arrival)])
 
     def _passes(self, arrival: Arrival) -> bool:
         stream = arrival.stream
         stream.gate = stream.gate or RateGate(self._max_rate)
-        passes = not 0 <= stream.last_sent - _sent(arrival) <= _MAX_OVERTAKE
+        passes = not 0 <= stream.last_sent - _sent(arrival) <= _OVERTAKEN
         if self.rate > self._max_rate:  # below the lowest rate of publishers
             passes = passes and stream.gate.passes(time.monotonic_ns())
         if not passes:
@@ -120,37 +118,39 @@ class MaxRateReceiver(Receiver):
     def _poll(self, now: float) -> float:
         pause = super()._poll(now)
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
-            found = [
-                reply.ok for each in self._last for reply in each.poll() if reply.ok is not None
+            replies = [
+                reply.ok for query in self._last for reply in query.poll() if reply.ok is not None
             ]
             # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [
                 raw
-                for raw in found
+                for raw in replies
                 if raw.attachment is not None and raw.attachment.to_bytes() == LIVE
             ]:
                 self._rate_inbox.put_last(live)
         if now >= self._next_check:
             self._next_check = math.inf
             _checks.put(self._check_publishers)
-        return pause if all(each.ended for each in self._last) else min(pause, _LAST_POLL)
+        return pause if all(query.ended for query in self._last) else min(pause, _LAST_POLL)
 
     def _check_publishers(self) -> None:
-        now, found = time.monotonic(), Publishers()
+        now, publishers = time.monotonic(), Publishers()
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
-            found = self._directory.publishers(timeout=0.0)
+            publishers = self._directory.publishers(timeout=0.0)
         regular = (
-            each for each in found if (topic := get_topic(each.topic)).rate and not topic.on_change
+            address
+            for address in publishers
+            if (topic := get_topic(address.topic)).rate and not topic.on_change
         )
         # other topics may pause for long
-        self._since = {each: self._since.get(each, now) for each in regular}
+        self._since = {address: self._since.get(address, now) for address in regular}
         due = [
-            each
-            for each, since in self._since.items()
+            address
+            for address, since in self._since.items()
             if now - since >= TIMINGS.downsampled_timeout
         ]
         self._since.update(dict.fromkeys(due, math.inf))
-        if missing := [each for each in due if not self._rate_inbox.has_downsampled(each)]:
+        if missing := [address for address in due if not self._rate_inbox.has_downsampled(address)]:
             key = missing[0].key(prefix=self._rate_inbox.decoder.prefix)
             more = f" and {len(missing) - 1} more" if missing[1:] else ""
             text = "no downsampled messages of %s%s arrive: subscribe without a maximum rate, or check the access rules"

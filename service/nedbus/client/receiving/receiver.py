@@ -16,6 +16,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.client.closing import join_thread
 from nedbus.client.io_thread import TICK, Job
 from nedbus.client.protocol import CLOSED
@@ -23,26 +24,22 @@ from nedbus.log_event import UnexpectedErrors, about
 from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ack_key
 
+from .arrival import Arrival
 from .decoder import WAKE_UP
-from .inbox import MAX_ACK_REQUESTS, AckRequest, Inbox
+from .inbox import AckRequest, Inbox
 from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
 
-RING_CAPACITY: Final = 16_384
-"""Samples that the ring holds between two polls: more than 0.2 s of the traffic of the largest fleet."""
-
-MAX_DECLARED_KEYS: Final = 1024
-"""Exact keys that a subscription declares to Zenoh, about 1.5 kB each; the messages of others cost more CPU time."""
-
-_MAX_DECLARATIONS: Final = 8  # keys declared per poll; with 5,000 keys, one takes 3 ms
+# keys declared to Zenoh per poll; with 5,000 keys, one takes 3 ms
+_DECLARATIONS: Final = 8
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 # samples; after such a batch a short pause makes the next one larger and cheaper
-_MIN_BUSY_BATCH: Final = 64
+_BUSY_BATCH: Final = 64
 _BUSY_PAUSE: Final = 0.0003  # s
-_MAX_DIGITS: Final = 10  # digits of a sequence number
+_DIGITS: Final = 10  # of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
 
 
@@ -86,7 +83,7 @@ class Receiver:
             undo.callback(self._undeclare)
             for key_expr in inbox.key_exprs:
                 ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(
-                    RING_CAPACITY
+                    limits.RING
                 )
                 subscriber = zenoh.ext.declare_advanced_subscriber(
                     session, key_expr, ring, history=last
@@ -95,7 +92,7 @@ class Receiver:
                 self._undeclares.append(subscriber.undeclare)
                 if not inbox.newest_only:
                     channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(
-                        MAX_ACK_REQUESTS
+                        limits.ACK_REQUESTS
                     )
                     queryable = session.declare_queryable(ack_key(key_expr), channel)
                     self._undeclares.append(queryable.undeclare)
@@ -119,28 +116,41 @@ class Receiver:
                 drained = drained and ring.idle
                 continue
             try:
-                if batch := drain(ring.handler, []):
-                    self._put(batch)
+                self._put(drain(ring.handler, []))
             finally:
                 ring.lock.release()
         return drained
 
-    def wait(self, timeout: float | None) -> bool:
-        """Wait until the inbox may have a sample; return False after `timeout` seconds."""
+    def receive_next(self) -> Arrival | None:
+        """Wait until the inbox may have a sample, or return the next message to be read, for `Inbox.pop`."""
         ring = self._rings[0]
-        if timeout is not None or ring.pump is not None or self._closed or len(self._rings) > 1:
-            self.pump()
-            return self._inbox.wait(timeout)
+        if ring.pump is not None or self._closed or len(self._rings) > 1:
+            self.wait(None)
+            return None
         if ring.busy:
             time.sleep(_BUSY_PAUSE)
         # the I/O thread holds the lock for a shorter time
         if not ring.lock.acquire(timeout=_BUSY_PAUSE):
-            return self._inbox.wait(None)
+            self._inbox.wait(None)
+            return None
         try:
-            self._receive(ring, if_empty=True)
+            batch = self._receive(ring, if_empty=True)
+            if len(batch) != 1:
+                self._put(batch)
+                return None
+            self._take_link_changes()
+            try:  # not `with`, which costs two calls per message
+                return self._inbox.take(batch[0])
+            except BaseException as exc:  # noqa: BLE001 - `_discard` raises what is not to be survived
+                self._discard(batch, exc)
+                return None
         finally:
             ring.lock.release()
-        return True
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until the inbox may have a sample; return False after `timeout` seconds."""
+        self.pump()
+        return self._inbox.wait(timeout)
 
     def pump(self) -> None:
         """Start the pump threads, which drain the rings from now on; a second call does nothing."""
@@ -189,15 +199,15 @@ class Receiver:
                 if ring.busy:
                     time.sleep(_BUSY_PAUSE)
                 with ring.lock:
-                    self._receive(ring)
+                    self._put(self._receive(ring))
         except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
             _log.exception(
                 "%s: unexpected error, subscription ended", self._inbox.name, extra=about("error")
             )
             self._inbox.end(f"unexpected {type(exc).__name__}: {exc}")
 
-    def _receive(self, ring: _Ring, *, if_empty: bool = False) -> None:
-        """Wait for a sample and drain the ring into the inbox; end the inbox if the subscriber is gone.
+    def _receive(self, ring: _Ring, *, if_empty: bool = False) -> list[zenoh.Sample]:
+        """Wait for a sample, and return what the ring holds; end the inbox if the subscriber is gone.
 
         With `if_empty`, return at once if the inbox already has a sample; if one is added later, `_poll` ends the wait.
         """
@@ -205,7 +215,7 @@ class Receiver:
         ring.idle = True
         try:
             if if_empty and self._inbox.waiting:
-                return
+                return []
             batch = [handler.recv()]
             ring.idle = False
             drain(handler, batch)
@@ -213,20 +223,26 @@ class Receiver:
             if not self._closed:  # else `close` ends the inbox, once it has everything
                 self._inbox.give_up()
                 self._inbox.end("its Zenoh session was closed")
-            return
+            return []
         finally:
             ring.idle = False
-        ring.busy = len(batch) >= _MIN_BUSY_BATCH
-        self._put(batch)
+        ring.busy = len(batch) >= _BUSY_BATCH
+        return batch
 
     def _put(self, batch: list[zenoh.Sample]) -> None:
+        if not batch:
+            return
         self._take_events()
         try:  # not `with`, which costs two calls per batch
-            self._inbox.put(batch, overflowed=len(batch) >= RING_CAPACITY)
-        except BaseException as exc:
-            if not self._errors.survives(exc):
-                raise
-            self._inbox.decoder.count_invalid(len(batch))
+            self._inbox.put(batch, overflowed=len(batch) >= limits.RING)
+        except BaseException as exc:  # noqa: BLE001 - `_discard` raises what is not to be survived
+            self._discard(batch, exc)
+
+    def _discard(self, batch: list[zenoh.Sample], exc: BaseException) -> None:
+        """Log an unexpected error and count its messages as invalid; raise one that is not to be survived."""
+        if not self._errors.survives(exc):
+            raise exc
+        self._inbox.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:
         """Job of the I/O thread: drain the ring, acknowledge and recover; return the seconds until the next call."""
@@ -240,9 +256,8 @@ class Receiver:
         recovered_key, pause = self._retransmission.poll(now, drained=drained)
         if recovered_key:
             self._inbox.wake()
-            if any(
-                ring.idle for ring in self._rings
-            ):  # only a session-local sample, which the decoder discards, ends a blocking receive
+            # only a session-local sample, which the decoder discards, ends a blocking receive
+            if any(ring.idle for ring in self._rings):
                 here = zenoh.Locality.SESSION_LOCAL
                 with suppress(zenoh.ZError):  # the session is closed
                     self._session.put(
@@ -251,16 +266,21 @@ class Receiver:
         return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
     def _take_events(self) -> None:
-        """Handle link changes, which must precede the samples received since, and acknowledgement requests."""
-        if not self._take_queries:
+        """Handle link changes and acknowledgement requests."""
+        self._take_link_changes()
+        try:  # not `suppress`, which costs three calls per batch
+            for take in self._take_queries:
+                # a flood must not hold the I/O thread
+                for query in islice(iter(take, None), limits.ACK_REQUESTS):
+                    self._on_ack_request(query)
+        except zenoh.ZError:  # undeclared
             return
+
+    def _take_link_changes(self) -> None:
+        """Handle link changes, which must precede the samples received since."""
         try:
             while self._take_link() is not None:
                 self._inbox.on_link_change()
-            for take in self._take_queries:
-                # a flood must not hold the I/O thread
-                for query in islice(iter(take, None), MAX_ACK_REQUESTS):
-                    self._on_ack_request(query)
         except zenoh.ZError:  # undeclared
             pass
 
@@ -268,7 +288,7 @@ class Receiver:
         self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
         key, get = str(query.key_expr), query.parameters.get
         publisher, number = get("publisher"), get("number") or ""
-        if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
+        if not (publisher and number.isdecimal() and len(number) <= _DIGITS):
             return  # dropping the query ends it
         reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
         request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
@@ -279,9 +299,9 @@ class Receiver:
         streams = self._inbox.streams
         self._forget_keys([streams.evicted.popleft() for _ in range(len(streams.evicted))])
         with suppress(zenoh.ZError, IndexError):  # the session is closed; no more new keys
-            for _ in range(_MAX_DECLARATIONS):
+            for _ in range(_DECLARATIONS):
                 key = streams.opened.popleft()
-                if len(self._declared) < MAX_DECLARED_KEYS:
+                if len(self._declared) < limits.DECLARED_KEYS:
                     self._declared[key] = self._session.declare_keyexpr(key)
 
     def _forget_keys(self, keys: Iterable[str]) -> None:
@@ -294,7 +314,7 @@ class Receiver:
 def drain(handler: zenoh.Handler[zenoh.Sample], batch: list[zenoh.Sample]) -> list[zenoh.Sample]:
     """Append all received items to `batch`, up to the capacity of the ring, and return it."""
     try:  # noqa: SIM105 - `suppress` takes three calls per batch
-        batch.extend(islice(iter(handler.try_recv, None), RING_CAPACITY - len(batch)))
+        batch.extend(islice(iter(handler.try_recv, None), limits.RING - len(batch)))
     except zenoh.ZError:  # undeclared; the next blocking receive raises as well
         pass
     return batch

@@ -7,20 +7,13 @@ from typing import Final
 
 import zenoh
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.transport import RawSample, entity_name
 
 from .arrival import NO_LAYOUTS, Arrival, DetachedSample, Stream, detach
 from .streams import Streams
 from .writer_proxy import NUMBERS, Gaps, LossCounters, WriterProxy
 
-MAX_HELD: Final = 131_072
-"""Maximum number of messages held back behind gaps, about 90 MB; beyond it, gaps count as lost."""
-
-MAX_REQUESTING: Final = 10_000
-"""Publishers with open gaps; beyond that, the heartbeat of an unknown publisher opens none."""
-
-_MAX_WRITERS_OF_KEY: Final = 8  # beyond that the oldest writer without a gap is evicted
 # messages in order on one key, of which only the first and the last sender are compared
 _LONG_RUN: Final = 8
 # s after a link change; a new publisher may have sent messages during the outage
@@ -30,7 +23,6 @@ _SETTLING: Final = 10.0
 class Reorder:
     """The writer proxies of a subscription. Not thread-safe.
 
-    Messages in order are appended to `gaps.delivered`.
     With `recovers`, a gap holds back later messages until it is filled; otherwise it counts as lost at once.
     `admit`: returns the arrival of a sample of a new stream or of another size; None if it is no message.
     """
@@ -48,22 +40,24 @@ class Reorder:
         self._streams = streams
         self._admit = admit
         self._counters = counters
-        self._recovers, self._clock = recovers, clock
+        self._recovers = recovers
+        self._clock = clock
         self._settling_until = float("-inf")
 
-    def accept(self, batch: Sequence[RawSample], overflowed: bool) -> None:
-        """Accept samples in order of arrival; `overflowed`: the ring was full, and gaps count as dropped.
+    def accept(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> list[Arrival]:
+        """Accept samples in order of arrival, and return the messages that are in order now.
 
-        The message that the writer of a key is expected to send next needs no further checks. Inside a run of such
-        messages of one writer the senders are compared at its end.
+        `overflowed`: the ring was full, and gaps count as dropped.
+        In a large batch, messages of one key with consecutive numbers are a run, whose senders are compared at its end.
         """
         known = self._streams.get
-        delivered = self.gaps.delivered
         new_arrival = tuple.__new__
         received, now = clock.utc_ns(), self._clock()
-        # the writer of the current run, and its messages; in a small batch each is a run
-        last, count = None, 0
         has_runs = len(batch) >= _LONG_RUN
+        delivered: list[Arrival] = []
+        run: list[Arrival] = []
+        writer: WriterProxy | None = None  # of the run
+        expected = 0  # number after the run
         for raw in batch:
             stream, payload = known(str(raw.key_expr)), raw.payload.to_bytes()
             arrival: Arrival | None
@@ -71,50 +65,42 @@ class Reorder:
                 arrival = self._admit(raw, received)
             else:
                 # Without a call of the class, which takes 0.07 us more.
-                arrival = new_arrival(
-                    Arrival, (stream, payload, raw, stream.codec, 0, received, NO_LAYOUTS)
-                )
-                writer, info = stream.writer, raw.source_info
-                if (
-                    writer is not None
-                    and info is not None
-                    and info.source_sn == writer.expected
-                    and writer.request is None
-                    and not stream.gap
-                    and (
-                        writer is last
-                        or (
-                            (source := info.source_id).eid == writer.eid
-                            and source.zid == writer.zid
-                        )
-                    )
-                ):
-                    if writer is last:
-                        count += 1
-                    else:
-                        if count > 1:
-                            self._check_run(count, now, overflowed)
-                        last = writer if has_runs else None
-                        count = 1
-                        stream.last_active = now
-                    writer.expected = (writer.expected + 1) % NUMBERS
-                    delivered.append(arrival)
-                    continue
-            if count > 1:
-                self._check_run(count, now, overflowed)
-            last, count = None, 0
-            if arrival is not None:
-                self._accept_one(arrival, now, overflowed)
-        if count > 1:
-            self._check_run(count, now, overflowed)
-        if self.gaps.held > MAX_HELD:
-            self.give_up(MAX_HELD)
+                fields = stream, payload, raw, stream.codec, 0, received, NO_LAYOUTS
+                arrival = new_arrival(Arrival, fields)
+                if writer is not None and stream.writer is writer:
+                    info = raw.source_info
+                    if info is not None and info.source_sn == expected:
+                        run.append(arrival)
+                        expected = (expected + 1) % NUMBERS
+                        continue
+            if writer is not None:
+                delivered += self._end_run(writer, run, now, overflowed)
+                writer = None
+            if arrival is None:
+                continue
+            expecting = _expecting_writer(arrival)
+            if expecting is None:
+                delivered += self._accept_one(arrival, now, overflowed)
+                continue
+            arrival.stream.last_active = now
+            expected = (expecting.expected + 1) % NUMBERS
+            if has_runs:
+                writer = expecting
+                run = [arrival]
+            else:
+                expecting.expected = expected
+                delivered.append(arrival)
+        if writer is not None:
+            delivered += self._end_run(writer, run, now, overflowed)
+        if self.gaps.held > limits.HELD_MESSAGES:
+            delivered += self.give_up(limits.HELD_MESSAGES)
+        return delivered
 
     def on_heartbeat(self, stream: Stream, publisher: str, number: int) -> None:
         """Handle a heartbeat: the publisher, known or not, has sent `number`, which should have arrived by now."""
         stream.last_active = self._clock()
         writer = stream.writers.get(publisher)
-        if writer is None and len(self.gaps.requesting) < MAX_REQUESTING:
+        if writer is None and len(self.gaps.requesting) < limits.REQUESTING_PUBLISHERS:
             writer = self._add_writer(
                 stream, publisher, 0 if self._settling else number, history_end=number + 1
             )
@@ -128,18 +114,25 @@ class Reorder:
             for writer in stream.writers.values():
                 writer.unresponsive = False  # perhaps the link was down
 
-    def give_up(self, max_held: int = -1) -> None:
-        """Count gaps as lost, largest reorder buffers first, until `max_held` messages are held back; -1: all gaps."""
+    def give_up(self, max_held: int = -1) -> list[Arrival]:
+        """Count gaps as lost, largest reorder buffers first, until `max_held` messages are held back; -1: all gaps.
+
+        Return the messages held back behind them.
+        """
+        released: list[Arrival] = []
         for writer in sorted(self.gaps.requesting, key=lambda writer: -len(writer.held)):
             if self.gaps.held > max_held:
-                writer.give_up()
+                released += writer.give_up()
+        return released
 
-    def forget(self, stream: Stream) -> None:
-        """Count the gaps of an evicted stream as lost."""
+    def forget(self, stream: Stream) -> list[Arrival]:
+        """Count the gaps of an evicted stream as lost, and return the messages held back behind them."""
+        released: list[Arrival] = []
         for writer in stream.writers.values():
-            writer.give_up()
+            released += writer.give_up()
         stream.writers.clear()
         stream.writer = None
+        return released
 
     def is_settled(
         self, stream: Stream | None, publisher: str, number: int, *, drained: bool
@@ -153,28 +146,29 @@ class Reorder:
         """True shortly after a link change, when unknown publishers may have sent messages."""
         return self._clock() < self._settling_until
 
-    def _check_run(self, count: int, now: float, overflowed: bool) -> None:
-        """Compare the senders of a run, the last `count` messages; if one differs, accept the messages one by one.
+    def _end_run(
+        self, writer: WriterProxy, run: list[Arrival], now: float, overflowed: bool
+    ) -> list[Arrival]:
+        """Return the messages of a run; if the sender of one differs, accept them one by one.
 
         The first sender is known; of a long run, only the last one is compared as well.
         """
-        delivered = self.gaps.delivered
-        run = delivered[-count:]
-        writer = run[0].stream.writer
-        compared = run[-1:] if count >= _LONG_RUN else run[1:]
-        if writer is None or all(writer.is_sender(arrival.raw.source_info) for arrival in compared):
-            return
-        del delivered[-count:]
-        writer.expected = (writer.expected - count) % NUMBERS
+        compared = run[-1:] if len(run) >= _LONG_RUN else run[1:]
+        if all(writer.is_sender(arrival.raw.source_info) for arrival in compared):
+            writer.expected = (writer.expected + len(run)) % NUMBERS
+            return run
+        delivered: list[Arrival] = []
         for arrival in run:
-            self._accept_one(arrival, now, overflowed)
+            delivered += self._accept_one(arrival, now, overflowed)
+        return delivered
 
-    def _accept_one(self, arrival: Arrival, now: float, overflowed: bool) -> None:
-        """Accept any message: of a new writer, behind a gap, late, rejected, or without a number."""
-        recovers = self._recovers and not overflowed
+    def _accept_one(self, arrival: Arrival, now: float, overflowed: bool) -> list[Arrival]:
+        """Accept any message, and return what is in order now."""
         stream, raw = arrival.stream, arrival.raw
+        stream.last_active = now
+        writer = stream.writer
+        recovers = self._recovers and not overflowed
         info = raw.source_info
-        stream.last_active, writer = now, stream.writer
         if info is not None and (writer is None or not writer.is_sender(info)):
             name = entity_name(info.source_id)
             writer = stream.writers.get(name)
@@ -183,35 +177,47 @@ class Reorder:
                 writer = self._add_writer(stream, name, first, history_end=info.source_sn)
             stream.writer = writer
             if writer is not None:
-                # Only replies to queries use BLOCK, such as those to Zenoh's history query; nedbus publishers use DROP.
-                is_live = (
-                    isinstance(raw, DetachedSample)
-                    or raw.congestion_control != zenoh.CongestionControl.BLOCK
-                )
-                if not is_live and writer.eid is None:
+                if writer.eid is None and _is_reply(raw):
                     arrival = detach(arrival, retained=True)
-                writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
+                writer.zid = info.source_id.zid
+                writer.eid = info.source_id.eid
         if info is None or writer is None:
-            if arrival.payload:
-                self.gaps.delivered.append(arrival)
-            return
-        writer.on_sample(info.source_sn, arrival, recovers=recovers, overflowed=overflowed)
+            return [arrival] if arrival.payload else []
+        return writer.on_sample(info.source_sn, arrival, recovers=recovers, overflowed=overflowed)
 
     def _add_writer(
         self, stream: Stream, name: str, expected: int, *, history_end: int
     ) -> WriterProxy | None:
         """Add a writer proxy, evicting one without a gap if necessary; None if all writers of the key have gaps."""
-        if len(stream.writers) >= _MAX_WRITERS_OF_KEY:
-            writers = stream.writers.values()
-            first = next(
-                (each for each in writers if each is not stream.writer and each.request is None),
-                None,
-            )
-            if first is None:
+        if len(stream.writers) >= limits.PUBLISHERS_OF_KEY:
+            idle = [
+                writer
+                for writer in stream.writers.values()
+                if writer is not stream.writer and writer.request is None
+            ]
+            if not idle:
                 return None
-            del stream.writers[first.name]
+            del stream.writers[idle[0].name]
         writer = WriterProxy(
             stream, name, expected, self._counters, self.gaps, history_end=history_end
         )
         stream.writers[name] = writer
         return writer
+
+
+def _expecting_writer(arrival: Arrival) -> WriterProxy | None:
+    """Return the last publisher of a key if it is expected to send this message next, with no gap open."""
+    stream = arrival.stream
+    writer, info = stream.writer, arrival.raw.source_info
+    if writer is None or info is None or info.source_sn != writer.expected:
+        return None
+    if writer.request is not None or stream.gap or not arrival.payload:
+        return None
+    return writer if writer.is_sender(info) else None
+
+
+def _is_reply(raw: RawSample | DetachedSample) -> bool:
+    """Return True for a reply to Zenoh's history query: only replies use BLOCK, nedbus publishers use DROP."""
+    if isinstance(raw, DetachedSample):
+        return False
+    return bool(raw.congestion_control == zenoh.CongestionControl.BLOCK)

@@ -9,6 +9,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.client.io_thread import TICK
 from nedbus.errors import NedbusError
 from nedbus.log_event import UnexpectedErrors
@@ -20,9 +21,6 @@ from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
 
-_MAX_OPEN: Final = 64  # requests in flight
-_MAX_OPEN_HISTORY: Final = 16  # requests in flight to publishers that have delivered no message yet
-_MAX_OPEN_OF_KEY: Final = 4  # requests in flight on one key, whose publishers may never answer
 _TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
@@ -36,7 +34,7 @@ class Retransmission:
         text = "%s: unexpected error, recovered messages discarded (logged once)"
         self._errors = UnexpectedErrors(_log, text, inbox.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}
-        self._followed = [follow_heartbeats(session, each) for each in inbox.key_exprs]
+        self._followed = [follow_heartbeats(session, key_expr) for key_expr in inbox.key_exprs]
         self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
@@ -59,7 +57,7 @@ class Retransmission:
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
         if self._inbox.may_recover:
             for writer in list(self._inbox.gaps.requesting):  # copied: other threads add to it
-                if len(self._open) >= _MAX_OPEN:
+                if len(self._open) >= limits.REQUESTS:
                     break
                 if writer in self._open or not self._may_open(writer):
                     continue
@@ -79,7 +77,7 @@ class Retransmission:
                 undeclare()
 
     def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
-        found = {
+        samples = {
             number: raw
             for number, raw in answers.poll().items()
             if len(raw.payload) <= PAYLOAD_LIMIT
@@ -87,17 +85,21 @@ class Retransmission:
         ended, key = answers.ended, writer.stream.wire_key
         if ended:
             del self._open[writer]
-        elif not found:
+        elif not samples:
             return ""
         with self._errors:
-            return key if self._inbox.on_retransmission(writer, found, ended=ended, now=now) else ""
+            return (
+                key if self._inbox.on_retransmission(writer, samples, ended=ended, now=now) else ""
+            )
         self._open.pop(writer, None)
         return (
             key if self._inbox.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
         )
 
     def _may_open(self, writer: WriterProxy) -> bool:
-        share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]
+        share = [
+            other for other in self._open if bool(other.history_end) == bool(writer.history_end)
+        ]
         if writer.history_end:
-            return len(share) < _MAX_OPEN_HISTORY
-        return sum(each.stream is writer.stream for each in share) < _MAX_OPEN_OF_KEY
+            return len(share) < limits.HISTORY_REQUESTS
+        return sum(other.stream is writer.stream for other in share) < limits.REQUESTS_OF_KEY

@@ -5,38 +5,31 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from heapq import heappop, heappush, heapreplace
-from typing import Final
+
+from nedbus import limits
 
 from .arrival import Stream
-
-MAX_KEYS: Final = 10_000
-"""Keys tracked by a reader, to bound its memory; beyond that the least recently active are evicted and counted."""
-
-MAX_SILENCE: Final = 600.0
-"""Seconds without a message or heartbeat after which a key is evicted, if there are more than KEPT_KEYS."""
-
-KEPT_KEYS: Final = 1_000
-"""Keys kept however long they are silent, to count the losses of a long outage."""
 
 
 class Streams:
     """The state of each key.
 
     `open_stream`: returns the state of a new key, or raises AddressError. `on_evict`: called with an evicted state,
-    and True if it was evicted because of MAX_KEYS.
+    and True if it was evicted because there were too many.
     """
 
     def __init__(
         self, open_stream: Callable[[str], Stream], on_evict: Callable[[Stream, bool], object]
     ) -> None:
-        self._open_stream, self._on_evict = open_stream, on_evict
+        self._open_stream = open_stream
+        self._on_evict = on_evict
         self._streams: dict[str, Stream] = {}
         # heap: each key, with a time at which it was active
         self._by_activity: list[tuple[float, str]] = []
         self.get = self._streams.get
         # keys for the receiver to declare to Zenoh
-        self.opened: deque[str] = deque(maxlen=MAX_KEYS)
-        self.evicted: deque[str] = deque(maxlen=MAX_KEYS)
+        self.opened: deque[str] = deque(maxlen=limits.KEYS)
+        self.evicted: deque[str] = deque(maxlen=limits.KEYS)
 
     def __iter__(self) -> Iterator[Stream]:
         return iter(self._streams.values())
@@ -54,10 +47,10 @@ class Streams:
         return stream
 
     def _evict(self, now: float) -> None:
-        """Evict silent keys above KEPT_KEYS, and the least recently active at MAX_KEYS; keys with requests are last."""
+        """Evict silent keys above KEPT_KEYS, and the least recently active at KEYS; keys with requests are last."""
         order = self._by_activity
-        while len(order) >= MAX_KEYS or (
-            len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE
+        while len(order) >= limits.KEYS or (
+            len(order) >= limits.KEPT_KEYS and order[0][0] < now - limits.KEY_SILENCE
         ):
             since, key = order[0]
             stream = self._streams[key]
@@ -69,4 +62,4 @@ class Streams:
             heappop(order)
             del self._streams[key]
             self.evicted.append(key)
-            self._on_evict(stream, since >= now - MAX_SILENCE)
+            self._on_evict(stream, since >= now - limits.KEY_SILENCE)

@@ -12,8 +12,6 @@ from nedbus_msgs import identity_of
 from .arrival import Arrival, detach, encoding_of
 from .writer_proxy import LossCounters
 
-# messages queued with Zenoh's receive buffer; later ones are detached from it
-_MAX_FRESH: Final = 1024
 _PAYLOAD: Final = attrgetter("payload")
 
 
@@ -50,7 +48,9 @@ class Unread:
                 else:
                     newest[key] = arrival
         else:
-            every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
+            every.extend(
+                map(detach, arrivals) if len(every) > limits.BUFFERED_MESSAGES else arrivals
+            )
         excess = 0
         while (
             len(every) > self._limit
@@ -80,7 +80,9 @@ class Unread:
         )
         taken = list(newest.values())[:count] or [every.popleft() for _ in range(count)]
         if len({arrival.stream.codec for arrival in taken}) > 1 or taken[0].stream.codec is None:
-            kinds = [each.codec if each.stream.codec else _identity(each) for each in taken]
+            kinds = [
+                arrival.codec if arrival.stream.codec else _identity(arrival) for arrival in taken
+            ]
             others = [
                 arrival for arrival, kind in zip(taken, kinds, strict=True) if kind != kinds[0]
             ]

@@ -11,18 +11,18 @@ from typing import Final
 
 import zenoh
 
+from nedbus import limits
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_REPLIES
 
 from .arrival import Arrival, Stream, detach
 
 NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
-MAX_GAP: Final = 2**30
-"""Largest gap; a larger step means that the publisher restarted or the message is late."""
+# a larger step means that the publisher restarted or the message is late
+LARGEST_GAP: Final = 2**30
 
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
 # a step back up to this size is a late message or a duplicate; a larger one is a restart
-_MAX_REORDERED: Final = 2**16
+_REORDERED: Final = 2**16
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
 
 
@@ -39,11 +39,10 @@ class LossCounters:
 
 @dataclass(slots=True, eq=False)
 class Gaps:
-    """Open gaps of a subscription, and the messages that have passed them."""
+    """Open gaps of a subscription."""
 
     held: int = 0  # messages held back behind gaps
     opened: int = 0  # gaps so far
-    delivered: list[Arrival] = field(default_factory=list)  # messages to be queued, in order
     # proxies with a gap, oldest request first
     requesting: dict[WriterProxy, None] = field(default_factory=dict)
 
@@ -84,31 +83,31 @@ class WriterProxy:
 
     def on_sample(
         self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False
-    ) -> None:
-        """Accept a message and deliver what is in order.
+    ) -> list[Arrival]:
+        """Accept a message, and return what is in order now.
 
         With `recovers`, messages behind a gap are held back until it is filled.
         With `overflowed`, the ring was full, and the gap counts as dropped.
         """
         step = (number - self.expected) % NUMBERS
-        if step > MAX_GAP:
-            if NUMBERS - step <= _MAX_REORDERED:
+        released: list[Arrival] = []
+        if step > LARGEST_GAP:
+            if NUMBERS - step <= _REORDERED:
                 self.counters.discarded += 1
-                return
-            self.give_up()
+                return []
+            released = self.give_up()
             self.expected = number
         elif (
             step and (self.request is not None or recovers) and self.expected + step < _LAST_NUMBER
         ):
             self._hold(number, arrival)
             self._extend_request(number + 1)
-            return
+            return []
         else:
             if step:
-                self.give_up()
+                released = self.give_up()
             self._count_gap(number, overflowed=overflowed)
-        self._deliver(arrival)
-        self._release()
+        return released + self._deliver(arrival) + self._release()
 
     def is_sender(self, info: zenoh.SourceInfo | None) -> bool:
         """Return True for the source info of this writer; comparing the parts of an id is cheaper than its name."""
@@ -117,7 +116,7 @@ class WriterProxy:
 
     def on_heartbeat(self, number: int) -> None:
         """Open a gap up to a message that should have arrived by now."""
-        if self.expected <= number < min(self.expected + MAX_GAP, _LAST_NUMBER):
+        if self.expected <= number < min(self.expected + LARGEST_GAP, _LAST_NUMBER):
             self._extend_request(number + 1)
 
     def next_request(self, now: float) -> range | None:
@@ -134,61 +133,73 @@ class WriterProxy:
             request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
         request.attempts += 1
         self.gaps.requesting[self] = self.gaps.requesting.pop(self)
-        request.requested = range(max(self.expected, last - MAX_REPLIES + 1), last + 1)
+        request.requested = range(max(self.expected, last - limits.REPLIES + 1), last + 1)
         return request.requested
 
-    def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> None:
-        """Accept answers to the open request and deliver what is in order; `ended`: no more answers follow."""
+    def on_retransmission(
+        self, answers: Mapping[int, Arrival], *, ended: bool, now: float
+    ) -> list[Arrival]:
+        """Accept answers to the open request, and return what is in order now; `ended`: no more answers follow."""
         request = self.request
         if request is None:
-            return
-        for number, arrival in found.items():
+            return []
+        for number, arrival in answers.items():
             if self.expected <= number < request.stop and number not in self.held:
                 self._hold(number, arrival)
-        if found:
+        if answers:
             lowest = request.first_available
-            request.first_available = min(found) if lowest is None else min(lowest, *found)
+            request.first_available = min(answers) if lowest is None else min(lowest, *answers)
             request.last_answered |= (
-                request.requested is not None and request.requested[-1] in found
+                request.requested is not None and request.requested[-1] in answers
             )
+        released: list[Arrival] = []
         # else wait for the end, which reveals the lowest number available
         if self.history_end <= self.expected:
-            self._release()
+            released = self._release()
         if ended and request.requested is not None:
-            last, request.requested = request.requested[-1], None
-            expired = request.deadline is not None and now >= request.deadline
-            if request.last_answered:
-                self.unresponsive = False
-                self._confirm_lowest(request, expired=expired)
-            elif request.probe is not None:
-                request.probe = request.stop - 1  # the probe may have left the cache
-            self._release()
-            if expired:
-                self.unresponsive = request.first_available is None
-                self.give_up(last)
-            request.last_answered = False
-            request.retry_at = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
+            released += self._end_request(request, request.requested[-1], now)
+        return released
 
-    def give_up(self, last: int = NUMBERS) -> None:
-        """Count gaps up to number `last` as lost, and deliver the messages held back behind them."""
+    def _end_request(self, request: Request, last: int, now: float) -> list[Arrival]:
+        """Handle the end of the answers up to number `last`, and return what is in order now."""
+        released: list[Arrival] = []
+        request.requested = None
+        expired = request.deadline is not None and now >= request.deadline
+        if request.last_answered:
+            self.unresponsive = False
+            released = self._confirm_lowest(request, expired=expired)
+        elif request.probe is not None:
+            request.probe = request.stop - 1  # the probe may have left the cache
+        released += self._release()
+        if expired:
+            self.unresponsive = request.first_available is None
+            released += self.give_up(last)
+        request.last_answered = False
+        request.retry_at = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
+        return released
+
+    def give_up(self, last: int = NUMBERS) -> list[Arrival]:
+        """Count gaps up to number `last` as lost, and return the messages held back behind them."""
+        released: list[Arrival] = []
         while self.request is not None and self.expected <= last:
             self._count_gap(min(self.held, default=self.request.stop))
-            self._release()
+            released += self._release()
+        return released
 
     def is_settled(self, number: int) -> bool:
         """Return True if this message has arrived or counts as lost."""
-        return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
+        return (self.expected - 1 - number) % NUMBERS <= LARGEST_GAP
 
-    def _confirm_lowest(self, request: Request, *, expired: bool) -> None:
+    def _confirm_lowest(self, request: Request, *, expired: bool) -> list[Arrival]:
         """Count numbers below the lowest answered one as lost, once a probe has shown that no lower answer was lost."""
         lowest = request.first_available
         if lowest is None or lowest <= self.expected:
-            return
+            return []
         if lowest != request.candidate and not expired:
             request.probe = request.candidate = lowest
-        else:
-            request.probe = None
-            self.give_up(lowest - 1)
+            return []
+        request.probe = None
+        return self.give_up(lowest - 1)
 
     def _hold(self, number: int, arrival: Arrival) -> None:
         if number in self.held:
@@ -214,23 +225,29 @@ class WriterProxy:
             self.stream.gap += lost
         self.expected = number
 
-    def _deliver(self, arrival: Arrival) -> None:
+    def _deliver(self, arrival: Arrival) -> list[Arrival]:
+        """Advance to the next number; return the message with the losses before it, or nothing if it was rejected."""
         self.expected = (self.expected + 1) % NUMBERS
         self.history_end = 0
-        if arrival.payload:
-            self.gaps.delivered.append(
-                arrival._replace(lost=self.stream.gap) if self.stream.gap else arrival
-            )
+        if not arrival.payload:
+            return []
+        if self.stream.gap:
+            arrival = arrival._replace(lost=self.stream.gap)
             self.stream.gap = 0
+        return [arrival]
 
-    def _release(self) -> None:
+    def _release(self) -> list[Arrival]:
+        """Return the held messages that are in order now, and end the request if none is missing."""
         request = self.request
+        released: list[Arrival] = []
         if request is None:
-            return
+            return released
         while (arrival := self.held.pop(self.expected, None)) is not None:
             self.gaps.held -= 1
-            self._deliver(arrival)
-            request.deadline, request.attempts = None, 0
+            released += self._deliver(arrival)
+            request.deadline = None
+            request.attempts = 0
         if self.expected >= request.stop:
             self.request = None
             del self.gaps.requesting[self]
+        return released

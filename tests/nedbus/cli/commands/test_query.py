@@ -108,7 +108,7 @@ def test_incomplete_list_exits_with_1(
     bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If replies are missing, `list` shows the others with a warning and exits with 1."""
-    monkeypatch.setattr(liveliness, "MAX_REPLIES", 1)
+    monkeypatch.setattr("nedbus.limits.REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1

@@ -12,7 +12,6 @@ import pytest
 
 from nedbus import limits
 from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, SharedWindow
-from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
 from tests.waits import DEADLINE
@@ -35,7 +34,7 @@ def control(session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timi
 
 def test_unacknowledged_messages_fit_into_cache_and_queues() -> None:
     """Unacknowledged messages fit into the history cache for recovery, and into the queue of each reader."""
-    assert WINDOW < LIMIT < CACHE < RING_CAPACITY < limits.UNREAD_MESSAGES
+    assert WINDOW < LIMIT < CACHE < limits.RING < limits.UNREAD_MESSAGES
     assert LIMIT + WINDOW == CACHE
 
 

@@ -10,8 +10,9 @@ from typing import Any, cast
 import pytest
 
 import nedbus
+from nedbus import limits
 from nedbus.client.publishing import group
-from nedbus.client.publishing.group import MAX_GROUP, Group, Outgoing
+from nedbus.client.publishing.group import Group, Outgoing
 from nedbus.client.publishing.writer import Heartbeats, Writer
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import receive_timestamps, wait_for_subscriber
@@ -71,17 +72,17 @@ def test_paced_messages_are_put_at_once(clock: Clock) -> None:
 
 def test_quick_succession_forms_groups_after_its_first_messages(clock: Clock) -> None:
     """The first 16 messages of a quick succession are put at once, the following ones in groups of 64."""
-    clock.publish(16 + 3 * MAX_GROUP, pause=QUICK)
-    assert clock.sizes == [1] * 16 + [MAX_GROUP] * 3
-    assert clock.numbers == list(range(16 + 3 * MAX_GROUP))
+    clock.publish(16 + 3 * limits.GROUP_MESSAGES, pause=QUICK)
+    assert clock.sizes == [1] * 16 + [limits.GROUP_MESSAGES] * 3
+    assert clock.numbers == list(range(16 + 3 * limits.GROUP_MESSAGES))
 
 
 def test_pause_ends_a_quick_succession(clock: Clock) -> None:
     """After a pause, the first 16 messages of the next quick succession are put at once again."""
-    clock.publish(16 + MAX_GROUP, pause=QUICK)
+    clock.publish(16 + limits.GROUP_MESSAGES, pause=QUICK)
     clock.publish(1, pause=1.0)
-    clock.publish(15 + MAX_GROUP, pause=QUICK)
-    assert clock.sizes == ([1] * 16 + [MAX_GROUP]) * 2
+    clock.publish(15 + limits.GROUP_MESSAGES, pause=QUICK)
+    assert clock.sizes == ([1] * 16 + [limits.GROUP_MESSAGES]) * 2
 
 
 @pytest.mark.parametrize(("room", "size"), [(37, 37), (1, 1), (0, 1), (-5, 1)])
@@ -95,12 +96,12 @@ def test_group_is_complete_though_its_messages_were_handed_over(clock: Clock) ->
     """Flow control is asked after 64 messages even if the I/O thread hands over each group before it is complete."""
     clock.publish(16, pause=QUICK)
     complete = list[bool]()
-    for number in range(MAX_GROUP):
+    for number in range(limits.GROUP_MESSAGES):
         clock.now += QUICK
         complete.append(clock.group.add(cast("Outgoing", (str(number).encode(), None, ""))))
         if number % 10 == 9:
             clock.group.try_hand_over()
-    assert complete == [False] * (MAX_GROUP - 1) + [True]
+    assert complete == [False] * (limits.GROUP_MESSAGES - 1) + [True]
 
 
 def test_signal_handler_leaves_the_interrupted_group_to_its_thread(clock: Clock) -> None:
@@ -265,7 +266,7 @@ def test_ctrl_c_in_zenoh_repeats_no_message(
 
         monkeypatch.setattr(writer, "_publisher", SimpleNamespace(put=put))
         with pytest.raises(KeyboardInterrupt):
-            publish(publisher, 31, 100 * MAX_GROUP)
+            publish(publisher, 31, 100 * limits.GROUP_MESSAGES)
         published = publisher.published
         assert publisher.flush(DEADLINE)
         assert publisher.published == published

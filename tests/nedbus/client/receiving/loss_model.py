@@ -121,7 +121,7 @@ class InboxReceivePath(Inbox):
         if batch:
             found = self.pop_batch()
             return None if found is None else (found.messages["timestamp"].tolist(), found.lost)
-        sample = self.pop(rows=False)
+        sample = self.pop()
         return None if sample is None else ([sample.message.timestamp], sample.lost)
 
 

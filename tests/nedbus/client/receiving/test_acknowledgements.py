@@ -7,7 +7,8 @@ from functools import partial
 
 import pytest
 
-from nedbus.client.receiving.inbox import MAX_ACK_REQUESTS, AckRequest
+from nedbus import limits
+from nedbus.client.receiving.inbox import AckRequest
 from nedbus.transport import RawSample
 
 from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, raw
@@ -39,7 +40,7 @@ class AcknowledgingReader:
 
     def read(self, count: int) -> list[str]:
         """Read samples; return the names of all acknowledged requests."""
-        assert all(self.queue.pop(rows=False) for _ in range(count))
+        assert all(self.queue.pop() for _ in range(count))
         return self.acknowledged
 
     def put(self, *samples: RawSample) -> list[str]:
@@ -91,9 +92,9 @@ def test_requests_of_publishers_are_independent(reader: AcknowledgingReader) -> 
 def test_number_of_open_requests_is_bounded(reader: AcknowledgingReader) -> None:
     """Beyond the limit, the oldest acknowledgement requests are discarded; publishers repeat them."""
     reader.put(raw(0))
-    for number in range(1, MAX_ACK_REQUESTS + 3):
+    for number in range(1, limits.ACK_REQUESTS + 3):
         reader.request(number)
-    assert len(reader.put(*map(raw, range(1, MAX_ACK_REQUESTS + 3)))) == MAX_ACK_REQUESTS
+    assert len(reader.put(*map(raw, range(1, limits.ACK_REQUESTS + 3)))) == limits.ACK_REQUESTS
 
 
 def test_reception_is_acknowledged_at_once(reader: AcknowledgingReader) -> None:
@@ -114,7 +115,7 @@ def test_read_is_acknowledged_when_the_script_reads(
     reader.put(raw(2), raw(3))
     reader.request(3, read=True)
     for acknowledged in ([], ["1"]):
-        assert reader.queue.pop(rows=False) is not None
+        assert reader.queue.pop() is not None
         assert reader.acknowledged == acknowledged
     assert reader.queue.pop_batch() is not None
     assert reader.acknowledged == ["1", "3"]

@@ -88,7 +88,7 @@ def test_unread_subscription_does_not_delay_other_readers(
     mode: Mode,
 ) -> None:
     """A full subscription delays neither other subscriptions of any bus, nor queries, nor its own close."""
-    monkeypatch.setattr("nedbus.client.receiving.receiver.RING_CAPACITY", 256)
+    monkeypatch.setattr("nedbus.limits.RING", 256)
     monkeypatch.setattr("nedbus.limits.UNREAD_MESSAGES", 1000)
     stuck = client.subscribe(VLP, mode=mode)
     with nedbus.connect(endpoint) as other:
@@ -347,7 +347,7 @@ def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:
 def test_receiving_a_sample_needs_few_python_calls(
     publisher: nedbus.Publisher, endpoint: str
 ) -> None:
-    """A reader that waits for each sample needs at most 25 Python calls, in six classes, to receive it."""
+    """A reader that waits for each sample needs at most 25 Python calls, in seven classes, to receive it."""
     called: list[list[str]] = []
 
     def trace(frame: FrameType, event: str, _: object) -> None:
@@ -361,10 +361,17 @@ def test_receiving_a_sample_needs_few_python_calls(
             sys.setprofile(trace)
             next(subscription)
             sys.setprofile(None)
-    waited = [
-        names for names in called if any(name.startswith("Receiver.") for name in names)
-    ]  # samples received along with an earlier one need no wait
+    # Samples received along with others need more calls, or no wait.
+    waited = [names for names in called if "Inbox.take" in names]
     median = sorted(waited, key=len)[len(waited) // 2]
     assert len(median) <= 25
     classes = {name.partition(".")[0] for name in median if name[0].isupper()}
-    assert classes == {"Subscription", "Receiver", "Inbox", "Reorder", "Unread", "Decoder"}
+    assert classes == {
+        "Subscription",
+        "Receiver",
+        "Inbox",
+        "Reorder",
+        "WriterProxy",
+        "Unread",
+        "Decoder",
+    }

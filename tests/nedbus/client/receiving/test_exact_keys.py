@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 import nedbus
-from nedbus.client.receiving import receiver, streams
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.messages import VLP, message
 from tests.waits import DEADLINE, wait_for
@@ -42,8 +41,8 @@ def test_number_of_declared_keys_is_bounded(
     fleet: list[nedbus.Publisher], endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A reader declares a limited number of keys, and undeclares those that it evicts."""
-    monkeypatch.setattr(receiver, "MAX_DECLARED_KEYS", 2)
-    monkeypatch.setattr(streams, "MAX_KEYS", 3)
+    monkeypatch.setattr("nedbus.limits.DECLARED_KEYS", 2)
+    monkeypatch.setattr("nedbus.limits.KEYS", 3)
     with nedbus.connect(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
         known = subscription._receiver
         for publisher in fleet:

@@ -20,8 +20,6 @@ from nedbus.client.receiving import (
     Decoder,
     Inbox,
     LayoutLookup,
-    streams as streams_module,
-    unread as unread_module,
 )
 from nedbus.client.receiving.arrival import Stream
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
@@ -120,7 +118,7 @@ def test_number_from_another_publisher_does_not_continue_a_sequence(
 
 def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the limit of messages held back, here 10, the gap with the most messages behind it counts as lost."""
-    monkeypatch.setattr("nedbus.client.receiving.reorder.MAX_HELD", 10)
+    monkeypatch.setattr("nedbus.limits.HELD_MESSAGES", 10)
     inbox = make_queue("every")
     inbox.put([raw(0), raw(2, timestamp=2)])
     inbox.put([raw(number, key=OTHER_KEY, publisher="b") for number in (0, *range(2, 12))])
@@ -287,7 +285,7 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(
 
 def test_number_of_tracked_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader keeps the state of at most 10,000 keys, here 10; messages on additional keys still arrive."""
-    monkeypatch.setattr("nedbus.client.receiving.streams.MAX_KEYS", 10)
+    monkeypatch.setattr("nedbus.limits.KEYS", 10)
     inbox = make_queue("every")
     tracemalloc.start()
     for number in range(2000):
@@ -316,7 +314,7 @@ def test_least_recently_active_key_is_evicted(
     mode: Mode, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Beyond the limit, the least recently active key is evicted and counted; losses of other keys still count."""
-    monkeypatch.setattr(streams_module, "MAX_KEYS", 3)
+    monkeypatch.setattr("nedbus.limits.KEYS", 3)
     now = [0.0]
     inbox = make_queue(mode, clock=lambda: now[0])
 
@@ -340,7 +338,7 @@ def test_least_recently_active_key_is_evicted(
 
 def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -> None:
     """A key with a gap is evicted, and its gap counted as lost, only if all keys have a gap."""
-    monkeypatch.setattr(streams_module, "MAX_KEYS", 3)
+    monkeypatch.setattr("nedbus.limits.KEYS", 3)
     now = [0.0]
     inbox = make_queue("every", clock=lambda: now[0])
     for vehicle, numbers in [
@@ -364,7 +362,7 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
-    monkeypatch.setattr("nedbus.client.receiving.streams.KEPT_KEYS", 10)
+    monkeypatch.setattr("nedbus.limits.KEPT_KEYS", 10)
     now = [0.0]
     inbox = make_queue(mode, clock=lambda: now[0])
     for number in range(2000):
@@ -419,7 +417,7 @@ def test_queue_wait_returns_on_sample_wake_end_or_timeout() -> None:
 def small_queue(monkeypatch: pytest.MonkeyPatch) -> Inbox:
     """Return a queue for mode `every` that holds 10 samples, at most 4 of them with their receive buffers."""
     monkeypatch.setattr(limits, "UNREAD_MESSAGES", 10)
-    monkeypatch.setattr(unread_module, "_MAX_FRESH", 4)
+    monkeypatch.setattr("nedbus.limits.BUFFERED_MESSAGES", 4)
     return make_queue("every")
 
 
@@ -637,10 +635,10 @@ def test_message_without_an_available_definition_is_invalid(
     """A reader skips a message of an unknown definition; it counts as invalid, and the log has the reason."""
     inbox = make_queue("every")
     put(inbox, [undefined(number=0), raw(0)])
-    read = inbox.pop(rows)
+    read = inbox.pop(rows=rows)
     assert read is not None
     assert read.topic == "vehicle_local_position"
-    assert inbox.pop(rows) is None
+    assert inbox.pop(rows=rows) is None
     assert inbox.counts == Counts(received=1, invalid=1)
     assert ["received no definition of" in text for text in caplog.messages] == [True]
 

@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 
+from nedbus import limits
 from nedbus.client.receiving import LayoutLookup, layout_lookup
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
 from nedbus.timings import Timings
@@ -160,8 +161,8 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
     start = time.monotonic()
     for number in range(5000):
         assert lookup.codec("Evil", str(number), wait=True) is None
-    assert len(lookup._open) <= 2 * layout_lookup._MAX_UNKNOWN
-    assert len(lookup._failed) <= layout_lookup._MAX_FAILED
+    assert len(lookup._open) <= 2 * limits.UNKNOWN_DEFINITIONS
+    assert len(lookup._failed) <= limits.FAILED_DEFINITIONS
     assert start <= lookup._budget_time <= time.monotonic()
     wait_for(lambda: lookup.codec("Honest", "hash"), what="the definition")
     lookup.close()
@@ -191,7 +192,7 @@ def test_memory_for_definitions_is_bounded(
     Definitions no longer in use are evicted, least recently used first.
     """
     now = 0.0
-    monkeypatch.setattr(layout_lookup, "_MAX_FIELDS", 10 * (1 + layout_lookup._BASE))
+    monkeypatch.setattr(limits, "DEFINITION_FIELDS", 10 * (1 + layout_lookup._BASE))
     lookup = LayoutLookup(
         lambda schema_ids: {each: {"timestamp": "uint64"} for each in schema_ids}, now=lambda: now
     )

@@ -15,7 +15,7 @@ import zenoh
 
 import nedbus
 from nedbus import Counts
-from nedbus.client.receiving import Receiver, reorder, retransmission
+from nedbus.client.receiving import Receiver, retransmission
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.timings import Timings
@@ -287,7 +287,7 @@ def test_number_of_open_requests_is_bounded(
     lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Simultaneous gaps of 60 vehicles are requested a few at a time, and all are filled."""
-    monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
+    monkeypatch.setattr("nedbus.limits.REQUESTS", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
     for publisher in publishers:
         wait_for_subscriber(publisher)
@@ -313,7 +313,7 @@ def test_number_of_held_back_samples_is_bounded(
     lossy: Lossy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If too many samples are held back behind gaps, the gaps count as lost and the samples are delivered."""
-    monkeypatch.setattr(reorder, "MAX_HELD", 50)
+    monkeypatch.setattr("nedbus.limits.HELD_MESSAGES", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]
