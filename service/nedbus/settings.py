@@ -204,7 +204,8 @@ def find_mistakes(
     except ValidationError as exc:
         details = exc.errors()
         settings = Settings(**_without_mistakes(values, details))
-    _warn_about_misspelled_variables()
+    if needed != set():
+        _warn_about_misspelled_variables()
     settings._file, wrong = path, {str(detail["loc"][0]) for detail in details}
     settings._set_by.update(
         {name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set}

@@ -5,7 +5,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from nedbus.transport import AccessControl, Verdict
+from nedbus.health import WriteVerdict
+from nedbus.pki import AccessControl
 from nedbus_msgs import ANY, DEFAULT_TOPIC, all_status_keys, status_key
 
 from .finding import Finding
@@ -149,7 +150,7 @@ def explain_permissions(
     *,
     vehicle: str | None,
     prefix: str,
-    verdict: Verdict | None,
+    verdict: WriteVerdict | None,
 ) -> Iterator[Finding]:
     """Yield which rule decides about the messages of a client: those of a vehicle, if given, else of a reader.
 

@@ -9,8 +9,8 @@ from nedbus.daemon import PlannedSource, plan_sources
 from nedbus.endpoints import DEFAULT_ENDPOINT, check_endpoints, split_endpoint
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
+from nedbus.pki import RouterConfig, read_router_config
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source
-from nedbus.transport import RouterConfig, read_router_config
 from nedbus_msgs import Address
 
 from .access_rules import find_rule_mistakes

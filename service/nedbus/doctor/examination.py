@@ -12,12 +12,12 @@ from typing import Final
 from nedbus import Tls, connect
 from nedbus.errors import NedbusError
 from nedbus.extras import import_optional
+from nedbus.health import probe_writes
 from nedbus.log_event import about
-from nedbus.pki import Certificate
+from nedbus.pki import AccessControl, Certificate, read_router_config
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.timings import TIMINGS
-from nedbus.transport import AccessControl, probe_writes, read_router_config
 
 from .access_rules import explain_permissions
 from .configuration import check_sources

@@ -17,6 +17,7 @@ from nedbus.health import (
     RouterState,
     ServiceStatus,
     SourceStatus,
+    WriteVerdict,
     query_routers,
 )
 from nedbus.rmw_zenoh import (
@@ -26,7 +27,6 @@ from nedbus.rmw_zenoh import (
     translate_zenoh_errors,
 )
 from nedbus.timings import TIMINGS
-from nedbus.transport import Verdict
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ class Observation:
     prefix: str
     version: str
     vehicle: str | None
-    verdict: Verdict | None = None
+    verdict: WriteVerdict | None = None
     services: list[ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0

@@ -7,13 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from nedbus import Tls, clock
+from nedbus import Tls, clock, connect
 from nedbus.endpoints import split_endpoint
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.pki import Certificate
+from nedbus.pki import UNKNOWN_CA, Certificate, check_pem, read_certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import UNKNOWN_CA, check_pem, open_client, read_certificate
+from nedbus_msgs import DEFAULT_PREFIX
 
 from .finding import Finding, brief, worst_state
 
@@ -42,7 +42,7 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
         if worst_state(findings) == "wrong":
             return
     try:
-        open_client([endpoint], timeout=TIMINGS.doctor_open, tls=tls).close()
+        connect(endpoint, timeout=TIMINGS.doctor_open, prefix=DEFAULT_PREFIX, tls=tls).close()
     except NedbusError:
         if protocol == "tcp" and read_certificate(host, port, TIMINGS.handshake):
             seen = "it speaks TLS"

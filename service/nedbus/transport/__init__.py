@@ -43,7 +43,7 @@ from .tls import UNKNOWN_CA, Tls, check_pem, read_certificate
 from .vehicle_directory import Publishers, VehicleDirectory
 from .write_probe import (
     CONFIRMED,
-    Verdict,
+    WriteVerdict,
     is_refused,
     probe_at_router,
     probe_writes,
@@ -59,6 +59,9 @@ from .zenoh_ext import (
 )
 
 if TYPE_CHECKING:
-    from .access_control import AccessControl
+    from .access_control import AccessControl, AccessRule, Decision
 else:
-    __getattr__ = lazy_exports("nedbus.transport", {"AccessControl": ("", "access_control")})
+    __getattr__ = lazy_exports(
+        "nedbus.transport",
+        dict.fromkeys(("AccessControl", "AccessRule", "Decision"), ("", "access_control")),
+    )
