@@ -42,11 +42,7 @@ _SECTIONS: Final = {  # by title: the packages of the names
         "nedbus.monitoring.live_events",
     ),
     "External positions": ("nedbus.fusion",),
-    "A service in your program": (
-        "nedbus.settings",
-        "nedbus.daemon",
-        "nedbus.transport.router_log",
-    ),
+    "A service in your program": ("nedbus.settings", "nedbus.daemon"),
     "MAVLink links": ("nedbus.sources",),
     "Metrics and health": ("nedbus.monitoring",),
     "Certificates and access rules": ("nedbus.pki", "nedbus.transport.access_control"),

@@ -27,7 +27,6 @@ from .router import (
     read_router_config,
     router_endpoints,
 )
-from .router_log import Uplinks, log_refusals
 from .session import (
     MAX_REPLY_BYTES,
     RawSample,
@@ -40,6 +39,7 @@ from .session import (
     translate_zenoh_errors,
 )
 from .tls import UNKNOWN_CA, Tls, check_pem, read_certificate
+from .uplinks import Uplinks
 from .vehicle_directory import Publishers, VehicleDirectory
 from .write_probe import (
     CONFIRMED,
