@@ -51,6 +51,12 @@ BATCH_MESSAGES: Final = 4096
 
 # --- Doctor ---
 
+EXAMINED_NAMES: Final = 2_000
+"""Services, streams and keys that the doctor examines, because a peer may claim any number. Others are left out."""
+
+SHOWN_FINDINGS: Final = 10
+"""Findings of one check, because a peer may claim to be a thousand vehicles. The others are counted."""
+
 # --- Monitoring ---
 
 # --- Bridges ---

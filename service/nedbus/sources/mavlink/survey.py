@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus import limits
 from nedbus.mavlink import NO_HEARTBEAT, Senders
 
 from .link import DuplicateIds, Link, Packet, name_of, open_link
@@ -18,7 +19,7 @@ from .reader import SYSTEM
 
 _READ_TIMEOUT: Final = 0.25  # s
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
-_NAMED_SENDERS: Final = 5  # a port that is open to the internet receives from thousands
+
 _BAUD: Final = 57600
 _BACKEND: Final = "SDLOG_BACKEND"
 
@@ -50,7 +51,8 @@ class SystemTraffic:
 class LinkSurvey:
     """What arrived on a link; `survey_link` returns one.
 
-    `packets`: their number by address, of the first five addresses. `systems`: the autopilots by system id.
+    `packets`: their number by address, of the first `limits.SHOWN_NAMES` addresses.
+    `systems`: the autopilots by system id.
     `ignored`: why other senders are ignored, by system and component id. `duplicates`: system ids with which two
     addresses send, with a sentence that names these.
     """
@@ -114,7 +116,7 @@ class _Surveyor:
     def _on_packet(self, packet: Packet, now: float) -> None:
         packets = self.survey.packets
         name = name_of(packet.peer)
-        if name in packets or len(packets) < _NAMED_SENDERS:
+        if name in packets or len(packets) < limits.SHOWN_NAMES:
             packets[name] += 1
         if not self._link.stream:
             self._parser = _new_parser()  # a datagram holds whole messages

@@ -9,6 +9,7 @@ import time
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus import limits
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import LinkSurvey, survey_link
 from tests.peers.ports import free_port
@@ -64,8 +65,9 @@ def test_survey_tells_autopilots_from_other_senders() -> None:
     assert len(result.packets) == 1
 
 
-def test_packets_are_counted_for_five_addresses() -> None:
-    """A link on which many addresses send lists the first five; memory does not grow with their number."""
+def test_packets_are_counted_for_few_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A link on which many addresses send lists the first ones; memory does not grow with their number."""
+    monkeypatch.setattr(limits, "SHOWN_NAMES", 5)
     port = free_port()
     senders = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(8)]
 
