@@ -59,4 +59,13 @@ SHOWN_FINDINGS: Final = 10
 
 # --- Monitoring ---
 
+HTTP_REQUESTS: Final = 16
+"""Requests that an HTTP server answers at a time, each in a thread. Further clients wait, or replace the slowest."""
+
+EXPORTED_STREAMS: Final = 1_000
+"""Streams with own time series, which fill Prometheus' memory, positions first. The others are summed as "other"."""
+
+EXPORTED_ROUTERS: Final = 16
+"""Routers with own time series, because any peer may claim to be one. Others are left out."""
+
 # --- Bridges ---
