@@ -69,3 +69,9 @@ EXPORTED_ROUTERS: Final = 16
 """Routers with own time series, because any peer may claim to be one. Others are left out."""
 
 # --- Bridges ---
+
+BRIDGED_STREAMS: Final = 10_000
+"""Streams of which a bridge keeps a clock or a held message, because any peer may publish. The oldest is forgotten."""
+
+LOGGED_STREAMS: Final = 1_000
+"""Streams that the ROS 2 bridge logs as unsupported, and remembers to log once. Others are not logged."""
