@@ -71,7 +71,4 @@ EXPORTED_ROUTERS: Final = 16
 # --- Bridges ---
 
 BRIDGED_STREAMS: Final = 10_000
-"""Streams of which a bridge keeps a clock or a held message, because any peer may publish. The oldest is forgotten."""
-
-LOGGED_STREAMS: Final = 1_000
-"""Streams that the ROS 2 bridge logs as unsupported, and remembers to log once. Others are not logged."""
+"""Streams of which a bridge keeps a clock, a message or a log line, as peers may publish. The oldest is forgotten."""

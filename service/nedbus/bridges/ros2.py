@@ -103,7 +103,7 @@ class Ros2Bridge:
         self._withdrawn: dict[Address, float] = {}
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0  # entity ids used so far
-        self._unsupported: set[Address] = set()
+        self._unsupported: dict[Address, None] = {}  # those logged, the oldest first
         # last sample of streams without a rate, kept until published
         self._held: dict[Address, Sample[Any]] = {}
 
@@ -277,9 +277,11 @@ class Ros2Bridge:
             return False
         if address.topic in self._types:
             return True
-        has_room = len(self._unsupported) < limits.LOGGED_STREAMS
-        if has_room and address not in self._unsupported:
-            self._unsupported.add(address)
+        if address not in self._unsupported:
+            if len(self._unsupported) >= limits.BRIDGED_STREAMS:
+                oldest = next(iter(self._unsupported))
+                del self._unsupported[oldest]
+            self._unsupported[address] = None
             reason = "its px4_msgs type is unknown"
             if address.topic in BY_TOPIC:
                 reason = f"PX4 {self._layout} has no such message"

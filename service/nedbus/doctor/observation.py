@@ -80,7 +80,8 @@ class Observation:
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
         self._query(bus, session)
         tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
-        others = {key for key in tokens if not key.startswith("@")}
+        own = f"{self.prefix}/"
+        self.elsewhere = {key for key in tokens if not key.startswith(("@", own))}
         self._add(newest)
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
@@ -88,11 +89,12 @@ class Observation:
             time.sleep(_POLL)
             self._add(newest)
             for sample in take_others():
-                _add_key(others, str(sample.key_expr))
+                key = str(sample.key_expr)
+                if not key.startswith(own):
+                    _add_key(self.elsewhere, key)
         for address, last in islice(newest.items(), limits.EXAMINED_NAMES):
             self.ages[address] = last.age if math.isfinite(last.age) else None
         self.listened = time.monotonic() - start
-        self.elsewhere = {key for key in others if not key.startswith(f"{self.prefix}/")}
 
     def _query(self, bus: Bus, session: Session) -> None:
         """Ask routers, services and the router's list of publishers."""

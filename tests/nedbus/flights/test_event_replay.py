@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ def log(tmp_path: Path) -> Path:
     writer.define([VLP])
     for tenth in range(120):
         fields: dict[str, object] = VALID | {"xy_valid": tenth < 40, "v_xy_valid": tenth < 40}
-        raw: dict[str, object] = {}
+        raw: dict[str, Any] = {}
         if tenth == 20:
             raw["ref_lon"] = 4000.0
         writer.add(VLP, message(1_000_000 + tenth * 100_000, **fields), **raw)
