@@ -18,9 +18,9 @@ import nedbus_msgs
 from .markdown import cell, code, docstring, page, section, table
 
 PUBLIC_MODULES: Final = (
-    "nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus.vehicle_events", "nedbus.fusion",
-    "nedbus.settings", "nedbus.daemon", "nedbus.monitoring", "nedbus.pki", "nedbus.doctor",
-    "nedbus.rmw_zenoh",
+    "nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus.timeline", "nedbus.flights",
+    "nedbus.vehicle_events", "nedbus.fusion", "nedbus.settings", "nedbus.daemon", "nedbus.sources",
+    "nedbus.monitoring", "nedbus.pki", "nedbus.doctor", "nedbus.rmw_zenoh",
 )  # fmt: skip
 """The modules whose `__all__` is the public API; the others, and further names of these, may change at any time."""
 
@@ -31,8 +31,10 @@ _SECTIONS: Final = {  # by title: the packages of the names
         "nedbus.transport.router",
         "nedbus.transport.tls",
         "nedbus.transport.vehicle_directory",
+        "nedbus.transport.write_probe",
     ),
     "Files": ("nedbus.flights", "nedbus.tables"),
+    "Time": ("nedbus.timeline",),
     "Events": (
         "nedbus.vehicle_events",
         "nedbus.event_history",
@@ -40,13 +42,10 @@ _SECTIONS: Final = {  # by title: the packages of the names
         "nedbus.monitoring.live_events",
     ),
     "External positions": ("nedbus.fusion",),
-    "A service in your program": (
-        "nedbus.settings",
-        "nedbus.daemon",
-        "nedbus.transport.router_log",
-    ),
+    "A service in your program": ("nedbus.settings", "nedbus.daemon"),
+    "MAVLink links": ("nedbus.sources",),
     "Metrics and health": ("nedbus.monitoring",),
-    "Certificates": ("nedbus.pki",),
+    "Certificates and access rules": ("nedbus.pki", "nedbus.transport.access_control"),
     "Checks of settings and networks": ("nedbus.doctor",),
     "ROS 2 over Zenoh": (
         "nedbus.transport.rmw_zenoh",

@@ -35,6 +35,13 @@ _WITHOUT_HASH: Final[Mapping[str, int]] = {
 }  # fmt: skip
 
 
+ARDUPILOT: Final = "mavlink-ardupilot"
+"""The source of a log message whose author is ArduPilot, over MAVLink."""
+
+OTHER_AUTOPILOT: Final = "mavlink-autopilot"
+"""The source of a log message whose author is an autopilot other than PX4 and ArduPilot, over MAVLink."""
+
+
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """The origin of a message, as reported by its publisher.

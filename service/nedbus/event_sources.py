@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from nedbus import Flight, Sample
 from nedbus.errors import ArgumentError
-from nedbus.flights import FileEvents, detect_sample_events, read_file_events, read_flight_events
+from nedbus.flights import detect_events
 from nedbus_msgs import ANY, Selection, VehicleNames
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
     from nedbus import Bus
     from nedbus.health import EventHistory, LiveEvents, Verdict
 
@@ -48,7 +50,7 @@ def events(
         raise ArgumentError(
             "within", within, "None with files and samples, which are read as a whole"
         )
-    return _detect(source).history().of(selection)
+    return detect_events(source).of(selection)
 
 
 def why(
@@ -61,24 +63,11 @@ def why(
 
     Raises the errors of `events` and of `EventHistory.why`.
     """
-    history = source.history() if _is_bus(source) else _detect(source).history()
+    history = source.history() if _is_bus(source) else detect_events(source)
     return history.verdicts(vehicle, at=at)
 
 
-def _is_bus(source: object) -> TypeGuard[Bus]:
+def _is_bus(source: object) -> TypeIs[Bus]:
     """Return whether a source is a bus; without one, its module, which loads Zenoh, is not imported."""
     module = sys.modules.get("nedbus.client.bus")
     return module is not None and isinstance(source, module.Bus)
-
-
-def _detect(source: object) -> FileEvents:
-    if isinstance(source, str | Path):
-        return read_file_events(Path(source).expanduser())
-    if isinstance(source, Flight):
-        return read_flight_events(source)
-    if not isinstance(source, Iterable):
-        expected = "a file, several files, an open flight, samples, or a connected bus"
-        raise ArgumentError("source", source, expected)
-    if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
-        return read_file_events(*[Path(each).expanduser() for each in source])
-    return detect_sample_events(source)

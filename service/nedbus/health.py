@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .event_history import EventHistory
     from .fusion import Fusion, QuantityFusion
     from .monitoring import LiveEvents
-    from .transport import RouterState, query_routers
+    from .transport import RouterState, WriteVerdict, probe_writes, query_routers
     from .vehicle_events import (
         SEVERITIES,
         AccountReport,
@@ -54,7 +54,7 @@ else:
         "event_history": "EventHistory",
         "fusion": "Fusion QuantityFusion",
         "monitoring": "LiveEvents",
-        "transport": "RouterState query_routers",
+        "transport": "RouterState WriteVerdict probe_writes query_routers",
     }
     __getattr__ = lazy_exports(
         "nedbus", {name: ("", module) for module, names in _NAMES.items() for name in names.split()}
@@ -64,6 +64,6 @@ __all__ = [
     "SEVERITIES", "AccountReport", "Condition", "Event", "EventHistory", "Fusion", "Health", "Histogram",
     "LinkCallback", "LiveEvents", "LogStreamStatus", "Monitor", "NewestMessage", "PositionStatus", "Publishers",
     "QuantityFusion", "RejectionReport", "Rejections", "RouterState", "ServiceStatus", "SourceStatus", "Span", "Story",
-    "StreamHealth", "StreamState", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict", "describe_stream",
-    "find_services", "health_of_last", "query_routers", "stream_state",
+    "StreamHealth", "StreamState", "StreamStatus", "Times", "VehicleReport", "Vehicles", "Verdict", "WriteVerdict",
+    "describe_stream", "find_services", "health_of_last", "probe_writes", "query_routers", "stream_state",
 ]  # fmt: skip

@@ -171,6 +171,24 @@ EXCLUDING_KEY_EXPRS: Final = 5000
 
 # --- Doctor ---
 
+EXAMINED_NAMES: Final = 2_000
+"""Services, streams and keys that the doctor examines, because a peer may claim any number. Others are left out."""
+
+SHOWN_FINDINGS: Final = 10
+"""Findings of one check, because a peer may claim to be a thousand vehicles. The others are counted."""
+
 # --- Monitoring ---
 
+HTTP_REQUESTS: Final = 16
+"""Requests that an HTTP server answers at a time, each in a thread. Further clients wait, or replace the slowest."""
+
+EXPORTED_STREAMS: Final = 1_000
+"""Streams with own time series, which fill Prometheus' memory, positions first. The others are summed as "other"."""
+
+EXPORTED_ROUTERS: Final = 16
+"""Routers with own time series, because any peer may claim to be one. Others are left out."""
+
 # --- Bridges ---
+
+BRIDGED_STREAMS: Final = 10_000
+"""Streams of which a bridge keeps a clock, a message or a log line, as peers may publish. The oldest is forgotten."""

@@ -93,7 +93,6 @@ EVENTS: Final[Mapping[str, Event]] = {
     # a link
     "link_lost": Event("the link to a router is lost, or does not come up"),
     "link_up": Event("the link to a router is up, for the first time or again"),
-    "client_refused": Event("a router refuses a client, usually because of its certificate"),
     "access_denied": Event("the router's access rules drop the messages of a vehicle"),
     "access_granted": Event(
         "the router now accepts the messages of a vehicle, which it dropped before"

@@ -6,7 +6,7 @@ import os
 import re
 import tomllib
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -32,29 +32,32 @@ _log = logging.getLogger(__name__)
 __all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source"]
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-# minimum length of a variable's name to count as a truncated setting
-_MIN_PREFIX: Final = len("NEDBUS_TLS")
+_OTHER_VARIABLES: Final = ("config", "log_level", "log_format")  # read by the commands
+_SHORTEST_PREFIX: Final = len("NEDBUS_TLS")  # of a variable that counts as a truncated setting
+_SIMILARITY: Final = 0.85  # of a misspelled variable, from 0 to 1
 
 
 def split_sources(value: object) -> object:
     """Split a string at semicolons and line breaks; without any, at commas followed by `KIND:`."""
     if not isinstance(value, str):
         return value
-    parts = (
-        re.split(r"[;\n]", value)
-        if re.search(r"[;\n]", value)
-        else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
-    )
-    return tuple(part.strip() for part in parts if part.strip())
+    separator = r",(?=\s*[a-z][a-z0-9-]*:)"
+    if re.search(r"[;\n]", value):
+        separator = r"[;\n]"
+    return _stripped(re.split(separator, value))
 
 
 def split_values(value: object) -> object:
     """Split a string at commas."""
-    return (
-        tuple(part.strip() for part in value.split(",") if part.strip())
-        if isinstance(value, str)
-        else value
-    )
+    if not isinstance(value, str):
+        return value
+    return _stripped(value.split(","))
+
+
+def _stripped(parts: Iterable[str]) -> tuple[str, ...]:
+    """Return the parts without surrounding blanks, and without empty ones."""
+    texts = [part.strip() for part in parts]
+    return tuple(text for text in texts if text)
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
@@ -176,8 +179,11 @@ def load_client_settings(
     """Return the settings of a client; with `connect`, settings that a client ignores may be invalid in the file."""
     needed: set[str] | None = None
     if connect is not None:
-        needed = {"prefix"} if prefix is None else set()
-        if tls is None and any(scheme in str(connect) for scheme in ("tls/", "quic/")):
+        needed = set()
+        if prefix is None:
+            needed.add("prefix")
+        is_secure = "tls/" in str(connect) or "quic/" in str(connect)
+        if is_secure and tls is None:
             needed |= {"tls_ca", "tls_certificate", "tls_key"}
     return load_settings(file, needed, connect=connect, prefix=prefix)
 
@@ -188,44 +194,51 @@ def find_mistakes(
     """Return the settings as `load_settings` does, without invalid values, and an error for each invalid value."""
     flags = {name: value for name, value in given.items() if value is not None}
     mistakes: list[ConfigError] = []
-    path, content = None, dict[str, object]()
+    path = None
+    content = dict[str, object]()
     try:
         path = _settings_file(file)
-        content = _read_toml(path) if path and needed != set() else {}
-        content = {
-            name: value for name, value in content.items() if needed is None or name in needed
-        }
+        if path and needed != set():
+            content = _read_toml(path)
     except ConfigError as exc:
         mistakes.append(exc)
-    is_read, details = not mistakes, list[ErrorDetails]()
+    is_read = not mistakes
+    if needed is not None:
+        content = {name: value for name, value in content.items() if name in needed}
     values: dict[str, Any] = content | _read_environment() | flags
+    details = list[ErrorDetails]()
     try:
         settings = Settings(**values)
     except ValidationError as exc:
         details = exc.errors()
         settings = Settings(**_without_mistakes(values, details))
-    _warn_about_misspelled_variables()
-    settings._file, wrong = path, {str(detail["loc"][0]) for detail in details}
-    settings._set_by.update(
-        {name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set}
-    )
+    if needed != set():
+        _warn_about_misspelled_variables()
+    wrong = {str(detail["loc"][0]) for detail in details}
+    settings._file = path
+    for name in wrong | settings.model_fields_set:
+        settings._set_by[name] = _set_by(name, path, flags)
     mistakes += [_setting_error(settings, detail) for detail in details]
-    settings._left_out = frozenset(
-        wrong if is_read else wrong | (Settings.model_fields.keys() - settings._set_by)
-    )
+    left_out = wrong
+    if not is_read:  # the file may have set any other setting
+        left_out = wrong | (Settings.model_fields.keys() - settings._set_by)
+    settings._left_out = frozenset(left_out)
     return settings, mistakes
 
 
 def state_folder() -> Path:
     """Return the folder of state that outlives a process: systemd's StateDirectory, or that of the XDG directories."""
-    if given := os.environ.get("STATE_DIRECTORY"):
-        return Path(given.partition(":")[0])
+    given = os.environ.get("STATE_DIRECTORY")
+    if given:
+        first, _, _ = given.partition(":")
+        return Path(first)
     return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state", "nedbus").expanduser()
 
 
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
     """Return the error for a setting, located by file, line and column, or by the name of the flag or variable."""
-    path, setter = settings._file, settings.set_by(name) or name
+    path = settings._file
+    setter = settings.set_by(name) or name
     if path is None or setter != str(path):
         return ConfigError(setter, reason)
     text = _read_text(path)
@@ -234,20 +247,24 @@ def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
 
 def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
     """Return the error of a source, located by file, line and column, or by the name of the variable."""
+    path = settings._file
     setter = settings.set_by("source")
-    if settings._file is None or setter != str(settings._file):
-        return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
-    text = _read_text(settings._file)
-    return ConfigError.in_text(
-        settings._file, str(error), text, _find_source(text, settings.source, index, error.key)
-    )
+    if path is not None and setter == str(path):
+        text = _read_text(path)
+        place = _find_source(text, settings.source, index, error.key)
+        return ConfigError.in_text(path, str(error), text, place)
+    if setter in {"", "source"}:
+        return error
+    return ConfigError(setter, str(error), key=error.key)
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
     """Return the settings file, None if there is none; raise ConfigError if a given file does not exist."""
     named = given or os.environ.get("NEDBUS_CONFIG")
     if not named:
-        return DEFAULT_FILE if DEFAULT_FILE.is_file() else None
+        if DEFAULT_FILE.is_file():
+            return DEFAULT_FILE
+        return None
     if not Path(named).is_file():
         raise ConfigError.in_file(Path(named), "there is no such file")
     return Path(named)
@@ -263,7 +280,8 @@ def _from_environment(name: str) -> str | None:
 
 def _read_environment() -> dict[str, str]:
     """Return the settings in the environment as text, which `Settings` parses; an empty variable is not set."""
-    return {name: text for name in Settings.model_fields if (text := _from_environment(name))}
+    texts = {name: _from_environment(name) for name in Settings.model_fields}
+    return {name: text for name, text in texts.items() if text}
 
 
 def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
@@ -273,38 +291,43 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
     valid = {name: value for name, value in values.items() if name not in wrong}
     for name in wrong.keys() & Settings.model_fields.keys():
-        value = values.get(name)
-        items = split_sources(value) if name == "source" else split_values(value)
-        if wrong[name] and isinstance(items, list | tuple):
-            valid[name] = tuple(
-                item for index, item in enumerate(items) if index not in wrong[name]
-            )
+        split = split_sources if name == "source" else split_values
+        items = split(values.get(name))
+        indices = wrong[name]
+        if indices and isinstance(items, list | tuple):
+            kept = [item for index, item in enumerate(items) if index not in indices]
+            valid[name] = tuple(kept)
         else:
             valid[name] = Settings.model_fields[name].default
     return valid
 
 
 def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
+    """Return the origin of a setting: the name of the flag, variable or file."""
     if name in flags:
         return name
-    return _variable(name) if _from_environment(name) else str(path or name)
+    if _from_environment(name):
+        return _variable(name)
+    return str(path or name)
 
 
 def _warn_about_misspelled_variables() -> None:
-    known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
-    for variable in sorted(
-        name for name in os.environ if name.startswith("NEDBUS_") and name not in known
-    ):
-        longer = sorted(
-            name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX
-        )
-        if near := longer or difflib.get_close_matches(variable, known, 1, 0.85):
-            _log.warning(
-                "ignored variable %s: did you mean %s?",
-                variable,
-                " or ".join(near),
-                extra=about("setting"),
-            )
+    known = {_variable(name) for name in (*Settings.model_fields, *_OTHER_VARIABLES)}
+    ours = {variable for variable in os.environ if variable.startswith("NEDBUS_")}
+    for variable in sorted(ours - known):
+        near = _similar_variables(variable, known)
+        if near:
+            text = "ignored variable %s: did you mean %s?"
+            _log.warning(text, variable, " or ".join(near), extra=about("setting"))
+
+
+def _similar_variables(variable: str, known: Collection[str]) -> list[str]:
+    """Return the variables that a truncated or misspelled name may mean."""
+    if len(variable) >= _SHORTEST_PREFIX:
+        longer = sorted(name for name in known if name.startswith(variable))
+        if longer:
+            return longer
+    return difflib.get_close_matches(variable, known, 1, _SIMILARITY)
 
 
 def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
@@ -324,9 +347,8 @@ def _read_text(path: Path) -> str:
     except UnicodeDecodeError as exc:
         raise ConfigError.in_file(path, "not UTF-8 text") from exc
     except OSError as exc:
-        raise ConfigError.in_file(
-            path, f"cannot be read ({(exc.strerror or str(exc)).lower()})"
-        ) from exc
+        reason = (exc.strerror or str(exc)).lower()
+        raise ConfigError.in_file(path, f"cannot be read ({reason})") from exc
 
 
 def _read_toml(path: Path) -> dict[str, object]:
@@ -344,28 +366,44 @@ def _read_toml(path: Path) -> dict[str, object]:
 
 def _find_key(text: str, name: str) -> int:
     """Return the index of a key or table, which `tomllib` does not report; -1 if it is not in the text."""
-    found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
-    return found.start(1) if found else -1
+    pattern = rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]"
+    match = re.search(pattern, text, re.MULTILINE)
+    return match.start(1) if match else -1
 
 
 def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> int:
     """Return the index of a source (a table, or a string in a list) or of one of its options."""
     source = sources[index]
-    headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
-    if not isinstance(source, str) and index < len(headers):
-        start = headers[index].start(1)
-        end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
-        option = (
-            re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE)
-            if key
-            else None
-        )
-        return start + option.start(1) if option else start
+    place = -1
     if isinstance(source, str):
-        found = [
-            each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)
-        ]
-        before = sources[:index].count(source)
-        if before < len(found):
-            return found[before]
-    return _find_key(text, "source")
+        place = _find_string(text, source, number=sources[:index].count(source))
+    else:
+        place = _find_table(text, index, key)
+    if place < 0:
+        return _find_key(text, "source")
+    return place
+
+
+def _find_string(text: str, source: str, *, number: int) -> int:
+    """Return the index of a quoted source, which may be there several times; -1 if it is not in the text."""
+    quoted = re.compile(rf"(?<=[\"'])({re.escape(source)})[\"']")
+    places = [match.start(1) for match in quoted.finditer(text)]
+    if number < len(places):
+        return places[number]
+    return -1
+
+
+def _find_table(text: str, index: int, key: str) -> int:
+    """Return the index of a table of sources, or of one of its keys; -1 if it is not in the text."""
+    headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
+    if index >= len(headers):
+        return -1
+    start = headers[index].start(1)
+    if not key:
+        return start
+    end = len(text)
+    if index + 1 < len(headers):
+        end = headers[index + 1].start()
+    pattern = rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*="
+    option = re.search(pattern, text[start:end], re.MULTILINE)
+    return start + option.start(1) if option else start

@@ -13,7 +13,7 @@ from nedbus import Tls
 from nedbus.endpoints import is_loopback, resolution_error
 from nedbus.errors import ConfigError, ConnectError, ListenError
 from nedbus.pki import make_authority, make_certificate
-from nedbus.settings import load_settings
+from nedbus.settings import load_client_settings, load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
 from tests.peers.command_line import run_command
@@ -385,3 +385,14 @@ def test_error_in_a_text_has_line_and_column(index: int, where: str) -> None:
 def test_loopback_addresses_are_recognised(host: str, expected: bool) -> None:
     """All of 127.0.0.0/8, ::1 and localhost are reachable from this host only."""
     assert is_loopback(host) == expected
+
+
+def test_misspelled_variable_is_not_reported_where_none_is_needed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A client with endpoint and prefix needs no variable, so it warns of none; the doctor opens several of them."""
+    monkeypatch.setenv("NEDBUS_CONECT", "tcp/127.0.0.1:1")
+    load_client_settings(None, connect="tcp/127.0.0.1:7447", prefix="nedbus", tls=None)
+    assert caplog.messages == []
+    load_client_settings(None, connect="tcp/127.0.0.1:7447", prefix=None, tls=None)
+    assert caplog.messages == ["ignored variable NEDBUS_CONECT: did you mean NEDBUS_CONNECT?"]

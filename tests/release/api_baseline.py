@@ -7,6 +7,7 @@ has changed. `--write` renews the file, which is a step of each release.
 
 from __future__ import annotations
 
+import inspect
 import logging
 import re
 import sys
@@ -80,10 +81,14 @@ def describe_api() -> str:
 
 
 def _find(loader: griffe.GriffeLoader, module: ModuleType, name: str) -> griffe.Object:
+    """Return what a name refers to; for another name of a function, that function."""
+    value = getattr(module, name)
+    own_path = f"{module.__name__}.{name}"
+    if inspect.isfunction(value) and value.__name__ != name:
+        own_path = f"{value.__module__}.{value.__qualname__}"
     try:
-        found = loader.modules_collection[f"{module.__name__}.{name}"]
-    except KeyError:  # imported by `*`, or another name of a function
-        value = getattr(module, name)
+        found = loader.modules_collection[own_path]
+    except KeyError:  # imported by `*`
         found = loader.modules_collection[f"{value.__module__}.{value.__qualname__}"]
     target = found.final_target if found.is_alias else found
     assert isinstance(target, griffe.Object)

@@ -36,6 +36,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.frames import (
     CommonOrigin,
+    GlobalPosition,
     ned_to_enu,
     quaternion_ned_to_enu,
     to_global,
@@ -45,7 +46,7 @@ from nedbus_msgs.frames import (
 from . import FOXGLOVE_PORT
 
 _ATTITUDE: Final = "vehicle_attitude"
-_MAX_APART: Final = 500_000  # us between a position and the attitude paired with it
+_PAIRED: Final = 500_000  # us between a position and an attitude that belong together
 _NO_ROTATION: Final = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
@@ -58,7 +59,8 @@ class FoxgloveServer:
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
-        self._bus, self._newest = bus, Monitor()
+        self._bus = bus
+        self._newest = Monitor()
         self._context = foxglove.Context()
         self._fields: dict[tuple[Address, Definition[Any]], foxglove.Channel] = {}
         # streams without a rate, whose last message no client has received
@@ -72,10 +74,10 @@ class FoxgloveServer:
                 name="nedbus", host=host, port=port, context=self._context
             )
         except RuntimeError as exc:  # "...: Address already in use (os error 98)"
-            reason = str(exc).rpartition(": ")[2].partition(" (os error")[0].lower()
-            raise ListenError(
-                [f"ws://{host}:{port}"], reason, hint="choose another address with --http"
-            ) from exc
+            _, _, text = str(exc).rpartition(": ")
+            reason, _, _ = text.partition(" (os error")
+            hint = "choose another address with --http"
+            raise ListenError([f"ws://{host}:{port}"], reason.lower(), hint=hint) from exc
         self._transforms = FrameTransformsChannel("/tf", context=self._context)
         self.url = f"ws://{host}:{self._server.port}"
 
@@ -108,7 +110,8 @@ class FoxgloveServer:
         self._server.stop()
 
     def _log_fields(self, sample: Sample[Any]) -> None:
-        address, message = sample.address, sample.message
+        address = sample.address
+        message = sample.message
         definition: Definition[Any] = message.DEFINITION
         channel = self._fields.get((address, definition))
         if channel is None:
@@ -120,69 +123,72 @@ class FoxgloveServer:
             self._fields[address, definition] = channel
         if channel.has_sinks():
             self._unseen.discard(address)
-            channel.log(
-                encode_with(definition, message.__dict__, definition.current),
-                log_time=_time_of(sample),
-            )
+            payload = encode_with(definition, message.__dict__, definition.current)
+            channel.log(payload, log_time=_time_of(sample))
         elif not get_topic(address.topic).rate:
             self._unseen.add(address)  # it may never have another message
 
     def _log_position(self, sample: Sample[VehicleLocalPosition]) -> None:
+        """Log pose, frames and location of a position, as far as it has them."""
         vehicle = sample.vehicle
         message = sample.message
         time_ns = _time_of(sample)
         if vehicle not in self._channels:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
-            self._channels[vehicle] = (
-                pose,
-                LocationFixChannel(f"/{vehicle}/location", context=self._context),
-            )
+            location = LocationFixChannel(f"/{vehicle}/location", context=self._context)
+            self._channels[vehicle] = (pose, location)
         poses, locations = self._channels[vehicle]
         stamp = messages.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         if math.isfinite(message.x + message.y + message.z):
-            east, north, up = ned_to_enu((message.x, message.y, message.z))
-            attitude = self._newest.get(Address(vehicle, _ATTITUDE))
-            x, y, z, w = orientation_of(message, attitude.message if attitude else None)
-            position = messages.Vector3(x=east, y=north, z=up)
-            orientation = messages.Quaternion(x=x, y=y, z=z, w=w)
-            local = f"{vehicle}/local"
+            position, orientation = self._pose_of(vehicle, message)
             pose_in_local = messages.Pose(position=position, orientation=orientation)
-            poses.log(
-                messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local),
-                log_time=time_ns,
-            )
+            frame = f"{vehicle}/local"
+            pose_message = messages.PoseInFrame(timestamp=stamp, frame_id=frame, pose=pose_in_local)
+            poses.log(pose_message, log_time=time_ns)
             if message.xy_global:
                 self._local_in_map[vehicle] = self._locate(vehicle, message)
-            origin = self._local_in_map.get(vehicle, messages.Vector3(x=0.0, y=0.0, z=0.0))
-            frames = (("map", local, origin, _NO_ROTATION), (local, vehicle, position, orientation))
-            transforms = [
-                messages.FrameTransform(
-                    timestamp=stamp,
-                    parent_frame_id=parent,
-                    child_frame_id=child,
-                    translation=moved,
-                    rotation=turned,
-                )
-                for parent, child, moved, turned in frames
-            ]
-            self._transforms.log(messages.FrameTransforms(transforms=transforms), log_time=time_ns)
+            transforms = self._transforms_of(vehicle, position, orientation, stamp)
+            self._transforms.log(transforms, log_time=time_ns)
         fix = to_global(message)
         if fix and message.xy_valid:
-            variance = message.eph**2 / 2
-            is_known = math.isfinite(variance + message.epv)
-            types = messages.LocationFixPositionCovarianceType
-            location = messages.LocationFix(
-                timestamp=stamp,
-                frame_id=vehicle,
-                latitude=fix.latitude,
-                longitude=fix.longitude,
-                altitude=fix.altitude,
-                position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2]
-                if is_known
-                else [],
-                position_covariance_type=types.Approximated if is_known else types.Unknown,
-            )
-            locations.log(location, log_time=time_ns)
+            locations.log(_location_of(vehicle, message, fix, stamp), log_time=time_ns)
+
+    def _pose_of(
+        self, vehicle: str, message: VehicleLocalPosition
+    ) -> tuple[messages.Vector3, messages.Quaternion]:
+        """Return position and orientation in the local frame: FLU in ENU."""
+        east, north, up = ned_to_enu((message.x, message.y, message.z))
+        newest = self._newest.get(Address(vehicle, _ATTITUDE))
+        attitude = newest.message if newest else None
+        x, y, z, w = orientation_of(message, attitude)
+        position = messages.Vector3(x=east, y=north, z=up)
+        return position, messages.Quaternion(x=x, y=y, z=z, w=w)
+
+    def _transforms_of(
+        self,
+        vehicle: str,
+        position: messages.Vector3,
+        orientation: messages.Quaternion,
+        stamp: messages.Timestamp,
+    ) -> messages.FrameTransforms:
+        """Return the frames map -> <vehicle>/local -> <vehicle>."""
+        local = f"{vehicle}/local"
+        origin = self._local_in_map.get(vehicle, messages.Vector3(x=0.0, y=0.0, z=0.0))
+        local_in_map = messages.FrameTransform(
+            timestamp=stamp,
+            parent_frame_id="map",
+            child_frame_id=local,
+            translation=origin,
+            rotation=_NO_ROTATION,
+        )
+        vehicle_in_local = messages.FrameTransform(
+            timestamp=stamp,
+            parent_frame_id=local,
+            child_frame_id=vehicle,
+            translation=position,
+            rotation=orientation,
+        )
+        return messages.FrameTransforms(transforms=[local_in_map, vehicle_in_local])
 
     def _locate(self, vehicle: str, message: VehicleLocalPosition) -> messages.Vector3:
         """Return the translation from `map` to the local frame of a message with a global origin, in ENU [m]."""
@@ -194,9 +200,9 @@ class FoxgloveServer:
         published = self._bus.publishers()
         if not self._bus.connected:
             return  # without a link the list of vehicles is incomplete
-        for address, definition in [
-            stream for stream in self._fields if stream[0] not in published
-        ]:
+        for address, definition in list(self._fields):
+            if address in published:
+                continue
             self._fields.pop((address, definition)).close()
             self._unseen.discard(address)
             self._newest.forget(address)
@@ -205,6 +211,28 @@ class FoxgloveServer:
             for channel in self._channels.pop(name):
                 channel.close()
             self._local_in_map.pop(name, None)
+
+
+def _location_of(
+    vehicle: str, message: VehicleLocalPosition, fix: GlobalPosition, stamp: messages.Timestamp
+) -> messages.LocationFix:
+    """Return the location of a position, with its variance [m^2] if that is known."""
+    variance = message.eph**2 / 2
+    types = messages.LocationFixPositionCovarianceType
+    covariance = list[float]()
+    covariance_type = types.Unknown
+    if math.isfinite(variance + message.epv):
+        covariance = [variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2]
+        covariance_type = types.Approximated
+    return messages.LocationFix(
+        timestamp=stamp,
+        frame_id=vehicle,
+        latitude=fix.latitude,
+        longitude=fix.longitude,
+        altitude=fix.altitude,
+        position_covariance=covariance,
+        position_covariance_type=covariance_type,
+    )
 
 
 def _time_of(sample: Sample[Any]) -> int:
@@ -218,7 +246,7 @@ def orientation_of(
 
     It comes from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, FLU faces east.
     """
-    if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
+    if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _PAIRED:
         w, x, y, z = quaternion_ned_to_enu(attitude.q)
         if math.isfinite(w + x + y + z):
             return x, y, z, w

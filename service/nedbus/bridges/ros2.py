@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import zenoh
 
-from nedbus import Bus, Sample, Session, Subscription, clock
+from nedbus import Bus, Sample, Session, Subscription, clock, limits
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
 from nedbus.rmw_zenoh import (
@@ -51,9 +51,7 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 _log = logging.getLogger(__name__)
 
 # s after which a withdrawn address is forgotten; longer than the 20 s of loss recovery
-_MAX_ABSENCE: Final = 60.0
-_MAX_UNSUPPORTED: Final = 1000  # addresses that are logged as unsupported
-_MAX_HELD: Final = 10_000  # held messages; beyond that the oldest is dropped
+_ABSENCE: Final = 60.0
 _REFUSALS: Final = {
     "conflict": "%s is not published to ROS 2, because %s already uses the topic /%s: set --namespace",
     "defer": "%s is not published to ROS 2, because node %s already publishes /%s",
@@ -87,7 +85,8 @@ class Ros2Bridge:
         hashed: bool = True,
         namespaces: Mapping[str, str] | None = None,
     ) -> None:
-        if layout not in (known := dict.fromkeys((*RELEASES, *DEFAULT.layouts))):
+        known = dict.fromkeys((*RELEASES, *DEFAULT.layouts))
+        if layout not in known:
             raise LayoutError(f"unknown layout {layout!r}: choose from {', '.join(known)}")
         self._bus = bus
         self._session = session
@@ -95,20 +94,16 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        # definition, layout and type hash, by topic
-        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}
-        for topic, definition in BY_TOPIC.items():
-            if found := definition.layout_of_release(layout):
-                type_hash = hash_of(found, ros2_type(definition)) if hashed else NO_HASH
-                self._types[topic] = definition, found, type_hash
-        self._zid, self._node = str(session.info.zid()), f"nedbus_{os.getpid()}"
+        self._types = _types_of(layout, hashed=hashed)
+        self._zid = str(session.info.zid())
+        self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
         # withdrawal time [s]; the late filter still has its clock
         self._withdrawn: dict[Address, float] = {}
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0  # entity ids used so far
-        self._unsupported: set[Address] = set()
+        self._unsupported: dict[Address, None] = {}  # those logged, the oldest first
         # last sample of streams without a rate, kept until published
         self._held: dict[Address, Sample[Any]] = {}
 
@@ -139,8 +134,9 @@ class Ros2Bridge:
         """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
         end = time.monotonic() + TIMINGS.token_visible
         while not stop.is_set() and not token_keys(observer, token, timeout=0.5):
-            if not all(session.info.routers_zid() for session in (observer, self._session)):
-                # restart the timeout while there is no link
+            is_linked = observer.info.routers_zid() and self._session.info.routers_zid()
+            if not is_linked:
+                # Without a link, the timeout begins again.
                 end = time.monotonic() + TIMINGS.token_visible
             elif time.monotonic() > end:
                 raise NedbusError(
@@ -169,7 +165,9 @@ class Ros2Bridge:
                 self._hold(sample)
 
     def _hold(self, sample: Sample[Any]) -> None:
-        if len(self._held) >= _MAX_HELD and sample.address not in self._held:
+        """Keep the last message of a stream without a rate until its topic is published."""
+        is_full = len(self._held) >= limits.BRIDGED_STREAMS
+        if is_full and sample.address not in self._held:
             address = next(iter(self._held))
             _log.debug("%s: dropped a message that waits for its ROS 2 topic", address)
             del self._held[address]
@@ -177,36 +175,43 @@ class Ros2Bridge:
 
     def _poll(self) -> None:
         """Report late samples, query the bus and the ROS 2 nodes, and apply the decisions."""
-        if held_back := self._late_filter.report():
-            _log.warning(
-                "%s; ROS 2 nodes would treat old messages as current",
-                held_back,
-                extra=about("bridge_late"),
-            )
-        for address in [
-            each
-            for each, since in self._withdrawn.items()
-            if time.monotonic() - since > _MAX_ABSENCE
-        ]:
+        held_back = self._late_filter.report()
+        if held_back:
+            text = "%s; ROS 2 nodes would treat old messages as current"
+            _log.warning(text, held_back, extra=about("bridge_late"))
+        self._forget_withdrawn()
+        addresses = [address for address in self._bus.publishers() if self._is_bridged(address)]
+        is_linked = self._bus.connected and self._session.info.routers_zid()
+        if not is_linked:
+            return  # the replies are incomplete
+        nodes = self._other_nodes()
+        others = dict[Address, str]()
+        for address in addresses:
+            node = nodes.get(self._key(address))
+            if node is not None:
+                others[address] = node
+        for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
+            self._apply(decision)
+
+    def _forget_withdrawn(self) -> None:
+        """Forget addresses that have been absent for a minute."""
+        before = time.monotonic() - _ABSENCE
+        ended = [address for address, since in self._withdrawn.items() if since < before]
+        for address in ended:
             del self._withdrawn[address]
             self._held.pop(address, None)
             self._late_filter.forget(address)
-        addresses = list(filter(self._is_bridged, self._bus.publishers()))
-        if not (self._bus.connected and self._session.info.routers_zid()):
-            return  # without a link the replies are incomplete
-        nodes: dict[TopicKey, str] = {}  # other nodes, by the topic they publish
-        for text in token_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
+
+    def _other_nodes(self) -> dict[TopicKey, str]:
+        """Return the other nodes that publish PX4 messages, by their topic."""
+        nodes = dict[TopicKey, str]()
+        key_expr = px4_publishers_key_expr(self._domain)
+        for text in token_keys(self._session, key_expr, timeout=0.5):
             with suppress(DecodeError):
                 token = PublisherToken.parse(text)
                 if token.session != self._zid:
                     nodes.setdefault(token.key, token.node)
-        others = {
-            address: node
-            for address in addresses
-            if (node := nodes.get(self._key(address))) is not None
-        }
-        for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
-            self._apply(decision)
+        return nodes
 
     def _apply(self, decision: Decision) -> None:
         address = decision.address
@@ -216,22 +221,15 @@ class Ros2Bridge:
             self._open(address)
             self._withdrawn.pop(address, None)
             definition, layout, _ = self._types[address.topic]
-            name = ros2_type(definition)
-            _log.info(
-                "%s -> /%s, %s of layout %s",
-                address,
-                topic,
-                name,
-                layout.name,
-                extra=about("bridged", address),
-            )
+            text = "%s -> /%s, %s of layout %s"
+            values = (address, topic, ros2_type(definition), layout.name)
+            _log.info(text, *values, extra=about("bridged", address))
             if address in self._held:
                 self._put(self._held.pop(address))
         elif decision.action in _REFUSALS:
             self._close(address)
-            _log.warning(
-                _REFUSALS[decision.action], address, other, topic, extra=about("conflict", address)
-            )
+            text = _REFUSALS[decision.action]
+            _log.warning(text, address, other, topic, extra=about("conflict", address))
         else:
             self._close(address)
             # After a router restart the address soon returns, with the messages of the outage.
@@ -243,26 +241,26 @@ class Ros2Bridge:
         key = self._key(address)
         self._entities += 1
         token = key.token("MP", self._zid, self._node, self._entities)
-        drop = zenoh.CongestionControl.DROP
-        encoding = BRIDGED_ENCODING
         with translate_zenoh_errors():
             publisher = self._session.declare_publisher(
-                str(key), encoding=encoding, congestion_control=drop
+                str(key),
+                encoding=BRIDGED_ENCODING,
+                congestion_control=zenoh.CongestionControl.DROP,
             )
             declared = self._session.liveliness().declare_token(token)
         self._publishers[address] = _Ros2Publisher(gid_of_token(token), publisher, declared)
 
     def _close(self, address: Address) -> None:
-        if publisher := self._publishers.pop(address, None):
+        publisher = self._publishers.pop(address, None)
+        if publisher is not None:
             publisher.token.undeclare()
             publisher.publisher.undeclare()
 
     def _put(self, sample: Sample[Message]) -> None:
         publisher = self._publishers[sample.address]
         definition, layout, _ = self._types[sample.topic]
-        payload = encode_with(
-            definition, definition.downgrade(sample.message.__dict__, layout), layout
-        )
+        fields = definition.downgrade(sample.message.__dict__, layout)
+        payload = encode_with(definition, fields, layout)
         publisher.sequence += 1
         attachment = bytes(Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
         with translate_zenoh_errors():
@@ -279,21 +277,31 @@ class Ros2Bridge:
             return False
         if address.topic in self._types:
             return True
-        if address not in self._unsupported and len(self._unsupported) < _MAX_UNSUPPORTED:
-            self._unsupported.add(address)
-            known = address.topic in BY_TOPIC
-            reason = (
-                f"PX4 {self._layout} has no such message"
-                if known
-                else "its px4_msgs type is unknown"
-            )
-            _log.warning(
-                "%s is not published to ROS 2: %s",
-                address,
-                reason,
-                extra=about("unsupported", address),
-            )
+        if address not in self._unsupported:
+            if len(self._unsupported) >= limits.BRIDGED_STREAMS:
+                oldest = next(iter(self._unsupported))
+                del self._unsupported[oldest]
+            self._unsupported[address] = None
+            reason = "its px4_msgs type is unknown"
+            if address.topic in BY_TOPIC:
+                reason = f"PX4 {self._layout} has no such message"
+            text = "%s is not published to ROS 2: %s"
+            _log.warning(text, address, reason, extra=about("unsupported", address))
         return False
+
+
+def _types_of(release: str, *, hashed: bool) -> dict[str, tuple[Definition[Any], Layout, str]]:
+    """Return definition, layout and type hash by topic, for the messages that a release has."""
+    types = dict[str, tuple[Definition[Any], Layout, str]]()
+    for topic, definition in BY_TOPIC.items():
+        layout = definition.layout_of_release(release)
+        if layout is None:
+            continue
+        type_hash = NO_HASH
+        if hashed:
+            type_hash = hash_of(layout, ros2_type(definition))
+        types[topic] = definition, layout, type_hash
+    return types
 
 
 @dataclass(slots=True, eq=False)

@@ -39,13 +39,10 @@ class Ros2Arbiter:
     """
 
     def __init__(self, namespaces: Mapping[str, str]) -> None:
+        expected = "a letter, then letters, digits and _, with / between names"
         for namespace in namespaces.values():
             if not _NAMESPACE.fullmatch(namespace.strip("/")):
-                raise AddressError(
-                    "namespace",
-                    namespace,
-                    "a letter, then letters, digits and _, with / between names",
-                )
+                raise AddressError("namespace", namespace, expected)
         self._namespaces = {"1": "", **namespaces}
         self.published: dict[Address, str] = {}
         self._deferred: dict[Address, float] = {}  # when another node's publisher was last seen [s]
@@ -68,32 +65,34 @@ class Ros2Arbiter:
         `now`: time on any monotonic clock [s].
         """
         present = set(addresses)
-        gone = sorted(self.published.keys() - present)
-        decisions = [Decision("withdraw", address, self.published.pop(address)) for address in gone]
-        self._deferred = {
-            address: seen for address, seen in self._deferred.items() if address in present
-        }
+        decisions = list[Decision]()
+        for address in sorted(self.published.keys() - present):
+            topic = self.published.pop(address)
+            decisions.append(Decision("withdraw", address, topic))
+        for address in self._deferred.keys() - present:
+            del self._deferred[address]
         self._conflicts &= present
-        decided = (
-            self._decide(address, other_nodes.get(address), now) for address in sorted(present)
-        )
-        return decisions + [decision for decision in decided if decision]
+        for address in sorted(present):
+            decision = self._decide(address, other_nodes.get(address), now)
+            if decision is not None:
+                decisions.append(decision)
+        return decisions
 
     def _decide(self, address: Address, other_node: str | None, now: float) -> Decision | None:
+        """Return the change for an address on the bus; `other_node`: the node that publishes its topic."""
         topic = self.topic_of(address)
         if other_node is not None:
             is_new = address not in self._deferred
             self._deferred[address] = now
             self.published.pop(address, None)
-            return Decision("defer", address, topic, other_node) if is_new else None
-        if (
-            address in self.published
-            or now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over
-        ):
+            if is_new:
+                return Decision("defer", address, topic, other_node)
             return None
-        owner = next(
-            (each for each, published in self.published.items() if published == topic), None
-        )
+        # A node that restarts must find its topic free.
+        is_deferred = now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over
+        if is_deferred or address in self.published:
+            return None
+        owner = self._owner_of(topic)
         if owner is None:
             self._deferred.pop(address, None)
             self._conflicts.discard(address)
@@ -103,3 +102,10 @@ class Ros2Arbiter:
             return None
         self._conflicts.add(address)
         return Decision("conflict", address, topic, str(owner))
+
+    def _owner_of(self, topic: str) -> Address | None:
+        """Return the published address that uses a topic; None if the topic is free."""
+        for address, published in self.published.items():
+            if published == topic:
+                return address
+        return None

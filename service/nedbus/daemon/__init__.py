@@ -6,12 +6,10 @@ threading.Thread(target=daemon.run).start()
 daemon.stop()
 """
 
-from nedbus.transport import log_refusals
-
 from .daemon import SOURCE_FORMS, Daemon, plan_sources
 from .router import run_router
 from .worker import STATES, PlannedSource, SourceMeasures
 
 __all__ = [
-    "SOURCE_FORMS", "STATES", "Daemon", "PlannedSource", "SourceMeasures", "log_refusals", "plan_sources", "run_router",
+    "SOURCE_FORMS", "STATES", "Daemon", "PlannedSource", "SourceMeasures", "plan_sources", "run_router",
 ]  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from nedbus.log_event import about
-from nedbus.transport import Tls, Uplinks, log_refusals, open_router, router_endpoints
+from nedbus.transport import Tls, Uplinks, open_router, router_endpoints
 
 _log = logging.getLogger(__name__)
 
@@ -23,19 +23,15 @@ def run_router(
     tls: Tls | None = None,
     closing: threading.Event | None = None,
 ) -> None:
-    """Run a Zenoh router until `stop` is set; log its links to other routers, and the clients that it refuses.
+    """Run a Zenoh router until `stop` is set; log its links to other routers.
 
     `listen`: endpoints, by default those of the file, else tcp/127.0.0.1:7447. `connect`: routers to join.
     `config_file`: a configuration of `zenohd`, whose endpoints `listen` and `connect` override.
     `tls`: files for `tls/` routers to join. `closing`: set once only the session is still open.
 
-    Zenoh reports refused clients only in its log: with a `tls/` endpoint, standard output goes through a pipe.
-
     Raises ListenError if it cannot listen, ConfigError for an invalid endpoint or file.
     """
     where = router_endpoints(listen, config_file)
-    if any(endpoint.startswith("tls/") for endpoint in where):
-        log_refusals()
     session = open_router(listen=listen, connect=connect, config_file=config_file, tls=tls)
     joining = f", joining {', '.join(connect)}" if connect else ""
     _log.info("router on %s%s", ", ".join(where), joining, extra=about("router"))

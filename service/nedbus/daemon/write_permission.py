@@ -22,7 +22,7 @@ from nedbus.transport import (
     CONFIRMED,
     Session,
     Tls,
-    Verdict,
+    WriteVerdict,
     probe_at_router,
     routers_of,
     secure_endpoints,
@@ -129,7 +129,7 @@ class WritePermission:
 
     def _check(self) -> float:
         vehicles = self._vehicles()
-        verdicts: Mapping[str, Verdict] = {}
+        verdicts: Mapping[str, WriteVerdict] = {}
         try:
             verdicts = self._probe(vehicles)
         except NedbusError as exc:  # link or session closed, or a TLS file being replaced
@@ -175,7 +175,7 @@ class WritePermission:
             TIMINGS.probe_pause if set(verdicts.values()) == {"allowed"} else TIMINGS.probe_unsure
         )
 
-    def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
+    def _probe(self, vehicles: set[str]) -> Mapping[str, WriteVerdict]:
         """Return the verdict for each vehicle, or no verdicts if the two sessions share no router."""
         return probe_at_router(
             self._session,

@@ -5,7 +5,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from nedbus.transport import AccessControl, Verdict
+from nedbus.health import WriteVerdict
+from nedbus.pki import AccessControl
 from nedbus_msgs import ANY, DEFAULT_TOPIC, all_status_keys, status_key
 
 from .finding import Finding
@@ -50,70 +51,66 @@ def find_rule_mistakes(access: AccessControl) -> list[RuleMistake]:
     """
     if not access.is_enabled:
         return []
-    found = defaultdict[str, list[str]](list)  # certificates by mistake
-    permissions = list(_permissions(access))
-    for permission in permissions:
+    certificates = defaultdict[str, list[str]](list)  # by mistake
+    examples = dict[str, _Permission]()  # the first permission of each prefix
+    for permission in _permissions(access):
+        examples.setdefault(permission.prefix, permission)
         for reason in _mistakes_of_vehicle(access, permission):
-            found[reason].append(permission.certificate)
-    for prefix in dict.fromkeys(permission.prefix for permission in permissions):
-        example = next(each for each in permissions if each.prefix == prefix)
-        for certificate in access.certificates:
-            if _reads(access, certificate, prefix) and not _reads_status(
-                access, certificate, example
-            ):
-                found[f"may read messages, but not the status of services: {_COMMON}"].append(
-                    certificate
-                )
-        for key in (
-            f"{prefix}/@rejected/{example.vehicle}/{DEFAULT_TOPIC}",
-            _heartbeat_key(example),
-        ):
-            if not access.limits_size(key):
-                reason = f"may put messages of any size on {key}, which fill the memory of readers: {_FILTER}"
-                found[reason].append(example.certificate)
+            certificates[reason].append(permission.certificate)
+    for example in examples.values():
+        for reason, certificate in _mistakes_of_prefix(access, example):
+            certificates[reason].append(certificate)
     return [
         RuleMistake(names[0], f"{_list_certificates(names)} {reason}")
-        for reason, names in found.items()
+        for reason, names in certificates.items()
     ]
+
+
+def _mistakes_of_prefix(access: AccessControl, example: _Permission) -> Iterator[tuple[str, str]]:
+    """Yield mistakes of the rules common to all vehicles of a prefix, each with a certificate that has it."""
+    for certificate in access.certificates:
+        reads = _reads(access, certificate, example.prefix)
+        if reads and not _reads_status(access, certificate, example):
+            yield f"may read messages, but not the status of services: {_COMMON}", certificate
+    rejections = f"{example.prefix}/@rejected/{example.vehicle}/{DEFAULT_TOPIC}"
+    for key in (rejections, _heartbeat_key(example)):
+        if not access.limits_size(key):
+            reason = f"may put messages of any size on {key}, which fill the memory of readers: {_FILTER}"
+            yield reason, example.certificate
 
 
 def _permissions(access: AccessControl) -> Iterator[_Permission]:
     """Yield the vehicles that each certificate may publish."""
     for certificate in access.certificates:
-        vehicles = dict[_Permission, None]()
+        permissions = dict[_Permission, None]()  # in order, each once
         for rule in access.rules_of(certificate):
-            if rule.is_allowed and rule.is_for("put", "ingress"):
-                for key_expr in rule.key_exprs:
-                    if vehicle := _OF_VEHICLE.fullmatch(str(key_expr)):
-                        vehicles[
-                            _Permission(certificate, vehicle["prefix"], vehicle["vehicle"])
-                        ] = None
-        yield from vehicles
+            if not rule.is_allowed or not rule.is_for("put", "ingress"):
+                continue
+            for key_expr in rule.key_exprs:
+                vehicle = _OF_VEHICLE.fullmatch(str(key_expr))
+                if vehicle is not None:
+                    name = vehicle["vehicle"]
+                    permissions[_Permission(certificate, vehicle["prefix"], name)] = None
+        yield from permissions
 
 
 def _mistakes_of_vehicle(access: AccessControl, permission: _Permission) -> Iterator[str]:
     certificate, prefix, vehicle = permission
     own_status = status_key("1a", vehicle=vehicle, prefix=prefix)
     may_report = access.decide(certificate, "reply", "ingress", own_status).is_allowed
-    is_asked = access.decide(
-        certificate, "query", "egress", all_status_keys(prefix=prefix)
-    ).is_allowed
+    all_keys = all_status_keys(prefix=prefix)
+    is_asked = access.decide(certificate, "query", "egress", all_keys).is_allowed
     if not (may_report and is_asked):
         yield (
             "may publish a vehicle, but not report about it under a key that names the vehicle; one vehicle can speak"
             f" for another under a key that does not: {_COMMON}"
         )
     other = f"{vehicle}-other"  # which no rule names
-    allowed = [
-        verb
-        for message, key, verb in _OWN_KEYS
-        if access.decide(
-            certificate,
-            message,
-            "ingress",
-            key.format(prefix=prefix, vehicle=other, topic=DEFAULT_TOPIC),
-        ).is_allowed
-    ]
+    allowed = list[str]()
+    for message, pattern, verb in _OWN_KEYS:
+        key = pattern.format(prefix=prefix, vehicle=other, topic=DEFAULT_TOPIC)
+        if access.decide(certificate, message, "ingress", key).is_allowed:
+            allowed.append(verb)
     if allowed and len(allowed) < len(_OWN_KEYS):  # one that may do everything is a router
         verbs = " and ".join(dict.fromkeys(allowed))
         yield f"may {verbs} every vehicle, not only its own: name the vehicle in the keys of its rule"
@@ -149,7 +146,7 @@ def explain_permissions(
     *,
     vehicle: str | None,
     prefix: str,
-    verdict: Verdict | None,
+    verdict: WriteVerdict | None,
 ) -> Iterator[Finding]:
     """Yield which rule decides about the messages of a client: those of a vehicle, if given, else of a reader.
 
@@ -159,24 +156,16 @@ def explain_permissions(
         yield _explain(access, certificate, "declare_subscriber", f"{prefix}/{ANY}/{DEFAULT_TOPIC}")
         yield _explain(access, certificate, "query", all_status_keys(prefix=prefix))
         return
-    for message, key, _ in _OWN_KEYS:
-        yield _explain(
-            access,
-            certificate,
-            message,
-            key.format(prefix=prefix, vehicle=vehicle, topic=DEFAULT_TOPIC),
-        )
+    for message, pattern, _ in _OWN_KEYS:
+        key = pattern.format(prefix=prefix, vehicle=vehicle, topic=DEFAULT_TOPIC)
+        yield _explain(access, certificate, message, key)
     key = f"{prefix}/{vehicle}/{DEFAULT_TOPIC}"
     is_allowed = access.decide(certificate, "put", "ingress", key).is_allowed
-    if verdict in {"allowed", "denied"} and (verdict == "allowed") != is_allowed:
+    expected = "allowed" if is_allowed else "denied"
+    if verdict not in (None, "unknown", expected):
         seen = f"a probe of vehicle {vehicle} was {verdict}, against this file"
-        yield Finding(
-            "rules",
-            certificate,
-            "warning",
-            seen,
-            "the router reads its rules only at startup: restart it",
-        )
+        advice = "the router reads its rules only at startup: restart it"
+        yield Finding("rules", certificate, "warning", seen, advice)
 
 
 def _explain(access: AccessControl, certificate: str, message: str, key: str) -> Finding:

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
+from nedbus import limits
 from nedbus_msgs.text import counted
 
 State = Literal["ok", "unknown", "warning", "wrong"]
@@ -16,8 +17,7 @@ FIRST_PARTNER: Final = (
 )
 """Advice for a link of udpout on which nothing arrives."""
 
-_MAX_FINDINGS: Final = 10  # per check: a peer may claim to be a thousand vehicles
-_MAX_NAME: Final = 140  # characters of a name from a peer; an address has up to 133
+_LISTED: Final = 5  # names in the text of a finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,30 +51,35 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
 def limit_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Merge equal findings of a check, and return the worst, preceded by one that states the number of the others."""
     ordered = sort_findings(_merge_equal(findings))
-    rest, kept = ordered[:-_MAX_FINDINGS], ordered[-_MAX_FINDINGS:]
-    if rest:
-        text = f"{counted(len(rest), 'more finding')} of this check"
-        kept.insert(0, Finding(kept[0].check, "", worst_state(rest), text))
-    return kept
+    kept = ordered[-limits.SHOWN_FINDINGS :]
+    others = ordered[: -limits.SHOWN_FINDINGS]
+    if not others:
+        return kept
+    text = f"{counted(len(others), 'more finding')} of this check"
+    return [Finding(kept[0].check, "", worst_state(others), text), *kept]
 
 
 def _merge_equal(findings: Iterable[Finding]) -> list[Finding]:
     """Return findings that differ only in their subjects as one, which lists the subjects."""
     subjects: dict[Finding, list[str]] = {}
     for finding in findings:
-        subjects.setdefault(replace(finding, subject=""), []).append(finding.subject)
+        same = replace(finding, subject="")
+        subjects.setdefault(same, []).append(finding.subject)
     return [replace(finding, subject=list_names(names)) for finding, names in subjects.items()]
 
 
 def brief(value: object) -> str:
-    """Return a value from a peer as text, truncated to _MAX_NAME characters."""
+    """Return a value from a peer as text of at most `limits.PEER_TEXT` characters."""
     text = str(value)
-    return text if len(text) <= _MAX_NAME else f"{text[: _MAX_NAME - 3]}..."
+    if len(text) <= limits.PEER_TEXT:
+        return text
+    return f"{text[: limits.PEER_TEXT - 3]}..."
 
 
-def list_names(names: Iterable[object], limit: int = 5) -> str:
+def list_names(names: Iterable[object], limit: int = _LISTED) -> str:
     """Join the first names, and append the number of the others."""
-    every = [brief(name) for name in names]
-    return ", ".join(every[:limit]) + (
-        f" and {len(every) - limit} more" if len(every) > limit else ""
-    )
+    texts = [brief(name) for name in names]
+    shown = ", ".join(texts[:limit])
+    if len(texts) > limit:
+        return f"{shown} and {len(texts) - limit} more"
+    return shown

@@ -1,10 +1,11 @@
 """Checks of the network behind a router: sessions, permissions, services, vehicles, clocks and other prefixes."""
 
-from collections.abc import Iterator
-from typing import Final
+from collections.abc import Collection, Iterator, Mapping
+from typing import Final, NamedTuple
 
+from nedbus import limits
 from nedbus.clock import format_duration, format_since
-from nedbus.health import ServiceStatus, SourceStatus
+from nedbus.health import LogStreamStatus, ServiceStatus, SourceStatus
 from nedbus.vehicle_events import by_vehicle
 from nedbus_msgs import Address, get_topic, prefix_of
 
@@ -15,11 +16,10 @@ _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = (
     "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 )
-_MAX_TEXT: Final = 300  # characters of text from a peer
-_MAX_REMARKS: Final = 3  # of a source
-_MAX_WARNING: Final = 602  # characters of the origin and the reason of a rejection
+_OTHER_PREFIXES: Final = 5  # named, one finding each
+_REMARKS: Final = 3  # of a source, in one finding
 _SILENT_PERIODS: Final = 3.0  # message intervals after which an address is silent
-_MAX_TIME: Final = 1e11  # s; maximum Unix time accepted from a service
+_FAR_FUTURE: Final = 1e11  # s; later Unix times of a service are no times
 _CLOCK_WARNING: Final = 0.5  # s
 _CLOCK_WRONG: Final = 5.0  # s
 _SYNCHRONISE: Final = "run NTP or PTP on both hosts; check them with 'timedatectl'"
@@ -28,20 +28,21 @@ _SYNCHRONISE: Final = "run NTP or PTP on both hosts; check them with 'timedatect
 def check_routers(seen: Observation) -> Iterator[Finding]:
     """Yield the number of sessions at each router; warn if it is close to the limit."""
     if not seen.routers:
-        yield Finding(
-            "router", "", "ok", "connected; its other sessions are not visible to this client"
-        )
+        text = "connected; its other sessions are not visible to this client"
+        yield Finding("router", "", "ok", text)
     for router in seen.routers:
-        is_full, text = False, f"connected sessions: {router.sessions:,}"
-        if router.max_sessions is not None:
-            text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-            is_full = router.sessions >= _NEARLY_FULL * router.max_sessions
+        limit = router.max_sessions
+        if limit is None:
+            yield Finding("router", router.zid, "ok", f"connected sessions: {router.sessions:,}")
+            continue
+        text = f"{router.sessions:,} of {limit:,} sessions"
+        if router.sessions < _NEARLY_FULL * limit:
+            yield Finding("router", router.zid, "ok", text)
+            continue
         advice = (
             "raise max_sessions and the limit of open files, or run a second router (docs/hosts.md)"
         )
-        yield Finding(
-            "router", router.zid, "warning" if is_full else "ok", text, advice if is_full else ""
-        )
+        yield Finding("router", router.zid, "warning", text, advice)
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
@@ -50,30 +51,30 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
     yield reading
     vehicle = seen.vehicle
     if vehicle is None:
-        yield Finding(
-            "write",
-            "",
-            "unknown",
-            "write permission not tested",
-            "test it with 'nedbus doctor --vehicle 1'",
-        )
+        advice = "test it with 'nedbus doctor --vehicle 1'"
+        yield Finding("write", "", "unknown", "write permission not tested", advice)
     elif seen.verdict == "allowed":
-        yield Finding(
-            "write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe arrived"
-        )
-    elif seen.verdict == "denied":  # a reader needs no write permission
-        state: State = (
-            "warning" if reading.state == "unknown" else "ok" if reading.state == "ok" else "wrong"
-        )
+        text = f"this client may publish vehicle {vehicle}: a probe arrived"
+        yield Finding("write", vehicle, "ok", text)
+    elif seen.verdict == "denied":
         text = f"the router silently drops messages that this client publishes as vehicle {vehicle}"
         advice = (
             f"fine for a reader; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"
         )
-        yield Finding("write", vehicle, state, text, advice)
+        yield Finding("write", vehicle, _STATE_OF_DENIAL[reading.state], text, advice)
     else:
         text = f"write permission not tested: the router does not let this client read a probe for vehicle {vehicle}"
         advice = f"allow {seen.prefix}/*/@doctor/* as in config/router-secure.json5, or run the doctor as a reader"
         yield Finding("write", vehicle, "unknown", text, advice)
+
+
+_STATE_OF_DENIAL: Final[Mapping[State, State]] = {
+    "ok": "ok",  # a reader needs no write permission
+    "unknown": "warning",
+    "warning": "wrong",
+    "wrong": "wrong",
+}
+"""The state of a denied write permission by that of the read permission."""
 
 
 def _check_reading(seen: Observation) -> Finding:
@@ -92,153 +93,210 @@ def _check_reading(seen: Observation) -> Finding:
 
 def check_services(seen: Observation) -> Iterator[Finding]:
     """Yield findings on the version and the sources of each service; it has a status for each of its vehicles."""
-    known: list[Finding] = []
-    for finding in _check_statuses(seen):
-        if finding not in known:
-            known.append(finding)
-            yield finding
-
-
-def _check_statuses(seen: Observation) -> Iterator[Finding]:
+    findings = list[Finding]()
     for service in seen.services:
-        name = brief(service.service)
-        version = brief(service.version or "unknown")
-        if service.is_outdated:
-            where = brief(service.host or "an unknown host")
-            text = f"nedbus {version} on {where}: its status does not name its vehicle, and is not used"
-            yield Finding("service", name, "wrong", text, "update nedbus on its host")
-            continue
-        if version.split(".")[:2] != seen.version.split(".")[:2]:
-            advice = "install the same version on both sides; CHANGELOG.md lists changes of the wire format"
-            text = f"the service runs nedbus {version}, this client {seen.version}"
-            yield Finding("version", name, "warning", text, advice)
-        findings = [finding for source in service.sources for finding in _check_source(source)]
-        yield from findings
-        if all(finding.state == "ok" for finding in findings):
-            host = brief(service.host or "an unknown host")
-            text = f"nedbus {version} on {host}, sources without faults: {len(service.sources)}"
-            yield Finding("service", name, "ok", text)
+        findings += _check_service(service, seen.version)
     if not seen.services:
         advice = "start one with 'nedbus serve'; publishing scripts do not count as services"
-        yield Finding("service", "", "unknown", "no nedbus service answers", advice)
+        findings.append(Finding("service", "", "unknown", "no nedbus service answers", advice))
+    yield from dict.fromkeys(findings)
+
+
+def _check_service(service: ServiceStatus, own_version: str) -> Iterator[Finding]:
+    """Yield the findings on one status of a service."""
+    name = brief(service.service)
+    version = brief(service.version or "unknown")
+    host = brief(service.host or "an unknown host")
+    if service.is_outdated:
+        text = f"nedbus {version} on {host}: its status does not name its vehicle, and is not used"
+        yield Finding("service", name, "wrong", text, "update nedbus on its host")
+        return
+    if _release_of(version) != _release_of(own_version):
+        advice = (
+            "install the same version on both sides; CHANGELOG.md lists changes of the wire format"
+        )
+        text = f"the service runs nedbus {version}, this client {own_version}"
+        yield Finding("version", name, "warning", text, advice)
+    findings = list[Finding]()
+    for source in service.sources:
+        findings += _check_source(source)
+    yield from findings
+    if all(finding.state == "ok" for finding in findings):
+        text = f"nedbus {version} on {host}, sources without faults: {len(service.sources)}"
+        yield Finding("service", name, "ok", text)
+
+
+def _release_of(version: str) -> list[str]:
+    """Return the major and the minor version."""
+    return version.split(".")[:2]
 
 
 def _published(seen: Observation) -> list[str]:
-    return sorted({brief(address) for source in seen.sources for address in source.addresses})
+    """Return the addresses that services report as published."""
+    names = {brief(address) for source in seen.sources for address in source.addresses}
+    return sorted(names)
 
 
 def _check_source(source: SourceStatus) -> Iterator[Finding]:
-    name, state = brief(source.source), source.state
-    error = (source.error or "unknown reason")[:_MAX_TEXT]
-    if state in {"failed", "retrying"}:
-        ends = "it has stopped" if state == "failed" else "it is being restarted"
-        yield Finding(
-            "source", name, "wrong", f"{state}: {error}", f"{ends}; see the log of its service"
-        )
-    elif state in {"waiting", "starting"}:
-        advice = "check that the vehicle sends to the service; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
-        if source.source.startswith("mavlink:udpout:"):
-            advice = f"{advice}; {FIRST_PARTNER}"
-        yield Finding("source", name, "warning", f"{state}: no message yet", advice)
+    """Yield the findings on a source, from what its service reports."""
+    name = brief(source.source)
+    yield from _check_state(name, source)
     if source.overload:
-        yield Finding(
-            "source", name, "wrong", source.overload[:_MAX_TEXT], "stop other programs on its host"
-        )
+        text = source.overload[: limits.PEER_TEXT]
+        yield Finding("source", name, "wrong", text, "stop other programs on its host")
     if source.silent:
         advice = (
             "PX4 may be losing them: remove rel= from all lines of its zenoh/pub.csv (docs/live.md)"
         )
-        seen = f"announced, but silent while other topics arrive: {list_names(source.silent, 20)}"
+        topics = list_names(source.silent, limits.SHOWN_NAMES)
+        seen = f"announced, but silent while other topics arrive: {topics}"
         yield Finding("source", name, "warning", seen, advice)
     if source.not_carried:
         advice = (
             "to carry them, pass PX4's definitions: px4-zenoh:?msg=NAME.msg, or a folder of them"
         )
-        seen = f"published by vehicles, but not carried: {list_names(source.not_carried, 20)}"
+        topics = list_names(source.not_carried, limits.SHOWN_NAMES)
+        seen = f"published by vehicles, but not carried: {topics}"
         yield Finding("source", name, "ok", seen, advice)
     for log in source.log_streams:
-        stream = f"{name} vehicle {brief(log.vehicle)}"
-        if log.reason:
-            seen = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
-            yield Finding(
-                "source", stream, "warning", seen, "see 'The ULog stream' in docs/live.md"
-            )
-        if log.gaps:
-            seen = f"the ULog stream lost {log.lost} LOGGING_DATA, about {log.lost_messages} messages; gaps: {log.gaps}"
-            advice = "raise the rate of the link, or log fewer topics; see the table of rates in docs/live.md"
-            yield Finding("source", stream, "warning", seen, advice)
-    if stale := [address for address in source.stale if address not in source.silent]:
+        yield from _check_log_stream(f"{name} vehicle {brief(log.vehicle)}", log)
+    stale = [address for address in source.stale if address not in source.silent]
+    if stale:
         advice = (
             "check that the vehicle is on and its link is up; the source recovers automatically"
         )
         yield Finding("source", name, "warning", f"no more messages of {list_names(stale)}", advice)
+    yield from _check_rejections(name, source)
+
+
+def _check_state(name: str, source: SourceStatus) -> Iterator[Finding]:
+    """Yield that a source has failed, or that nothing has arrived."""
+    state = source.state
+    error = (source.error or "unknown reason")[: limits.PEER_TEXT]
+    if state == "failed":
+        advice = "it has stopped; see the log of its service"
+        yield Finding("source", name, "wrong", f"failed: {error}", advice)
+    elif state == "retrying":
+        advice = "it is being restarted; see the log of its service"
+        yield Finding("source", name, "wrong", f"retrying: {error}", advice)
+    elif state in {"waiting", "starting"}:
+        advice = "check that the vehicle sends to the service; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
+        if source.source.startswith("mavlink:udpout:"):
+            advice = f"{advice}; {FIRST_PARTNER}"
+        yield Finding("source", name, "warning", f"{state}: no message yet", advice)
+
+
+def _check_log_stream(name: str, log: LogStreamStatus) -> Iterator[Finding]:
+    """Yield that a vehicle has no ULog stream, or that messages of it were lost."""
+    if log.reason:
+        reason = log.reason[: limits.PEER_TEXT]
+        seen = f"no ULog stream, fields are converted from MAVLink: {reason}"
+        advice = "see 'The ULog stream' in docs/live.md"
+        yield Finding("source", name, "warning", seen, advice)
+    if log.gaps:
+        seen = f"the ULog stream lost {log.lost} LOGGING_DATA, about {log.lost_messages} messages; gaps: {log.gaps}"
+        advice = "raise the rate of the link, or log fewer topics; see the table of rates in docs/live.md"
+        yield Finding("source", name, "warning", seen, advice)
+
+
+def _check_rejections(name: str, source: SourceStatus) -> Iterator[Finding]:
+    """Yield that messages are rejected; without any, the remarks of a source, such as that on a satellite link."""
+    # The origin of a rejection and its reason are two texts of a peer.
+    texts = [text[: 2 * limits.PEER_TEXT] for text in source.warnings]
     if source.rejected > 0:
-        why = f" ({list_names(source.rejections)})" if source.rejections else ""
-        first = "".join(f"; {text[:_MAX_WARNING]}" for text in source.warnings[:1])
+        seen = f"messages rejected: {source.rejected:,}"
+        if source.rejections:
+            seen = f"{seen} ({list_names(source.rejections)})"
+        if texts:
+            seen = f"{seen}; {texts[0]}"
         advice = "rejected messages are not published; see the service's log or the @rejected keys for all reasons"
-        yield Finding(
-            "source", name, "warning", f"messages rejected: {source.rejected:,}{why}{first}", advice
-        )
-    elif source.warnings:  # remarks, such as that on a satellite link
-        remarks = "; ".join(text[:_MAX_WARNING] for text in source.warnings[:_MAX_REMARKS])
-        yield Finding("source", name, "ok", remarks)
+        yield Finding("source", name, "warning", seen, advice)
+    elif texts:
+        yield Finding("source", name, "ok", "; ".join(texts[:_REMARKS]))
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
     """Yield findings on the addresses of all vehicles, or of the selected one."""
     vehicle = seen.vehicle
     arrived = seen.delays.keys()
-    known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
+    known = sorted(
+        address for address in {*seen.alive, *arrived} if vehicle in (None, address.vehicle)
+    )
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
-    for name, report in by_vehicle(seen.accounts).items():
-        now, current = report.now, report.vehicles[name]
-        if vehicle in (None, name) and current.severity != "info" and not current.is_forgotten(now):
-            advice = f"see the events before it with 'nedbus why --vehicle {name}'"
-            text = f"{current.text[:_MAX_TEXT]}{format_since(current.since, now)}"
-            yield Finding(
-                "vehicle", name, "wrong" if current.severity == "bad" else "warning", text, advice
-            )
+    yield from _check_reports(seen)
     if not seen.alive.complete:
         advice = "a vehicle may have over 1,000 publishers: the log names it; otherwise, try again"
         yield Finding("vehicle", "", "unknown", "not all streams are listed", advice)
-    shown = set(map(str, known))
-    hidden = [
-        each
-        for each in _published(seen)
-        if each not in shown and vehicle in (None, each.partition("/")[0])
-    ]
-    # otherwise this client may lack read permission
-    for each in hidden if arrived or seen.ages else ():
-        advice = "check that the router's access rules allow that service to write this vehicle (docs/security.md)"
-        text = f"reported as published by {list_names(_publishers_of(seen, each))}, but no message arrives"
-        yield Finding("vehicle", each, "wrong", text, advice)
-    if flowing := [address for address in known if address in arrived]:
+    hidden = _hidden_addresses(seen, known)
+    if arrived or seen.ages:  # otherwise this client may lack read permission
+        for name in hidden:
+            yield _explain_hidden(seen, name)
+    flowing = [address for address in known if address in arrived]
+    if flowing:
         vehicles = {address.vehicle for address in flowing}
-        yield Finding(
-            "vehicle",
-            "",
-            "ok",
-            f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}",
-        )
+        text = f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}"
+        yield Finding("vehicle", "", "ok", text)
     if not known and not hidden:
         yield _missing_vehicle(seen)
+
+
+def _check_reports(seen: Observation) -> Iterator[Finding]:
+    """Yield the faults of vehicles in the event reports of services."""
+    for name, report in by_vehicle(seen.accounts).items():
+        if seen.vehicle not in (None, name):
+            continue
+        current = report.vehicles[name]
+        if current.severity == "info" or current.is_forgotten(report.now):
+            continue
+        since = format_since(current.since, report.now)
+        text = f"{current.text[: limits.PEER_TEXT]}{since}"
+        advice = f"see the events before it with 'nedbus why --vehicle {name}'"
+        state: State = "wrong" if current.severity == "bad" else "warning"
+        yield Finding("vehicle", name, state, text, advice)
+
+
+def _hidden_addresses(seen: Observation, known: Collection[Address]) -> list[str]:
+    """Return the addresses that services report as published, although this client sees no publisher of them."""
+    shown = set(map(str, known))
+    hidden = list[str]()
+    for name in _published(seen):
+        vehicle, _, _ = name.partition("/")
+        if name not in shown and seen.vehicle in (None, vehicle):
+            hidden.append(name)
+    return hidden
+
+
+def _explain_hidden(seen: Observation, name: str) -> Finding:
+    advice = "check that the router's access rules allow that service to write this vehicle (docs/security.md)"
+    publishers = list_names(_publishers_of(seen, name))
+    text = f"reported as published by {publishers}, but no message arrives"
+    return Finding("vehicle", name, "wrong", text, advice)
 
 
 def _missing_vehicle(seen: Observation) -> Finding:
     """Return the finding that the selected vehicle, or any, is not published."""
     vehicle = seen.vehicle
     advice = "start its source: 'nedbus serve --source ...'"
-    if any(finding.state != "ok" for source in seen.sources for finding in _check_source(source)):
+    if _has_source_findings(seen):
         advice = "see the findings on sources"
     elif seen.services:
         names = list_names(map(_name_of, seen.services))
         advice = f"no source of {names} receives it: check the name, or start its source there"
-    if others := sorted({each.vehicle for each in {*seen.alive, *seen.delays}}):
-        advice += f"; published: {', '.join(others[:20])}"
+    others = sorted({address.vehicle for address in {*seen.alive, *seen.delays}})
+    if others:
+        advice = f"{advice}; published: {', '.join(others[: limits.SHOWN_NAMES])}"
     if vehicle is None:
         return Finding("vehicle", "", "warning", f"no vehicle found under {seen.prefix}/", advice)
     return Finding("vehicle", vehicle, "wrong", f"not found under {seen.prefix}/", advice)
+
+
+def _has_source_findings(seen: Observation) -> bool:
+    for source in seen.sources:
+        for finding in _check_source(source):
+            if finding.state != "ok":
+                return True
+    return False
 
 
 def _name_of(service: ServiceStatus) -> str:
@@ -256,101 +314,125 @@ def _publishers_of(seen: Observation, address: str) -> list[str]:
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
+    """Yield that a stream is silent, cannot be decoded, or has several publishers."""
     name = str(address)
-    age, rate = seen.ages.get(address), get_topic(address.topic).rate
-    if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
-        last = "no message yet" if address not in seen.ages else "its last message has no timestamp"
-        if age is not None:
-            last = f"its last message is {format_duration(age)} old"
-        advice = "its publisher runs but sends nothing: check its input, such as a service's source or a script's loop"
-        # topics of a replay may start later
-        state: State = "wrong" if address in seen.ages else "warning"
-        yield Finding(
-            "vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice
-        )
-    if error := seen.errors.get(address):
+    if not flows and _is_silent(seen, address):
+        yield _explain_silence(seen, address)
+    error = seen.errors.get(address)
+    if error:
         advice = "check that nedbus publishes this key; a newer message layout needs a newer nedbus on this host"
-        yield Finding(
-            "vehicle", name, "wrong", f"cannot decode a payload: {error[:_MAX_TEXT]}", advice
-        )
-    if (publishers := seen.alive[address]) > 1:
+        text = f"cannot decode a payload: {error[: limits.PEER_TEXT]}"
+        yield Finding("vehicle", name, "wrong", text, advice)
+    publishers = seen.alive[address]
+    if publishers > 1:
         advice = "readers receive a mixture of their messages: stop all but one, or give each its own --vehicle"
         text = f"{publishers} publishers of this address"
-        if services := _publishers_of(seen, name):
+        services = _publishers_of(seen, name)
+        if services:
             text = f"{text}: {list_names(services)}"
-            if publishers > len(services):
-                text = f"{text}, and {publishers - len(services)} that no service reports, such as a script"
+        if services and publishers > len(services):
+            others = publishers - len(services)
+            text = f"{text}, and {others} that no service reports, such as a script"
         yield Finding("vehicle", name, "wrong", text, advice)
+
+
+def _is_silent(seen: Observation, address: Address) -> bool:
+    """Return whether the last message of a stream is older than its rate explains."""
+    rate = get_topic(address.topic).rate
+    if not rate:
+        return False
+    age = seen.ages.get(address)
+    if age is None:
+        age = seen.listened
+    return age > _SILENT_PERIODS / rate
+
+
+def _explain_silence(seen: Observation, address: Address) -> Finding:
+    state: State = "wrong"
+    age = seen.ages.get(address)
+    if age is not None:
+        last = f"its last message is {format_duration(age)} old"
+    elif address in seen.ages:
+        last = "its last message has no timestamp"
+    else:
+        last = "no message yet"
+        state = "warning"  # topics of a replay may start later
+    text = f"alive, but silent for {seen.listened:.0f} s: {last}"
+    advice = "its publisher runs but sends nothing: check its input, such as a service's source or a script's loop"
+    return Finding("vehicle", str(address), state, text, advice)
+
+
+class _Offset(NamedTuple):
+    """Offset of a clock from this host's, and its uncertainty [s]."""
+
+    seconds: float
+    error: float
+
+    @property
+    def is_wrong(self) -> bool:
+        return abs(self.seconds) > _CLOCK_WARNING + self.error
+
+
+def _clocks(seen: Observation) -> dict[str, _Offset]:
+    """Return the clocks of services and publishers by name."""
+    clocks = dict[str, _Offset]()
+    for service in seen.services:
+        # The comparison is false for NaN.
+        if service.now is not None and abs(service.now) < _FAR_FUTURE:
+            name = f"service {brief(service.service)} on {brief(service.host)}"
+            clocks[name] = _Offset(service.now - seen.asked, seen.error)
+    for address, delay in seen.delays.items():
+        if delay is None:
+            continue
+        # A positive delay includes the network latency.
+        error = 0.0 if delay < 0 else _CLOCK_WARNING
+        clocks[f"publisher of {address}"] = _Offset(-delay, error)
+    return clocks
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:
     """Yield findings on clocks that are off; if all others agree with each other, this host's clock is off."""
-    clocks = {  # offset from this host's clock, and its uncertainty [s]
-        f"service {brief(each.service)} on {brief(each.host)}": (each.now - seen.asked, seen.error)
-        for each in seen.services
-        if each.now is not None and abs(each.now) < _MAX_TIME  # false for NaN
-    }
-    for address, delay in seen.delays.items():
-        if delay is not None:
-            # a positive delay includes the network latency
-            error = 0.0 if delay < 0 else _CLOCK_WARNING
-            clocks[f"publisher of {address}"] = (-delay, error)
-    off = {
-        name: offset
-        for name, (offset, error) in clocks.items()
-        if abs(offset) > _CLOCK_WARNING + error
-    }
-    if (
-        len(off) > 1
-        and len(off) == len(clocks)
-        and max(off.values()) - min(off.values()) < _CLOCK_WARNING
-    ):
-        middle = sorted(off.values())[len(off) // 2]
+    clocks = _clocks(seen)
+    off = {name: clock.seconds for name, clock in clocks.items() if clock.is_wrong}
+    if clocks and not off:
+        largest = max(abs(clock.seconds) for clock in clocks.values())
+        text = f"all clocks agree with this host's within {format_duration(largest)}"
+        yield Finding("clock", "", "ok", text)
+        return
+    are_all_off = len(off) == len(clocks)
+    ordered = sorted(off.values())
+    if len(off) > 1 and are_all_off and ordered[-1] - ordered[0] < _CLOCK_WARNING:
+        middle = ordered[len(ordered) // 2]
         others = f"{len(off)} others, which agree with each other"
         yield _clock_finding("this host", "this host's clock", -middle, others, _SYNCHRONISE)
         return
-    only = len(clocks) == len(off)
-    blame = (
-        "either clock may be off:"
-        if only
-        else "the other clocks agree with this host's; set this one:"
-    )
+    blame = "the other clocks agree with this host's; set this one:"
+    if are_all_off:
+        blame = "either clock may be off:"
     for name, offset in off.items():
         yield _clock_finding(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
-    if clocks and not off:
-        largest = max(abs(offset) for offset, _ in clocks.values())
-        yield Finding(
-            "clock",
-            "",
-            "ok",
-            f"all clocks agree with this host's within {format_duration(largest)}",
-        )
 
 
 def _clock_finding(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:
-    text = f"{clock} is {format_duration(abs(offset))} {'ahead of' if offset > 0 else 'behind'} {reference}"
-    return Finding(
-        "clock", name, "wrong" if abs(offset) > _CLOCK_WRONG else "warning", text, advice
-    )
+    direction = "ahead of" if offset > 0 else "behind"
+    text = f"{clock} is {format_duration(abs(offset))} {direction} {reference}"
+    state: State = "wrong" if abs(offset) > _CLOCK_WRONG else "warning"
+    return Finding("clock", name, state, text, advice)
 
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
     """Yield other prefixes and ROS 2 topics, which readers of this prefix do not receive."""
     prefixes = {prefix_of(key) for key in seen.elsewhere}
-    for prefix in sorted(prefixes - {""})[:5]:
+    for prefix in sorted(prefixes - {""})[:_OTHER_PREFIXES]:
         advice = f"use --prefix {prefix} or NEDBUS_PREFIX={prefix} to read them, or correct the publisher's prefix"
         text = f"messages are published under {prefix}/, but the prefix here is {seen.prefix}/"
         yield Finding("prefix", prefix, "warning", text, advice)
-    if seen.ros2 and not any(each.source.startswith("px4-zenoh:") for each in seen.sources):
+    is_bridged = any(source.source.startswith("px4-zenoh:") for source in seen.sources)
+    if seen.ros2 and not is_bridged:
         topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
+        text = f"ROS 2 or PX4 publishes {topics}, but no service bridges it"
         advice = "run 'nedbus serve --source px4-zenoh:' to bridge them"
-        yield Finding(
-            "ros2",
-            "",
-            "warning",
-            f"ROS 2 or PX4 publishes {topics}, but no service bridges it",
-            advice,
-        )
+        yield Finding("ros2", "", "warning", text, advice)
 
 
 NETWORK_CHECKS: Final = (

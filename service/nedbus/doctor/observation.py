@@ -10,13 +10,14 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus import Bus, Newest, Session, clock
+from nedbus import Bus, Newest, Session, clock, limits
 from nedbus.health import (
     AccountReport,
     Publishers,
     RouterState,
     ServiceStatus,
     SourceStatus,
+    WriteVerdict,
     query_routers,
 )
 from nedbus.rmw_zenoh import (
@@ -26,7 +27,6 @@ from nedbus.rmw_zenoh import (
     translate_zenoh_errors,
 )
 from nedbus.timings import TIMINGS
-from nedbus.transport import Verdict
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Address
 
 T = TypeVar("T")
@@ -34,10 +34,6 @@ T = TypeVar("T")
 _POLL: Final = 0.02  # s; also the error of measured delays
 _QUERY_TIMEOUT: Final = 1.0  # s
 _LIST_TIMEOUT: Final = 4.0  # s for the router to list all streams
-# peers may claim to be services; a service has one status for each vehicle
-_MAX_SERVICES: Final = 100
-_MAX_KEYS: Final = 2000
-_MAX_KEY_LENGTH: Final = 1024
 _RING: Final = 16_384  # samples buffered per subscription
 
 
@@ -58,7 +54,7 @@ class Observation:
     prefix: str
     version: str
     vehicle: str | None
-    verdict: Verdict | None = None
+    verdict: WriteVerdict | None = None
     services: list[ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0
@@ -79,59 +75,67 @@ class Observation:
 
     def observe(self, bus: Bus, session: Session) -> None:
         """Send the queries, and receive messages for at least 3 s; `session`: that of the bus."""
-        prefix, start = self.prefix, time.monotonic()
+        start = time.monotonic()
         newest = bus.newest(ANY)
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-        self.routers = query_routers(session, timeout=_QUERY_TIMEOUT)
-        before = clock.utc()
-        self.services = bus.services(timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
-        self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
-        self.accounts = bus.accounts(within=0.0, timeout=_QUERY_TIMEOUT)
-        self.alive = bus.publishers(timeout=_LIST_TIMEOUT)
-        tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
-        publishers = _parse_each(PublisherToken.parse, tokens)
-        # without nedbus's bridges
-        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]
+        self._query(bus, session)
         tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
-        others = {key for key in tokens if not key.startswith("@")}
+        own = f"{self.prefix}/"
+        self.elsewhere = {key for key in tokens if not key.startswith(("@", own))}
         self._add(newest)
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)
             self._add(newest)
-            keys = (
-                key
-                for sample in take_others()
-                if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}")
-            )
-            others.update(
-                islice(
-                    (key for key in keys if len(key) < _MAX_KEY_LENGTH),
-                    max(0, _MAX_KEYS - len(others)),
-                )
-            )
-        ages = islice(((address, each.age) for address, each in newest.items()), _MAX_KEYS)
-        self.ages = {address: age if math.isfinite(age) else None for address, age in ages}
+            for sample in take_others():
+                key = str(sample.key_expr)
+                if not key.startswith(own):
+                    _add_key(self.elsewhere, key)
+        for address, last in islice(newest.items(), limits.EXAMINED_NAMES):
+            self.ages[address] = last.age if math.isfinite(last.age) else None
         self.listened = time.monotonic() - start
-        self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
+
+    def _query(self, bus: Bus, session: Session) -> None:
+        """Ask routers, services and the router's list of publishers."""
+        self.routers = query_routers(session, timeout=_QUERY_TIMEOUT)
+        before = clock.utc()
+        services = bus.services(timeout=_QUERY_TIMEOUT)
+        after = clock.utc()
+        self.services = services[: limits.EXAMINED_NAMES]
+        self.asked = (before + after) / 2
+        self.error = (after - before) / 2
+        self.accounts = bus.accounts(within=0.0, timeout=_QUERY_TIMEOUT)
+        self.alive = bus.publishers(timeout=_LIST_TIMEOUT)
+        tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
+        for token in _parse_each(PublisherToken.parse, tokens):
+            if not token.node.startswith("nedbus_"):  # those of nedbus's bridges
+                self.ros2.append(token)
 
     def _add(self, newest: Newest) -> None:
-        for each in newest.update():
-            address = each.sample.address
-            if not each.sample.retained and (
-                address in self.delays or len(self.delays) < _MAX_KEYS
-            ):
-                known = (self.delays.get(address), each.sample.latency)
-                self.delays[address] = min(
-                    (delay for delay in known if delay is not None), default=None
-                )
-        self.errors = {
-            address: reason
-            for address, reason in newest.invalid.items()
-            if address.topic in BY_TOPIC
-        }
-        self.delays |= {address: None for address in newest.invalid if address not in self.delays}
+        """Add the messages since the last call: the delay of each stream, and errors."""
+        for last in newest.update():
+            sample = last.sample
+            address = sample.address
+            is_known = address in self.delays
+            if sample.retained or not (is_known or len(self.delays) < limits.EXAMINED_NAMES):
+                continue
+            delay = self.delays.get(address)
+            if delay is None or (sample.latency is not None and sample.latency < delay):
+                delay = sample.latency
+            self.delays[address] = delay
+        self.errors = dict[Address, str]()
+        for address, reason in newest.invalid.items():
+            self.delays.setdefault(address, None)
+            if address.topic in BY_TOPIC:
+                self.errors[address] = reason
+
+
+def _add_key(keys: set[str], key: str) -> None:
+    """Add the key of a message of any prefix, unless it is too long, or there are too many."""
+    has_room = len(keys) < limits.EXAMINED_NAMES and len(key) <= limits.PEER_TEXT
+    if has_room and key.endswith(f"/{DEFAULT_TOPIC}"):
+        keys.add(key)
 
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[zenoh.Sample]]:

@@ -7,13 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from nedbus import Tls, clock
+from nedbus import Tls, clock, connect
 from nedbus.endpoints import split_endpoint
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.pki import Certificate
+from nedbus.pki import UNKNOWN_CA, Certificate, check_pem, read_certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import UNKNOWN_CA, check_pem, open_client, read_certificate
+from nedbus_msgs import DEFAULT_PREFIX
 
 from .finding import Finding, brief, worst_state
 
@@ -26,13 +26,15 @@ _ALERTS: Final = {  # by substring of OpenSSL's reason for a TLS alert
     "CERTIFICATE": "it rejects the client certificate",
     "": "it aborts the handshake",
 }
+_SHOWN_HOSTS: Final = 8  # of a certificate for another host
 _RENEW: Final = "renew it with 'nedbus pki renew' (docs/security.md)"
 _OTHER_HOST: Final = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
     """Yield findings on one router; stop at the first one that is "wrong"."""
-    if unreachable := reach_endpoint(endpoint):
+    unreachable = reach_endpoint(endpoint)
+    if unreachable is not None:
         yield unreachable
         return
     protocol, host, port = split_endpoint(endpoint) or ("", "", 0)
@@ -42,17 +44,24 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
         if worst_state(findings) == "wrong":
             return
     try:
-        open_client([endpoint], timeout=TIMINGS.doctor_open, tls=tls).close()
+        bus = connect(endpoint, timeout=TIMINGS.doctor_open, prefix=DEFAULT_PREFIX, tls=tls)
+        bus.close()
     except NedbusError:
-        if protocol == "tcp" and read_certificate(host, port, TIMINGS.handshake):
-            seen = "it speaks TLS"
-            advice = "use tls/ instead of tcp/, with --tls-ca and a client certificate if needed"
-        else:
-            seen = "cannot open a Zenoh session"
-            advice = "check that it is a Zenoh router (default port: 7447) below its max_sessions; see its log"
-        yield Finding("endpoint", endpoint, "wrong", seen, advice)
+        yield _explain_no_session(endpoint)
     else:
         yield Finding("endpoint", endpoint, "ok", "a Zenoh router answers")
+
+
+def _explain_no_session(endpoint: str) -> Finding:
+    """Return the finding that a port can be reached, but no session opens there."""
+    protocol, host, port = split_endpoint(endpoint) or ("", "", 0)
+    if protocol == "tcp" and read_certificate(host, port, TIMINGS.handshake):
+        seen = "it speaks TLS"
+        advice = "use tls/ instead of tcp/, with --tls-ca and a client certificate if needed"
+    else:
+        seen = "cannot open a Zenoh session"
+        advice = "check that it is a Zenoh router (default port: 7447) below its max_sessions; see its log"
+    return Finding("endpoint", endpoint, "wrong", seen, advice)
 
 
 def reach_endpoint(endpoint: str) -> Finding | None:
@@ -101,53 +110,82 @@ def _check_router_certificate(
         yield Finding("tls", endpoint, "wrong", "cannot verify the router: no CA is given", advice)
         return
     try:
-        with (
-            suppress(TimeoutError, ConnectionError),
-            socket.create_connection((host, port), timeout=TIMINGS.handshake) as plain,
-            tls.context().wrap_socket(plain, server_hostname=host) as connection,
-        ):
-            connection.settimeout(TIMINGS.tls_alert)
-            connection.recv(1)  # with TLS 1.3 an alert arrives after the handshake
+        _shake_hands(host, port, tls)
     except ssl.SSLCertVerificationError as exc:
-        if exc.verify_code in _OTHER_HOST:
-            names = (
-                f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}"
-                if certificate
-                else ""
-            )
-            seen = f"the router's certificate is not for {host}{names}"
-            advice = f"connect to one of its hosts, or create a certificate: 'nedbus pki cert' with --host {host}"
-        elif exc.verify_code in UNKNOWN_CA:
-            issuer = f", but by {brief(certificate.issuer)}" if certificate else ""
-            seen = f"the router's certificate is not signed by the CA in {tls.ca}{issuer}"
-            advice = "pass its CA as --tls-ca, or check that the router is yours"
-        else:
-            seen, advice = f"the router's certificate is not trusted: {exc.verify_message}", ""
-        if advice or validity.state != "wrong":  # else the validity finding reports the same
-            yield Finding("tls", endpoint, "wrong", seen, advice)
+        finding = _explain_distrust(endpoint, host, tls, certificate, exc)
+        # Without advice, the finding on the validity reports the same.
+        if finding.advice or validity.state != "wrong":
+            yield finding
     except ssl.SSLError as exc:
-        seen = next(text for name, text in _ALERTS.items() if name in (exc.reason or ""))
+        reason = exc.reason or ""
+        seen = next(text for name, text in _ALERTS.items() if name in reason)
         advice = "use --tls-certificate and --tls-key with a certificate signed by the router's CA"
         yield Finding("tls", endpoint, "wrong", f"the router refuses this client: {seen}", advice)
 
 
+def _shake_hands(host: str, port: int, tls: Tls) -> None:
+    """Open a TLS connection, and wait for an alert; raise SSLError if one side rejects the other."""
+    with (
+        suppress(TimeoutError, ConnectionError),
+        socket.create_connection((host, port), timeout=TIMINGS.handshake) as plain,
+        tls.context().wrap_socket(plain, server_hostname=host) as connection,
+    ):
+        connection.settimeout(TIMINGS.tls_alert)
+        connection.recv(1)  # with TLS 1.3 an alert arrives after the handshake
+
+
+def _explain_distrust(
+    endpoint: str,
+    host: str,
+    tls: Tls,
+    certificate: Certificate | None,
+    error: ssl.SSLCertVerificationError,
+) -> Finding:
+    """Return the finding that this client does not trust the router's certificate."""
+    if error.verify_code in _OTHER_HOST:
+        seen = f"the router's certificate is not for {host}"
+        if certificate is not None:
+            hosts = ", ".join(certificate.hosts[:_SHOWN_HOSTS]) or "no host at all"
+            seen = f"{seen}, but for {hosts}"
+        advice = f"connect to one of its hosts, or create a certificate: 'nedbus pki cert' with --host {host}"
+    elif error.verify_code in UNKNOWN_CA:
+        seen = f"the router's certificate is not signed by the CA in {tls.ca}"
+        if certificate is not None:
+            seen = f"{seen}, but by {brief(certificate.issuer)}"
+        advice = "pass its CA as --tls-ca, or check that the router is yours"
+    else:
+        seen = f"the router's certificate is not trusted: {error.verify_message}"
+        advice = ""
+    return Finding("tls", endpoint, "wrong", seen, advice)
+
+
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:
     """Check the TLS files of these settings; return findings by setting, and the files if usable."""
-    given = {name: path for name in _PEM_FILES if (path := getattr(settings, name)) is not None}
-    found = [(name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items()]
-    findings = [(name, finding) for name, finding in found if finding is not None]
+    findings = list[tuple[str, Finding]]()
+    given = dict[str, Path]()
+    for name, whose in _PEM_FILES.items():
+        path = getattr(settings, name)
+        if path is None:
+            continue
+        given[name] = path
+        finding = check_pem_file(name, path, whose)
+        if finding is not None:
+            findings.append((name, finding))
     wrong = {finding.seen for _, finding in findings if finding.state == "wrong"}
     tls = None
     reason = None
     advice = ""
     try:
         if settings.tls is not None:
-            settings.tls.zenoh_settings()
-            tls, advice = settings.tls, "use a certificate signed by the CA of the router"
-            reason = None if wrong else tls.explain()
+            settings.tls.zenoh_settings()  # raises ConfigError
+            tls = settings.tls
+            advice = "use a certificate signed by the CA of the router"
+            if not wrong:
+                reason = tls.explain()
     except ConfigError as exc:
         reason = exc.reason
-    if reason and reason not in wrong and not settings.left_out & _PEM_FILES.keys():
+    is_new = reason not in wrong and not settings.left_out & _PEM_FILES.keys()
+    if reason and is_new:
         name = "tls_certificate" if "tls_certificate" in given else list(given)[-1]
         findings.append((name, Finding("certificate", str(given[name]), "wrong", reason, advice)))
     return findings, tls
@@ -160,11 +198,10 @@ def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
         check_pem(path, kind)
     except ConfigError as exc:
         return Finding("certificate", str(path), "wrong", exc.reason)
-    return (
-        _check_validity("certificate", str(path), whose, path.read_bytes())[0]
-        if kind == "CERTIFICATE"
-        else None
-    )
+    if kind == "PRIVATE KEY":
+        return None
+    validity, _ = _check_validity("certificate", str(path), whose, path.read_bytes())
+    return validity
 
 
 def _check_validity(
@@ -177,7 +214,8 @@ def _check_validity(
         return Finding(check, subject, "unknown", "certificate expiry not checked", str(exc)), None
     except ValueError as exc:
         return Finding(check, subject, "wrong", f"not a valid certificate: {exc}"), None
-    now, seen = clock.now(), f"{whose} {brief(certificate)}"
+    now = clock.now()
+    seen = f"{whose} {brief(certificate)}"
     days = certificate.days_left(now)
     finding = Finding(check, subject, "ok", seen)
     if days < 0:

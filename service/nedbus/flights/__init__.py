@@ -1,5 +1,8 @@
 """Flights: .ulg logs, .mcap recordings and .tlog files, read by one protocol, merged, and written as MCAP; no Zenoh.
 
+`__all__` is public: to choose streams of an open flight as `nedbus.read` does, to replay it with its events, and to
+write a recording.
+
 Each name imports its module on first use: MCAP needs an extra, and NumPy is slow to import.
 """
 
@@ -9,6 +12,7 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .conversion import Conversion, convert, convert_files, convert_flight
+    from .event_replay import EventReplay, ReplayedMessage, detect_events
     from .events import (
         EVENT_OPTIONS,
         MAX_FILE_EVENTS,
@@ -39,11 +43,13 @@ if TYPE_CHECKING:
         topics_of,
     )
     from .utc import find_utc, utc_of
+    from .vehicles import path_of, require_utc, utc_offset_of, vehicles_of
     from .writer import RecordingWriter
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "conversion"): "Conversion convert convert_files convert_flight",
+        ("", "event_replay"): "EventReplay ReplayedMessage detect_events",
         (
             "",
             "events",
@@ -61,8 +67,25 @@ else:
             "selection",
         ): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
         ("", "utc"): "find_utc utc_of",
+        ("", "vehicles"): "path_of require_utc utc_offset_of vehicles_of",
         ("mcap", "writer"): "RecordingWriter",
     }
     __getattr__ = lazy_exports(
         __name__, {name: place for place, names in _NAMES.items() for name in names.split()}
     )
+
+__all__ = [
+    "EventReplay",
+    "ReadOptions",
+    "RecordingWriter",
+    "ReplayedMessage",
+    "check_recording",
+    "detect_events",
+    "matching",
+    "path_of",
+    "require_one_vehicle",
+    "require_utc",
+    "single_match",
+    "utc_offset_of",
+    "vehicles_of",
+]

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.samples import ARDUPILOT, OTHER_AUTOPILOT
+from nedbus_msgs import ARDUPILOT, OTHER_AUTOPILOT
 
 from .fields import DECODED, HIGH_LATENCY
 

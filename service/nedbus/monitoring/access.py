@@ -35,28 +35,35 @@ def why_refused(
     hosts = values_of("Host")
     if len(hosts) > 1:
         return "more than one Host header"
-    is_any_name = path in _ANY_NAME and not is_local
-    if not all(
-        is_any_name or host in origins or _is_own_name(host, is_local=is_local) for host in hosts
-    ):
-        return f"{path[:100]} is only served under an IP address or a name of this host"
-    if any(origin.partition("//")[2] not in (*hosts, *origins) for origin in values_of("Origin")):
-        return "request of a page from another host"
-    if "cross-site" in values_of("Sec-Fetch-Site") and "document" not in values_of(
-        "Sec-Fetch-Dest"
-    ):
+    accepts_any_name = path in _ANY_NAME and not is_local
+    for host in hosts:
+        is_accepted = accepts_any_name or host in origins or _is_own_name(host, is_local=is_local)
+        if not is_accepted:
+            return f"{path[:100]} is only served under an IP address or a name of this host"
+    for origin in values_of("Origin"):
+        _, _, origin_host = origin.partition("//")
+        if origin_host not in hosts and origin_host not in origins:
+            return "request of a page from another host"
+    is_cross_site = "cross-site" in values_of("Sec-Fetch-Site")
+    is_link = "document" in values_of("Sec-Fetch-Dest")
+    if is_cross_site and not is_link:
         return "cross-site request"
     return ""
 
 
 def _is_own_name(host: str, *, is_local: bool) -> bool:
-    found = _HOST.fullmatch(host)
-    name = found[1].strip("[]").lower().removesuffix(".") if found else ""
+    """Return whether a Host header names this host by a name that a website cannot control."""
+    parts = _HOST.fullmatch(host)
+    if parts is None:
+        return False
+    name = parts[1].strip("[]").lower().removesuffix(".")
     with suppress(ValueError):
-        return bool(ipaddress.ip_address(name))
-    return (
-        name == "localhost" or name in _names() or (name != "" and "." not in name and not is_local)
-    )
+        ipaddress.ip_address(name)
+        return True
+    if name == "localhost" or name in _names():
+        return True
+    is_plain_name = name != "" and "." not in name
+    return is_plain_name and not is_local
 
 
 @cache

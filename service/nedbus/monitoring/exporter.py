@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from prometheus_client.core import Metric
 
-from nedbus import Bus, Session, clock
+from nedbus import Bus, Session, clock, limits
 from nedbus.errors import NedbusError
 from nedbus.health import LogStreamStatus, PositionStatus, RouterState, find_services, query_routers
 from nedbus.timings import TIMINGS
@@ -31,7 +31,6 @@ from .observer import Observer
 from .pages import vehicles_page
 
 _POLL_INTERVAL: Final = 0.5  # s
-_MAX_ROUTERS: Final = 16  # a peer may claim to be a router
 _SERVICES_INTERVAL: Final = 5.0  # s between queries of services while MAVLink sources publish
 
 
@@ -71,93 +70,101 @@ class Exporter(Observer):
                 task.result()
 
     def _metrics(self) -> Iterator[Metric]:
+        """Yield all metrics of the exporter."""
         counts = self.subscription.counts
-        streams = [
-            MeasuredStream(
-                (address.vehicle, address.stream, each.sample.source or ""),
-                each.health,
-                latencies=latencies,
-            )
-            for address, each in self.monitor.items()
-            if (latencies := self.monitor.latencies(address)) is not None
+        streams = list(self._streams())
+        reached = [
+            (("vehicles",), self.event_log.refused),
+            (("streams",), self.monitor.evicted),
+            (("keys",), counts.forgotten),
         ]
+        sessions = [((router.zid,), router.sessions) for router in self._routers]
+        limited = [router for router in self._routers if router.max_sessions is not None]
         yield build_info(self._version)
-        yield from make_metrics({
-            "nedbus_connected": [((), self._bus.connected)],
-            "nedbus_messages_dropped": [((), counts.dropped)],
-            "nedbus_messages_invalid": [((), counts.invalid)],
-            "nedbus_queue_messages": [((), self.subscription.waiting)],
-            "nedbus_limit_reached": [
-                (("vehicles",), self.event_log.refused), (("streams",), self.monitor.evicted),
-                (("keys",), counts.forgotten),
-            ],
-            "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
-            "nedbus_router_sessions_max": [
-                ((state.zid,), state.max_sessions) for state in self._routers if state.max_sessions is not None
-            ],
-        })  # fmt: skip
+        yield from make_metrics(
+            {
+                "nedbus_connected": [((), self._bus.connected)],
+                "nedbus_messages_dropped": [((), counts.dropped)],
+                "nedbus_messages_invalid": [((), counts.invalid)],
+                "nedbus_queue_messages": [((), self.subscription.waiting)],
+                "nedbus_limit_reached": reached,
+                "nedbus_router_sessions": sessions,
+                "nedbus_router_sessions_max": [
+                    ((router.zid,), router.max_sessions) for router in limited
+                ],
+            }
+        )
         yield from stream_metrics(streams, messages="nedbus_messages_received")
         yield from vehicle_metrics(self.event_log, streams)
+
+    def _streams(self) -> Iterator[MeasuredStream]:
+        """Yield the streams with their latencies."""
+        for address, newest in self.monitor.items():
+            latencies = self.monitor.latencies(address)
+            if latencies is not None:  # else it was evicted in the meantime
+                labels = (address.vehicle, address.stream, newest.sample.source or "")
+                yield MeasuredStream(labels, newest.health, latencies=latencies)
 
     def _read(self) -> None:
         for sample in self.subscription.rows():
             self.add(sample)
 
     def _query_peers(self, stop: threading.Event) -> None:
-        # A separate session: large replies (183 kB from a router with 1,000 sessions) would delay messages.
+        """Query routers now and then, and services more often while MAVLink sources publish."""
         due = 0.0
         while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, due - time.monotonic()))):
             if time.monotonic() >= due:
-                states: list[RouterState] = []
-                with suppress(NedbusError):  # the router is full, or the link is down
-                    self._session = self._session or self._bus.open_session(
-                        timeout=TIMINGS.routers_session
-                    )
-                    if not stop.is_set():
-                        states = query_routers(self._session, timeout=TIMINGS.routers_timeout)
-                self._routers = states[:_MAX_ROUTERS]
+                self._query_routers(stop)
                 due = time.monotonic() + TIMINGS.routers_interval
             elif self._session is not None and self._has_mavlink():
-                with suppress(NedbusError):
-                    services = find_services(
-                        self._session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout
-                    )
-                    sources = [source for each in services for source in each.sources]
-                    self.log_streams = {
-                        log.vehicle: log for source in sources for log in source.log_streams
-                    }
-                    self.positions = {
-                        sent.vehicle: sent for source in sources for sent in source.positions
-                    }
+                self._query_services(self._session)
         if self._session is not None:
             self._session.close()
 
+    def _query_routers(self, stop: threading.Event) -> None:
+        routers = list[RouterState]()
+        with suppress(NedbusError):  # the router is full, or the link is down
+            if self._session is None:
+                # An own session: a large reply (183 kB from a router with 1,000 sessions) would delay messages.
+                self._session = self._bus.open_session(timeout=TIMINGS.routers_session)
+            if not stop.is_set():
+                routers = query_routers(self._session, timeout=TIMINGS.routers_timeout)
+        self._routers = routers[: limits.EXPORTED_ROUTERS]
+
+    def _query_services(self, session: Session) -> None:
+        with suppress(NedbusError):
+            services = find_services(
+                session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout
+            )
+            log_streams = dict[str, LogStreamStatus]()
+            positions = dict[str, PositionStatus]()
+            for service in services:
+                for source in service.sources:
+                    log_streams |= {log.vehicle: log for log in source.log_streams}
+                    positions |= {sent.vehicle: sent for sent in source.positions}
+            self.log_streams = log_streams
+            self.positions = positions
+
     def _has_mavlink(self) -> bool:
-        return any(
-            (each.sample.source or "").startswith("mavlink") for each in self.monitor.values()
-        )
+        sources = (newest.sample.source or "" for newest in self.monitor.values())
+        return any(source.startswith("mavlink") for source in sources)
 
     def _status(self) -> dict[str, Any]:
-        streams = {
-            str(address): asdict(health) for address, health in self.monitor.snapshot().items()
-        }
-        return {
-            "connected": self._bus.connected,
-            **asdict(self.subscription.counts),
-            "streams": streams,
-        }
+        streams = dict[str, Any]()
+        for address, health in self.monitor.snapshot().items():
+            streams[str(address)] = asdict(health)
+        counts = asdict(self.subscription.counts)
+        return {"connected": self._bus.connected, **counts, "streams": streams}
 
     def _faults(self) -> list[str]:
-        return (
-            []
-            if self._bus.connected
-            else [f"no router answers at {' or '.join(self._bus.routers)}"]
-        )
+        if self._bus.connected:
+            return []
+        return [f"no router answers at {' or '.join(self._bus.routers)}"]
 
     def _vehicles(self) -> Page:
         if not self._bus.connected:
             return Page.verdict(self._faults(), "")
-        host, now = socket.gethostname(), clock.steady()
-        return vehicles_page(
-            report_of(self.event_log, "export", host, now, within=0.0, to_utc=clock.to_utc())
-        )
+        host = socket.gethostname()
+        now = clock.steady()
+        report = report_of(self.event_log, "export", host, now, within=0.0, to_utc=clock.to_utc())
+        return vehicles_page(report)

@@ -32,8 +32,11 @@ class LiveEvents(AbstractContextManager["LiveEvents"]):
 
     def __init__(self, bus: Bus, selection: Selection, within: float | None) -> None:
         self._selection = selection
-        self._history = [] if within is None else self._past(bus.accounts(within=within))
-        self._observer, self._seen = Observer(bus, selection), 0
+        self._history = list[Event]()
+        if within is not None:
+            self._history = self._past(bus.accounts(within=within))
+        self._observer = Observer(bus, selection)
+        self._seen = 0  # events of the observer's log that `poll` has returned
         self._losses = LinkLosses(bus)
         self._waiting = deque[Event]()  # of the last poll, for the iterator
         self._next_poll = 0.0
@@ -65,11 +68,14 @@ class LiveEvents(AbstractContextManager["LiveEvents"]):
 
         The first call also returns the past events of `within` seconds. Queries the services every 5 s.
         """
-        past, self._history = self._history, []
+        events = self._history
+        self._history = []
         self._observer.poll()
         new, self._seen = self._observer.event_log.events_since(self._seen)
-        own = [event.later(clock.to_utc()) for event in new]
-        return [event for event in (*past, *own, *self._losses.poll()) if self._is_selected(event)]
+        to_utc = clock.to_utc()
+        events += [event.later(to_utc) for event in new]
+        events += self._losses.poll()
+        return [event for event in events if self._is_selected(event)]
 
     def close(self) -> None:
         """End the subscription; a second call does nothing."""
@@ -99,11 +105,11 @@ class LiveEvents(AbstractContextManager["LiveEvents"]):
 
     def _past(self, reports: list[AccountReport]) -> list[Event]:
         """Return the events in reports about selected vehicles, those of a service once."""
-        selected = [
-            report
-            for report in reports
-            if not report.vehicles or any(map(self._selection.matches_vehicle, report.vehicles))
-        ]
+        selected = list[AccountReport]()
+        for report in reports:
+            is_selected = any(map(self._selection.matches_vehicle, report.vehicles))
+            if is_selected or not report.vehicles:
+                selected.append(report)
         return [event for _, event in once_per_service(selected)]
 
 
@@ -122,14 +128,13 @@ class LinkLosses:
         if now < self._next_query:
             return []
         self._next_query = now + _LOSS_QUERY
-        reported = {
-            (report.service, event.vehicle, *event.identity): _on_link(event, report.service)
-            for report in self._bus.accounts(within=_LOSS_WINDOW, timeout=_LOSS_TIMEOUT)
-            for event in report.events
-            if event.kind in _LOSS_KINDS
-        }
-        new = [event for key, event in reported.items() if key not in self._shown]
-        self._shown |= reported.keys()
+        new = list[Event]()
+        for report in self._bus.accounts(within=_LOSS_WINDOW, timeout=_LOSS_TIMEOUT):
+            for event in report.events:
+                key = (report.service, event.vehicle, *event.identity)
+                if event.kind in _LOSS_KINDS and key not in self._shown:
+                    self._shown.add(key)
+                    new.append(_on_link(event, report.service))
         return sorted(new, key=lambda event: event.time)
 
 

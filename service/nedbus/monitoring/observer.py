@@ -1,20 +1,20 @@
 """Observer of the health of selected streams and of their vehicles' events."""
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from nedbus import Bus, Sample, clock
-from nedbus.health import Health, Monitor, RejectionReport, stream_state
+from nedbus.health import Health, Monitor, Publishers, RejectionReport, stream_state
 from nedbus.timings import TIMINGS
 from nedbus.vehicle_events import RECENT, EventLog
 from nedbus_msgs import Address, Selection
 
-_MAX_WAITING: Final = 200  # queued messages above which the reader is behind
-_MAX_LAG: Final = 1.0  # s; if more, the limit is the usual number of messages in this time
-_MAX_PAUSE: Final = 2.5  # s between polls; after a longer pause, this process was stalled
+# A reader is behind with more queued messages than both.
+_BACKLOG: Final = 200  # messages
+_BACKLOG_TIME: Final = 1.0  # s of messages at their usual rates
+_STALL: Final = 2.5  # s between polls; after a longer pause, this process was stalled
 _SETTLING_TIME: Final = 3.0  # s after a reconnect; delayed messages have arrived by then
 
 
@@ -48,7 +48,8 @@ class Observer:
         self.subscription = bus.subscribe(
             *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode="every"
         )
-        self._bus, self._selection = bus, selection
+        self._bus = bus
+        self._selection = selection
         self.monitor = Monitor()
         self._rejections = bus.rejections()
         self._last_poll: float | None = None
@@ -56,60 +57,85 @@ class Observer:
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample just read; a retained one is no event, because its stream may have ended long ago."""
-        if self.monitor.add(sample):
-            missing, now = sample.provenance.missing, clock.steady()
-            self.event_log.add(
-                sample.address,
-                sample.message,
-                now,
-                missing=missing,
-                lost=sample.lost,
-                source=sample.source,
-            )
+        if not self.monitor.add(sample):
+            return
+        self.event_log.add(
+            sample.address,
+            sample.message,
+            clock.steady(),
+            missing=sample.provenance.missing,
+            lost=sample.lost,
+            source=sample.source,
+        )
 
     def poll(self) -> Snapshot:
         """Poll streams, rejections and the link, and record changes in the event log."""
-        now, connected = clock.steady(), self._bus.connected
-        dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
+        now = clock.steady()
+        connected = self._bus.connected
+        dropped = self.subscription.counts.dropped
+        waiting = self.subscription.waiting
         healths = self.monitor.snapshot()
-        taken = [
-            report for report in self._rejections.take() if self._selection.matches(report.address)
-        ]
-        rejected = [replace(report, received=round(now * 1e9)) for report in taken]
-        for report in rejected:
-            self.event_log.reject(report.address, report.reason, now)
+        rejected = self._take_rejections(now)
         alive = self._bus.publishers(timeout=0.2)
-        self._disconnected = self._disconnected if connected else now
-        settled = now - self._disconnected > _SETTLING_TIME
-        states = {
-            main: stream_state(healths[main], publishers=alive[main]).name if settled else "unknown"
-            for main in [vehicle.main for vehicle in list(self.event_log.vehicles.values())]
-            if main is not None and (main in healths or not settled)
-        }
+        if not connected:
+            self._disconnected = now
+        is_settled = now - self._disconnected > _SETTLING_TIME
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"
-        paused = self._last_poll is not None and now - self._last_poll > _MAX_PAUSE
+        self.event_log.update(
+            now,
+            self._states(healths, alive, is_settled=is_settled),
+            link=link,
+            dropped=dropped,
+            is_behind=self._is_behind(now, waiting, healths),
+            present={address.vehicle for address in alive},
+        )
+        if is_settled:
+            self._forget_ended(alive)
+        behind = ""
+        if self.event_log.overload:
+            behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped"
+        known = {address: health for address, health in healths.items() if address in self.monitor}
+        return Snapshot(now, known, alive, rejected, link, behind)
+
+    def _take_rejections(self, now: float) -> list[RejectionReport]:
+        """Take the new rejections of the selection, on the steady clock, and add them to the event log."""
+        rejected = list[RejectionReport]()
+        for report in self._rejections.take():
+            if self._selection.matches(report.address):
+                rejected.append(replace(report, received=round(now * 1e9)))
+                self.event_log.reject(report.address, report.reason, now)
+        return rejected
+
+    def _states(
+        self, healths: Mapping[Address, Health], alive: Publishers, *, is_settled: bool
+    ) -> dict[Address, str]:
+        """Return the state of the main stream of each vehicle; unknown just after a reconnect."""
+        states = dict[Address, str]()
+        for vehicle in list(self.event_log.vehicles.values()):
+            main = vehicle.main
+            if main is None:
+                continue
+            if not is_settled:
+                states[main] = "unknown"
+            elif main in healths:
+                states[main] = stream_state(healths[main], publishers=alive[main]).name
+        return states
+
+    def _is_behind(self, now: float, waiting: int, healths: Mapping[Address, Health]) -> bool:
+        """Return whether messages wait for this process, or it was stalled since the last poll."""
+        was_stalled = self._last_poll is not None and now - self._last_poll > _STALL
         self._last_poll = now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
-        is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
-        present = {each.vehicle for each in alive}
-        self.event_log.update(
-            now, states, link=link, dropped=dropped, is_behind=is_behind, present=present
-        )
-        if settled:
-            for address, each in self.monitor.items():
-                limit = min(
-                    TIMINGS.forgotten,
-                    math.inf if address.vehicle in self.event_log.vehicles else RECENT,
-                )
-                # a retained message does not come again
-                is_listed = alive.complete or not each.sample.retained
-                if not alive[address] and each.age > limit and is_listed:
-                    # unless a message has arrived in the meantime
-                    self.monitor.forget(address, silence=limit)
-        behind = (
-            f"reader overloaded: {waiting} messages queued, {dropped} dropped"
-            if self.event_log.overload
-            else ""
-        )
-        healths = {address: each for address, each in healths.items() if address in self.monitor}
-        return Snapshot(now, healths, alive, rejected, link, behind)
+        return was_stalled or waiting > max(_BACKLOG, _BACKLOG_TIME * rate)
+
+    def _forget_ended(self, alive: Publishers) -> None:
+        """Forget streams without a publisher that have been silent for long; of unknown vehicles, after a minute."""
+        for address, newest in self.monitor.items():
+            limit = TIMINGS.forgotten
+            if address.vehicle not in self.event_log.vehicles:
+                limit = min(limit, RECENT)
+            # A retained message does not come again.
+            is_listed = alive.complete or not newest.sample.retained
+            if not alive[address] and newest.age > limit and is_listed:
+                # It is kept if a message has arrived in the meantime.
+                self.monitor.forget(address, silence=limit)

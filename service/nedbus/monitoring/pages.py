@@ -1,6 +1,6 @@
 """HTTP pages of a service: /metrics, /healthz, /readyz, /vehicles and /status."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from typing import Final
 
@@ -8,13 +8,13 @@ from nedbus.clock import format_since
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.extras import import_optional
-from nedbus.health import AccountReport
+from nedbus.health import AccountReport, SourceStatus
 from nedbus.vehicle_events import Expectation, by_vehicle, faults_of
 from nedbus_msgs.text import plural
 
 from .http_server import Page
 
-_MAX_BUSY: Final = 20.0  # s that a source may spend on one message
+_BLOCKED: Final = 20.0  # s on one message, after which a source is not healthy
 
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
@@ -31,13 +31,13 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
 def vehicles_page(report: AccountReport) -> Page:
     """Return the state of each vehicle, or status 503 with the faults."""
     faults = faults_of([report], Expectation(well=True))
-    vehicles = ((name, report.vehicles[name]) for name in by_vehicle([report]))
-    lines = [
-        f"{name} {vehicle.text}{format_since(vehicle.since, report.now)}"
-        for name, vehicle in vehicles
-    ]
-    good = "\n".join(map(_one_line, lines)) or "no vehicles"
-    return Page.verdict(list(map(_one_line, faults)), good)
+    lines = list[str]()
+    for name in by_vehicle([report]):
+        vehicle = report.vehicles[name]
+        since = format_since(vehicle.since, report.now)
+        lines.append(_one_line(f"{name} {vehicle.text}{since}"))
+    good = "\n".join(lines) or "no vehicles"
+    return Page.verdict([_one_line(fault) for fault in faults], good)
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
@@ -45,28 +45,39 @@ def why_not_ready(daemon: Daemon) -> list[str]:
     if not daemon.ready.is_set():
         what = "waiting for a router at" if daemon.role == "client" else "starting a router on"
         return [f"the service is {what} {' or '.join(daemon.endpoints)}"]
-    reasons = []
+    reasons = list[str]()
     if daemon.role == "client" and not daemon.sessions:
         reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
     reasons += _refusals(daemon)
     for source in daemon.sources:
-        # a replay that waits for a reader has addresses
-        silent = source.state == "waiting" and not source.addresses
-        if silent or source.state in {"starting", "retrying", "failed"}:
-            what = "nothing arrives" if silent else source.state
-            reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
-        if source.overload:
-            reasons.append(f"{source.source}: {source.overload}")
+        reasons += _faults_of(source)
     return reasons
 
 
+def _faults_of(source: SourceStatus) -> Iterator[str]:
+    """Yield that a source receives nothing, or is overloaded."""
+    fault = ""
+    if source.state in {"starting", "retrying", "failed"}:
+        fault = source.state
+    elif source.state == "waiting" and not source.addresses:  # a replay that waits has addresses
+        fault = "nothing arrives"
+    if fault and source.error:
+        fault = f"{fault}: {source.error}"
+    if fault:
+        yield f"{source.source}: {fault}"
+    if source.overload:
+        yield f"{source.source}: {source.overload}"
+
+
 def _one_line(text: str) -> str:
-    return "".join(each if each.isprintable() else " " for each in text)  # a fault may quote a peer
+    """Return a text without control characters and line breaks: a fault may quote a peer."""
+    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def _health(daemon: Daemon) -> Page:
-    reasons, busy = _refusals(daemon), daemon.busy
-    if busy >= _MAX_BUSY:
+    reasons = _refusals(daemon)
+    busy = daemon.busy
+    if busy >= _BLOCKED:
         reasons.append(f"a source has been blocked by one message for {busy:.0f} s")
     return Page.verdict(reasons, "ok")
 

@@ -25,7 +25,7 @@ from nedbus import clock
 from nedbus.atomic_write import atomic_write
 from nedbus.errors import PkiError
 
-from .certificate import DAYS, MAX_NAME, Certificate
+from .certificate import DAYS, NAME_LENGTH, Certificate
 
 _CA_NAME: Final = "nedbus CA"
 _CA_DAYS: Final = 3650
@@ -44,7 +44,8 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
     Raises PkiError if the folder already has a CA, or cannot be written.
     """
     key = new_key()
-    return _write_files(folder / "ca", _sign(_CA_NAME, key.public_key(), key, days), key)
+    certificate = _sign(_CA_NAME, key.public_key(), key, days)
+    return _write_files(folder / "ca", certificate, key)
 
 
 def make_certificate(
@@ -56,15 +57,15 @@ def make_certificate(
 
     Raises PkiError if the folder already has a certificate of that name, has no CA, or cannot be written.
     """
-    if not name or len(name) > MAX_NAME or "/" in name or name.startswith("."):
+    has_length = 0 < len(name) <= NAME_LENGTH
+    if not has_length or "/" in name or name.startswith("."):
         raise PkiError(
-            f"{name!r} is not a valid name: use 1 to {MAX_NAME} characters, without / or a leading dot"
+            f"{name!r} is not a valid name: use 1 to {NAME_LENGTH} characters, without / or a leading dot"
         )
     authority = Authority.read(folder)
     key = new_key()
-    return _write_files(
-        folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key
-    )
+    certificate = authority.sign(name, key.public_key(), hosts=hosts, days=days)
+    return _write_files(folder / name, certificate, key)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,32 +90,40 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
     Raises PkiError if the folder has no CA, or a certificate cannot be read.
     """
     authority = load_certificate(folder / "ca.crt")
-    found = []
-    for path in folder.glob("*.crt"):
-        loaded = load_certificate(path)
-        certificate = Certificate.read(path)
-        problem = ""
-        # the key is missing, or not readable by this user
-        with suppress(OSError, ValueError, TypeError):
-            key = serialization.load_pem_private_key(
-                path.with_suffix(".key").read_bytes(), password=None
-            )
-            problem = (
-                ""
-                if key.public_key() == loaded.public_key()
-                else "does not match the key next to it"
-            )
-        try:
-            loaded.verify_directly_issued_by(authority)
-        except (ValueError, TypeError, InvalidSignature):
-            problem = _FOREIGN
-        is_authority = path.name == "ca.crt"
-        name = path.stem if is_authority else certificate.subject
-        use = "authority" if is_authority else "router" if certificate.hosts else "client"
-        found.append(CertificateEntry(path, name, use, certificate, problem))
-    return sorted(
-        found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name)
-    )
+    entries = [_read_entry(path, authority) for path in folder.glob("*.crt")]
+    entries.sort(key=lambda entry: (entry.certificate.ends, entry.name))
+    entries.sort(key=lambda entry: entry.use != "authority")  # stable
+    return entries
+
+
+def _read_entry(path: Path, authority: x509.Certificate) -> CertificateEntry:
+    """Read a certificate in the folder of a CA, and check that it belongs to the CA and to the key next to it."""
+    loaded = load_certificate(path)
+    certificate = Certificate.read(path)
+    name = certificate.subject
+    use = "client"
+    if path.name == "ca.crt":
+        name = path.stem
+        use = "authority"
+    elif certificate.hosts:
+        use = "router"
+    problem = ""
+    if not _has_own_key(path, loaded):
+        problem = "does not match the key next to it"
+    try:
+        loaded.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        problem = _FOREIGN
+    return CertificateEntry(path, name, use, certificate, problem)
+
+
+def _has_own_key(path: Path, certificate: x509.Certificate) -> bool:
+    """Return whether the key next to a certificate is its own; True if it is missing, or not readable by this user."""
+    with suppress(OSError, ValueError, TypeError):
+        data = path.with_suffix(".key").read_bytes()
+        key = serialization.load_pem_private_key(data, password=None)
+        return key.public_key() == certificate.public_key()
+    return True
 
 
 def renew_certificate(
@@ -135,8 +144,11 @@ def renew_certificate(
     if entry.problem == _FOREIGN:
         raise PkiError(f"{entry.path} is signed by another CA: renew it in the folder of that CA")
     # The private key may exist only on the vehicle, but the old certificate has the public key.
-    key = new_key() if replace_key else None
-    public_key = key.public_key() if key else load_certificate(entry.path).public_key()
+    key = None
+    public_key = load_certificate(entry.path).public_key()
+    if replace_key:
+        key = new_key()
+        public_key = key.public_key()
     signed = authority.sign(entry.name, public_key, hosts=entry.certificate.hosts, days=days)
     return _write_files(entry.path.with_suffix(""), signed, key, replace=True)
 
@@ -150,7 +162,8 @@ class Authority(NamedTuple):
     @classmethod
     def read(cls, folder: Path) -> Authority:
         """Read `ca.crt` and `ca.key`; raise PkiError if they are missing or damaged."""
-        certificate, path = load_certificate(folder / "ca.crt"), folder / "ca.key"
+        certificate = load_certificate(folder / "ca.crt")
+        path = folder / "ca.key"
         try:
             key = serialization.load_pem_private_key(_read(path), password=None)
         except (ValueError, TypeError):
@@ -181,11 +194,17 @@ def new_key() -> ec.EllipticCurvePrivateKey:
 def write_new(path: Path, item: x509.Certificate | ec.EllipticCurvePrivateKey) -> None:
     """Write a certificate (mode 644) or a private key (mode 600) to a new file."""
     if isinstance(item, x509.Certificate):
-        content, mode = item.public_bytes(serialization.Encoding.PEM), 0o644
+        mode = 0o644
+        content = item.public_bytes(serialization.Encoding.PEM)
     else:
-        pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        content, mode = item.private_bytes(serialization.Encoding.PEM, pkcs8, plain), 0o600
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        mode = 0o600
+        content = item.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with os.fdopen(descriptor, "wb") as file:
         file.write(content)
 
 
@@ -229,14 +248,11 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as exc:
-        hint = (
-            "run 'nedbus pki ca' first"
-            if path.name == "ca.crt"
-            else "check that this user may read it"
-        )
-        raise PkiError(
-            f"{path} cannot be read ({(exc.strerror or str(exc)).lower()}): {hint}"
-        ) from exc
+        hint = "check that this user may read it"
+        if path.name == "ca.crt":
+            hint = "run 'nedbus pki ca' first"
+        reason = (exc.strerror or str(exc)).lower()
+        raise PkiError(f"{path} cannot be read ({reason}): {hint}") from exc
 
 
 def _sign(
@@ -245,11 +261,19 @@ def _sign(
 ) -> x509.Certificate:  # fmt: skip
     """Return a certificate for a key; without an issuer, a self-signed CA certificate."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now, is_authority = clock.now(), issuer is None
-    if days is None:
-        days = _CA_DAYS if is_authority else DAYS
-    until = now + dt.timedelta(days=days)
-    allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
+    now = clock.now()
+    if issuer is None:
+        until = now + dt.timedelta(days=_CA_DAYS if days is None else days)
+        ends = until
+        constraints = x509.BasicConstraints(ca=True, path_length=0)
+        allowed = {"key_cert_sign", "crl_sign"}
+    else:
+        until = now + dt.timedelta(days=DAYS if days is None else days)
+        ends = min(until, issuer.not_valid_after_utc)
+        constraints = x509.BasicConstraints(ca=False, path_length=None)
+        allowed = {"digital_signature"}
+    usages = {usage: usage in allowed for usage in _USAGES}
+    authority_key = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -258,29 +282,21 @@ def _sign(
         .serial_number(x509.random_serial_number())
         # The clock of a vehicle may be behind at boot.
         .not_valid_before(min(now, until) - dt.timedelta(days=1))
-        .not_valid_after(until if issuer is None else min(until, issuer.not_valid_after_utc))
+        .not_valid_after(ends)
         # Required by Python 3.13 and later, though not by Zenoh.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
-        )
-        .add_extension(
-            x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True
-        )
-        .add_extension(
-            x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES}), critical=True
-        )
+        .add_extension(authority_key, critical=False)
+        .add_extension(constraints, critical=True)
+        .add_extension(x509.KeyUsage(**usages), critical=True)
     )
-
-    if issuer is not None:  # a router is also a client of other routers
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + (
-            [ExtendedKeyUsageOID.SERVER_AUTH] if hosts else []
-        )
+    if issuer is not None:
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]  # a router is also a client of other routers
+        if hosts:
+            purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
         builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if hosts:
-        builder = builder.add_extension(
-            x509.SubjectAlternativeName(list(map(_general_name, hosts))), critical=False
-        )
+        names = x509.SubjectAlternativeName([_general_name(host) for host in hosts])
+        builder = builder.add_extension(names, critical=False)
     return builder.sign(signer, hashes.SHA256())
 
 

@@ -19,13 +19,14 @@ RENEW_WITHIN: Final = 30
 CERTIFICATE_PREFIX: Final = "vehicle-"
 """Prefix of the vehicle id in common names, so no vehicle has the common name of a reader or router."""
 
-MAX_NAME: Final = 64  # limit of X.509 for a common name [characters]
+NAME_LENGTH: Final = 64  # characters that X.509 allows in a common name
+_SHOWN_HOSTS: Final = 8
 
 
 def certificate_name(vehicle: str) -> str:
     """Return the common name of a vehicle's certificate; raise AddressError for an invalid or too long id."""
     check_vehicle(vehicle)
-    longest = MAX_NAME - len(CERTIFICATE_PREFIX)
+    longest = NAME_LENGTH - len(CERTIFICATE_PREFIX)
     if len(vehicle) > longest:
         raise AddressError("vehicle", vehicle, f"at most {longest} characters, for a certificate")
     return CERTIFICATE_PREFIX + vehicle
@@ -51,25 +52,25 @@ class Certificate:
         """
         x509 = import_optional("pki", "cryptography.x509")
         try:
-            found = (
-                x509.load_pem_x509_certificate(data)
-                if pem
-                else x509.load_der_x509_certificate(data)
-            )
-            names = [
-                each.value
-                for each in found.extensions
-                if each.oid == x509.OID_SUBJECT_ALTERNATIVE_NAME
-            ]
+            load = x509.load_pem_x509_certificate if pem else x509.load_der_x509_certificate
+            loaded = load(data)
+            hosts = list[str]()
+            for extension in loaded.extensions:
+                if extension.oid == x509.OID_SUBJECT_ALTERNATIVE_NAME:
+                    hosts += [str(name.value) for name in extension.value]
         except (
             x509.InvalidVersion,
             x509.DuplicateExtension,
             x509.UnsupportedGeneralNameType,
         ) as exc:
             raise ValueError(str(exc)) from exc
-        hosts = tuple(str(name.value) for name in names[0]) if names else ()
-        begins, ends = found.not_valid_before_utc, found.not_valid_after_utc
-        return cls(_common_name(found.subject), _common_name(found.issuer), hosts, begins, ends)
+        return cls(
+            subject=_common_name(loaded.subject),
+            issuer=_common_name(loaded.issuer),
+            hosts=tuple(hosts),
+            begins=loaded.not_valid_before_utc,
+            ends=loaded.not_valid_after_utc,
+        )
 
     @classmethod
     def read(cls, path: str | Path) -> Certificate:
@@ -85,11 +86,14 @@ class Certificate:
         return self.days_left(now) <= within
 
     def __str__(self) -> str:
-        hosts = f" for {', '.join(self.hosts[:8])}" if self.hosts else ""
-        return f"{self.subject}{hosts}, issued by {self.issuer}, valid until {self.ends:%Y-%m-%d}"
+        name = self.subject
+        if self.hosts:
+            name = f"{name} for {', '.join(self.hosts[:_SHOWN_HOSTS])}"
+        return f"{name}, issued by {self.issuer}, valid until {self.ends:%Y-%m-%d}"
 
 
 def _common_name(name: Any) -> str:
-    return next(
-        (str(each.value) for each in name if each.rfc4514_attribute_name == "CN"), "unnamed"
-    )
+    for attribute in name:
+        if attribute.rfc4514_attribute_name == "CN":
+            return str(attribute.value)
+    return "unnamed"

@@ -6,9 +6,6 @@ from nedbus.extras import lazy_exports
 
 from .sample import M2, M3, Counts, M_co, Mode, Query, Sample, Subscribe
 from .source_message import (
-    ARDUPILOT,
-    OF_OTHER_AUTOPILOTS,
-    OTHER_AUTOPILOT,
     RecordStream,
     Rejection,
     SourceMessage,

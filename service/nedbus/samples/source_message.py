@@ -2,14 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 from nedbus_msgs import BY_TOPIC, Address, Definition, Encoded, InvalidMessageError, encode_upgraded
-
-ARDUPILOT: Final = "mavlink-ardupilot"
-OTHER_AUTOPILOT: Final = "mavlink-autopilot"
-OF_OTHER_AUTOPILOTS: Final = frozenset({ARDUPILOT, OTHER_AUTOPILOT})
-"""Values of `sample.source` of log messages whose author is ArduPilot, or another autopilot than PX4."""
 
 
 class RecordStream(Protocol):

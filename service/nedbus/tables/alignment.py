@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from nedbus import UtcOffset, utc_of
 from nedbus.errors import AddressError, ArgumentError, ConfigError
+from nedbus.flights import utc_offset_of
 from nedbus.timeline import to_datetime64
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray, derive_column
@@ -23,7 +24,6 @@ from .arrays import (
     missing_of,
     recording_start,
     to_dataframe,
-    utc_offset_of,
 )
 from .reading import FlightPath, ReadStreams, read_streams
 

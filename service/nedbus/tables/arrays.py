@@ -9,11 +9,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from nedbus import Flight, UtcOffset
+from nedbus import Flight
 from nedbus.errors import ArgumentError, SourceError
 from nedbus.extras import import_optional
-from nedbus.flights import ReadOptions, no_utc
-from nedbus_msgs import DEFAULT_TOPIC, Address, decode_text
+from nedbus.flights import ReadOptions, require_utc
+from nedbus_msgs import Address, decode_text
 from nedbus_msgs.arrays import MessageArray
 
 Absent = Mapping[str, npt.NDArray[np.bool_]]  # masks of the messages that lack a field, by field
@@ -84,35 +84,6 @@ def array_of(
         utc = require_utc(flight, address.vehicle)
         messages["timestamp"] = utc.unix_us(messages["timestamp"].astype(np.int64))
     return messages, masks
-
-
-def vehicles_of(flight: Flight) -> list[str]:
-    """Return the vehicles of a flight, file by file."""
-    found = []
-    for reader, names in zip(flight._readers, flight._names, strict=True):
-        own = sorted({address.vehicle for address in reader.definitions})
-        found += [names.get(vehicle, vehicle) for vehicle in own]
-    return found
-
-
-def path_of(flight: Flight, vehicle: str) -> Path:
-    """Return the file of a vehicle."""
-    number, _ = flight._find(Address(vehicle, DEFAULT_TOPIC))
-    return flight._paths[number]
-
-
-def require_utc(flight: Flight, vehicle: str) -> UtcOffset:
-    """Return the UTC offset of a vehicle; raise SourceError if it is unknown."""
-    utc = flight._utc_by_name[vehicle]
-    if isinstance(utc, str):
-        raise no_utc(path_of(flight, vehicle), utc)
-    return utc
-
-
-def utc_offset_of(flight: Flight, vehicle: str) -> UtcOffset | None:
-    """Return the UTC offset of a vehicle; None if it is unknown."""
-    utc = flight._utc_by_name[vehicle]
-    return utc if isinstance(utc, UtcOffset) else None
 
 
 def array_warnings(flight: Flight) -> list[tuple[Path, str]]:

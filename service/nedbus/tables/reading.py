@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, ove
 
 from nedbus import Flight
 from nedbus.errors import AddressError, SourceError
-from nedbus.flights import ReadOptions, matching, require_one_vehicle, single_match
+from nedbus.flights import (
+    ReadOptions,
+    matching,
+    path_of,
+    require_one_vehicle,
+    single_match,
+    vehicles_of,
+)
 from nedbus.log_event import about
 from nedbus.timeline import provides_utc
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, TOPICS, Address, Selection, vehicle_name
@@ -24,9 +31,7 @@ from .arrays import (
     array_of,
     array_warnings,
     open_arrays,
-    path_of,
     to_dataframe,
-    vehicles_of,
 )
 
 if TYPE_CHECKING:

@@ -12,6 +12,8 @@
 | STEP | a synchronised (Unix) time was set: no reboot | as received |
 
 `RebootDetector` tells a reboot from the times of streams without a common order, as on a bus.
+
+Of these, `__all__` is public: what a script that analyses messages needs to convert times and to find reboots.
 """
 
 from typing import TYPE_CHECKING
@@ -22,7 +24,7 @@ from .arrivals import arrivals
 from .axis import Axis
 from .order import Order
 from .pace import MAX_PAUSE, Pace
-from .reboots import MAX_REORDERED, RebootDetector, RebootSign
+from .reboots import REORDER_WINDOW, RebootDetector, RebootSign
 from .utc_offset import UTC_COLUMNS, UtcOffset, provides_utc, to_unix_ns, unix_seconds, utc_text
 from .vehicle_clock import Reading, RecentTimes, TimeKind, VehicleClock, is_boot_possible
 
@@ -33,3 +35,13 @@ else:
     __getattr__ = lazy_exports(
         __name__, dict.fromkeys(("UtcEstimate", "to_datetime64"), ("", "utc_estimate"))
     )
+
+__all__ = [
+    "REORDER_WINDOW",
+    "RebootDetector",
+    "RebootSign",
+    "UtcOffset",
+    "provides_utc",
+    "to_datetime64",
+    "unix_seconds",
+]

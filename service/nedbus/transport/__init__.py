@@ -27,7 +27,6 @@ from .router import (
     read_router_config,
     router_endpoints,
 )
-from .router_log import Uplinks, log_refusals
 from .session import (
     RawSample,
     Session,
@@ -39,10 +38,11 @@ from .session import (
     translate_zenoh_errors,
 )
 from .tls import UNKNOWN_CA, Tls, check_pem, read_certificate
+from .uplinks import Uplinks
 from .vehicle_directory import Publishers, VehicleDirectory
 from .write_probe import (
     CONFIRMED,
-    Verdict,
+    WriteVerdict,
     is_refused,
     probe_at_router,
     probe_writes,
@@ -58,6 +58,9 @@ from .zenoh_ext import (
 )
 
 if TYPE_CHECKING:
-    from .access_control import AccessControl
+    from .access_control import AccessControl, AccessRule, Decision
 else:
-    __getattr__ = lazy_exports("nedbus.transport", {"AccessControl": ("", "access_control")})
+    __getattr__ = lazy_exports(
+        "nedbus.transport",
+        dict.fromkeys(("AccessControl", "AccessRule", "Decision"), ("", "access_control")),
+    )

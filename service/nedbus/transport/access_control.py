@@ -34,7 +34,7 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class AccessRule:
     """One rule: kinds of messages, directions, and the key expressions whose keys it includes."""
 
     name: str
@@ -66,7 +66,7 @@ class AccessControl:
         self.is_enabled: bool = section["enabled"]
         self._is_allowed_by_default = section["default_permission"] == "allow"
         rules = {rule["id"]: _parse_rule(rule) for rule in section["rules"] or ()}
-        self._rules = defaultdict[str, list[Rule]](list)  # by subject
+        self._rules = defaultdict[str, list[AccessRule]](list)  # by subject
         for policy in section["policies"] or ():
             for subject in policy["subjects"]:
                 self._rules[subject] += [rules[name] for name in policy["rules"] if name in rules]
@@ -87,7 +87,7 @@ class AccessControl:
         """The common names in the configuration, in its order."""
         return [name for name in self._subjects if name is not None]
 
-    def rules_of(self, certificate: str) -> list[Rule]:
+    def rules_of(self, certificate: str) -> list[AccessRule]:
         """Return the rules that apply to the certificate with this common name."""
         subjects = [*self._subjects.get(None, ()), *self._subjects.get(certificate, ())]
         return [rule for subject in subjects for rule in self._rules.get(subject, ())]
@@ -116,8 +116,8 @@ class AccessControl:
         return any(own.includes(wanted) for own in self._limited)
 
 
-def _parse_rule(rule: Mapping[str, Any]) -> Rule:
+def _parse_rule(rule: Mapping[str, Any]) -> AccessRule:
     is_allowed = rule["permission"] == "allow"
     flows = tuple(rule["flows"] or _BOTH_FLOWS)
     key_exprs = tuple(zenoh.KeyExpr(key) for key in rule["key_exprs"])
-    return Rule(rule["id"], is_allowed, flows, tuple(rule["messages"]), key_exprs)
+    return AccessRule(rule["id"], is_allowed, flows, tuple(rule["messages"]), key_exprs)

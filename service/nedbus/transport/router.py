@@ -56,6 +56,7 @@ def open_router(
     `listen`, `connect`: override the endpoints of the file, as the flags of `zenohd` do.
     `tls`: files for the `tls/` routers in `connect`, unless the file has a TLS section.
 
+    With RUST_LOG set, Zenoh writes its own log to stdout, such as `zenoh_link_tls=warn` for refused clients.
     Plugins in the file are logged, not loaded: Zenoh's Python library does not support them.
     The admin space shows `max_sessions` in `metadata`. The soft limit of open files is raised to the hard limit.
 
@@ -64,6 +65,7 @@ def open_router(
     """
     check_endpoints(listen, where="listen")
     check_endpoints(connect, where="connect")
+    zenoh.try_init_log_from_env()
     if config_file is None:
         config = zenoh.Config()
         settings = {

@@ -21,7 +21,8 @@ from nedbus_msgs import ANY
 from .session import Session, open_client, translate_zenoh_errors
 from .tls import Tls
 
-Verdict = Literal["allowed", "denied", "unknown"]
+WriteVerdict = Literal["allowed", "denied", "unknown"]
+"""Whether a client may publish a vehicle; "unknown" if a probe could not tell."""
 
 CONFIRMED: Final = 3
 """Consecutive denials that count as a refusal; a slow or restarting router causes fewer."""
@@ -38,7 +39,7 @@ def probe_writes(
     *,
     prefix: str,
     timeout: float = 1.0,
-) -> dict[str, Verdict]:
+) -> dict[str, WriteVerdict]:
     """Return for each vehicle whether `writer` may publish it; "unknown" if `reader` is not allowed to subscribe.
 
     `timeout`: time for the router to announce the subscriber, and again for an allowed message to arrive [s].
@@ -75,7 +76,7 @@ def probe_writes(
                 )
             if _wait(receive, _RETRY):
                 break
-    refused: Verdict = "denied" if matched else "unknown"
+    refused: WriteVerdict = "denied" if matched else "unknown"
     return {vehicle: refused if key in missing else "allowed" for key, vehicle in keys.items()}
 
 
@@ -87,7 +88,7 @@ def probe_at_router(
     tls: Tls,
     prefix: str,
     stop: threading.Event | None = None,
-) -> Mapping[str, Verdict]:
+) -> Mapping[str, WriteVerdict]:
     """Probe with a second session to one of these endpoints; no verdicts if the two sessions share no router."""
     routers = routers_of(session)
     for endpoint in endpoints if vehicles else ():
@@ -106,7 +107,7 @@ def probe_at_router(
     return {}
 
 
-def is_refused(probe: Callable[[], Verdict | None]) -> bool | None:
+def is_refused(probe: Callable[[], WriteVerdict | None]) -> bool | None:
     """Return True after CONFIRMED denials by `probe`, False after an acceptance, None if it cannot be told."""
     for _ in range(CONFIRMED):
         verdict = probe()

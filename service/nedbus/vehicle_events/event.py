@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
-from nedbus.samples import ARDUPILOT, OTHER_AUTOPILOT
+from nedbus_msgs import ARDUPILOT, OTHER_AUTOPILOT
 
 from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import MAX_ALONE

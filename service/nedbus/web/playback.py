@@ -13,11 +13,11 @@ from bokeh.models.widgets import Select, Slider, Toggle
 
 from nedbus import Sample
 from nedbus.errors import NedbusError
-from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, follow_flight, open_messages, times_of
+from nedbus.flights import EventReplay
 from nedbus.health import RejectionReport, Times
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.vehicle_events import EventLog, state_at
+from nedbus.vehicle_events import state_at
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .event_timeline import EventTimeline
@@ -46,11 +46,11 @@ class Recording:
     def __init__(self, *paths: Path) -> None:
         self.name = ", ".join(path.name for path in paths)
         self.overview = Fleet(long=_OVERVIEW)
-        self.timeline = EventTimeline(EventLog(MAX_FILE_EVENTS), times=Times())
+        self._replay = EventReplay(paths)
+        self.timeline = EventTimeline(self._replay.event_log, times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
-        self._flight = open_messages(paths, EVENT_OPTIONS)
         self.indices: dict[Address, list[int]] = {}  # in `entries`, by stream
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
@@ -60,12 +60,13 @@ class Recording:
         return self.dues[-1] if self.dues else 0.0
 
     def _read(self) -> None:
-        flight, event_log = self._flight, self.timeline.event_log
         try:
-            self.timeline.times = times_of(flight)
-            for message, reason, payload in follow_flight(flight, event_log):
-                address, stamp = message.address, message.timestamp or 0
-                entry: bytes | str | int = stamp if reason is None else reason
+            self.timeline.times = self._replay.times
+            for message in self._replay:
+                address, payload = message.address, message.payload
+                entry: bytes | str | int = message.timestamp
+                if message.rejected is not None:
+                    entry = message.rejected
                 if payload is not None and (
                     is_position(address) or address.topic in _STATUS_TOPICS
                 ):
@@ -73,12 +74,13 @@ class Recording:
                     if is_position(address):
                         row = codec_of(DEFAULT).decode_row(payload)
                         self.overview.add(Sample(row, address, round(message.at * 1e9)), message.at)
-                if reason is None and address not in self.indices and is_position(address):
-                    self.timeline.set_clock(address.vehicle, stamp / 1e6, message.at)
+                is_first = message.rejected is None and address not in self.indices
+                if is_first and is_position(address):
+                    self.timeline.set_clock(address.vehicle, message.timestamp / 1e6, message.at)
                 self.indices.setdefault(address, []).append(len(self.entries))
                 self.entries.append((address, entry))
                 self.dues.append(message.at)
-            for warning in flight.warnings:
+            for warning in self._replay.warnings:
                 _log.warning(
                     "%s", warning, extra=about("damaged", source=self.name, reason=warning)
                 )

@@ -8,6 +8,7 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus import limits
 from nedbus.bridges.late_filter import DRIFT, LateFilter
 from nedbus_msgs import Address
 from tests.flights.messages import message
@@ -131,7 +132,7 @@ def test_report_names_one_address_and_counts_the_others() -> None:
 
 def test_number_of_clocks_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the limit the oldest clock is forgotten, so a late sample of its address counts as current."""
-    monkeypatch.setattr("nedbus.bridges.late_filter._MAX_CLOCKS", 2)
+    monkeypatch.setattr(limits, "BRIDGED_STREAMS", 2)
     late, addresses = LateFilter(), [Address(str(number), ONE.topic) for number in range(3)]
     assert all(late.admits(sample(NOW, address=each), arrived=0) for each in addresses)
     assert len(late._clocks) == 2

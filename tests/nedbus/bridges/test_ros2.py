@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus import limits
 from nedbus.bridges import Ros2Bridge
 from nedbus.errors import NedbusError
 from nedbus.timings import Timings
@@ -285,7 +286,7 @@ def test_number_of_held_messages_is_bounded(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beyond the limit the oldest held message is dropped; a newer one of the same stream replaces it."""
-    monkeypatch.setattr("nedbus.bridges.ros2._MAX_HELD", 2)
+    monkeypatch.setattr(limits, "BRIDGED_STREAMS", 2)
     bridge = Ros2Bridge(bus, zenoh_session)
     for timestamp, vehicle in enumerate("1223"):
         home = nedbus.HomePosition(timestamp=timestamp)

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from nedbus import limits
 from nedbus.monitoring import HttpServer, Page, http_server
 from nedbus.timings import Timings
 from tests.peers.http_client import HttpClient
@@ -138,7 +139,7 @@ def test_stalled_clients_delay_no_others(timings: Timings, sent: bytes, each_sec
         for _ in range(20):
             assert HttpClient(server.port).request("/page") == (200, "a page\n")
             # accepting, and sending bytes
-            assert threads_since(before) <= 2 + http_server._MAX_REQUESTS
+            assert threads_since(before) <= 2 + limits.HTTP_REQUESTS
 
 
 @STALLED
@@ -154,8 +155,8 @@ def test_slow_clients_time_out(
         ended.release()
 
     monkeypatch.setattr(HttpServer, "process_request_thread", handle_and_count)
-    with stalled(http_server._MAX_REQUESTS, sent, each_second):
-        for _ in range(http_server._MAX_REQUESTS):
+    with stalled(limits.HTTP_REQUESTS, sent, each_second):
+        for _ in range(limits.HTTP_REQUESTS):
             assert ended.acquire(timeout=DEADLINE)
 
 

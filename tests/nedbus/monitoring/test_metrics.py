@@ -24,8 +24,9 @@ from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.worker import State
 from nedbus.health import SourceStatus, StreamHealth, StreamStatus
+from nedbus.limits import EXPORTED_STREAMS as MAX_STREAMS
 from nedbus.monitoring import Exporter, HttpServer, Page, service_pages
-from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page, stream_metrics
+from nedbus.monitoring.metrics import MeasuredStream, metrics_page, stream_metrics
 from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
 from nedbus.timings import Timings

@@ -16,13 +16,14 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus import limits
 from nedbus.daemon import Daemon
 from nedbus.doctor import Finding
 from nedbus.doctor.examination import check_network
 from nedbus.doctor.observation import Observation
 from nedbus.doctor.prober import check_endpoint
 from nedbus.errors import ConfigError
-from nedbus.monitoring import Exporter, exporter, service_pages
+from nedbus.monitoring import Exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import (
@@ -291,7 +292,7 @@ def test_exporter_metrics_have_sessions_and_limits_of_routers(
         with open_client([limited], timeout=5.0):
             wait_for(lambda: shows(f"sessions{label} 3.0\n"), what="another session")
         wait_for(lambda: shows(f"sessions{label} 2.0\n"), what="its close")
-        monkeypatch.setattr(exporter, "_MAX_ROUTERS", 0)
+        monkeypatch.setattr(limits, "EXPORTED_ROUTERS", 0)
         wait_for(lambda: not shows(f"sessions{label}"), what="no router")
 
 

@@ -20,7 +20,7 @@ from nedbus.cli.options import (
 from nedbus.cli.output.progress import log_progress
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
-from nedbus.daemon import SOURCE_FORMS, Daemon, log_refusals, run_router
+from nedbus.daemon import SOURCE_FORMS, Daemon, run_router
 from nedbus.doctor import check_service
 from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import NedbusError
@@ -81,8 +81,6 @@ def serve(
         return
     settings = load_settings(config, **given)
     daemon = Daemon(settings, version=__version__)
-    if daemon.role == "router" and any(each.startswith("tls/") for each in daemon.endpoints):
-        log_refusals()
     pages = (
         serve_pages(settings.http, service_pages(daemon))
         if settings.http is not None

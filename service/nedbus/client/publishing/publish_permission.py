@@ -9,7 +9,7 @@ from nedbus.errors import RefusedError
 from nedbus.transport import (
     Session,
     Tls,
-    Verdict,
+    WriteVerdict,
     is_refused,
     probe_at_router,
     routers_of,
@@ -62,7 +62,7 @@ class PublishPermission:
         if self.is_refused(vehicle):
             raise RefusedError(vehicle, self._tls.certificate)
 
-    def _probe(self, vehicle: str) -> Verdict | None:
+    def _probe(self, vehicle: str) -> WriteVerdict | None:
         verdicts = probe_at_router(
             self._session, self._endpoints, [vehicle], tls=self._tls, prefix=self._prefix
         )

@@ -13,9 +13,11 @@ from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from nedbus.errors import AddressError, DecodeError, SourceError
-from nedbus.samples import OF_OTHER_AUTOPILOTS, SourceMessage
+from nedbus.samples import SourceMessage
 from nedbus_msgs import (
+    ARDUPILOT,
     BY_TOPIC,
+    OTHER_AUTOPILOT,
     Address,
     Definition,
     Encoded,
@@ -366,7 +368,7 @@ class _RecordedFile:
             self._reader.starts[vehicle] = int(start)
         missing = frozenset(metadata.get("missing", "").split()).intersection(definition.names)
         stream = RecordedStream(channel.topic, address, definition, layout, missing)
-        if metadata.get("source") in OF_OTHER_AUTOPILOTS:
+        if metadata.get("source") in (ARDUPILOT, OTHER_AUTOPILOT):
             stream.source = metadata["source"]
         return stream
 

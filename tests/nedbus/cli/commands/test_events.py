@@ -76,7 +76,7 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cache the parsed real log for all tests: only the output of the commands is tested."""
-    target = "nedbus.event_sources.read_file_events"
+    target = "nedbus.flights.event_replay.read_file_events"
     monkeypatch.setattr(
         target, lambda path: (cached_events if path == REAL else read_file_events)(path)
     )

@@ -136,7 +136,7 @@ def test_documented_log_limits_match_the_code() -> None:
     section = (ROOT / "docs" / "operate.md").read_text().partition("\n## Logs\n")[2]
     named = re.findall(r"^\| ((?:`[a-z_]+`(?:, )?)+) \| [a-z ]", section, re.MULTILINE)
     events = {each for names in named for each in re.findall(r"`([a-z_]+)`", names)} & EVENTS.keys()
-    assert {"error", "rejected", "client_refused"} <= events
+    assert {"error", "rejected", "access_denied"} <= events
     assert f"{BURST} lines" in section
     assert f"{PER_MINUTE} per minute" in section
 

@@ -1,20 +1,10 @@
-"""Log uplink state and refused clients of a service and its router.
+"""Log of the links from a service or a router to other routers, which Zenoh lists but does not report."""
 
-Zenoh does not report the state of links, and reports refused clients only in its own log on stdout.
-"""
-
-import atexit
 import logging
-import os
-import re
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Final
-
-import zenoh
 
 from nedbus.endpoints import split_endpoint
 from nedbus.log_event import about
@@ -25,19 +15,6 @@ from .tls import Tls
 _log = logging.getLogger(__name__)
 
 _LINK_TIMEOUT: Final = 3.0  # s before a link that does not come up is logged
-_EXIT_TIMEOUT: Final = 1.0  # s; a child process may hold the pipe open
-_COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
-# only listeners give a hint
-_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")
-_REASONS: Final = {  # by substring of Zenoh's text
-    "certificate expired": "its certificate has expired",
-    "BadSignature": "its certificate is signed by another CA",
-    "UnknownIssuer": "its certificate is signed by another CA",
-    "sent no certificates": "it sent no certificate",
-    "fatal alert": "it does not accept the certificate of this router",
-    "corrupt message": "it does not speak TLS",
-    "handshake eof": "it aborted the handshake",
-}
 
 
 class Uplinks:
@@ -121,42 +98,3 @@ class Uplinks:
         missing = "set tls_ca, tls_certificate and tls_key, which are missing"
         explanation = self._tls.explain() if self._tls else missing
         return f" ({explanation})" if explanation else ""
-
-
-def log_refusals() -> None:
-    """Log each client that a router of this process refuses from now on; Zenoh does not report the client's address.
-
-    Redirects stdout through a pipe, extracts refusals from Zenoh's log, and forwards all other lines.
-    """
-    stdout = os.dup(1)
-    read, write = os.pipe()
-    os.dup2(write, 1)
-    os.close(write)
-    zenoh.init_log_from_env_or("zenoh_link_tls=warn")
-    reader = threading.Thread(
-        target=_forward, args=(read, stdout), name="nedbus-refusals", daemon=True
-    )
-    reader.start()
-    atexit.register(_close_pipe, stdout, reader)
-
-
-def _close_pipe(stdout: int, reader: threading.Thread) -> None:
-    """Close the pipe at exit, and wait until its last lines are forwarded."""
-    os.dup2(stdout, 1)
-    reader.join(_EXIT_TIMEOUT)
-
-
-def _forward(read: int, stdout: int) -> None:
-    with open(read, "rb") as lines:
-        for line in lines:
-            found = _REFUSED.search(_COLOUR.sub("", line.decode(errors="replace")))
-            if found is not None:
-                reason = next(
-                    (text for part, text in _REASONS.items() if part in found[1]), found[1]
-                )
-                _log.warning(
-                    "refused a client: %s", reason, extra=about("client_refused", reason=reason)
-                )
-                continue
-            with suppress(OSError):  # the reader of stdout has closed it
-                os.write(stdout, line)
