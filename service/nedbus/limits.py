@@ -43,6 +43,19 @@ BATCH_MESSAGES: Final = 4096
 
 # --- Time ---
 
+LATEST_TIME: Final = 2**62
+"""Time in a file [us]; a damaged one may be larger than 64 bits with a sign. A later time counts as this one."""
+
+CLOCK_STEPS: Final = 1000
+"""Steps of a recorder's clock that place a vehicle which appears later. Further steps are ignored."""
+
+VEHICLE_STREAMS: Final = 1000
+"""Streams of one vehicle whose times and events are followed, because a peer chooses their number. \
+Further streams have none."""
+
+KNOWN_TIMES: Final = 512
+"""Messages of a stream among which copies are searched. An older copy counts as another message."""
+
 # --- Events ---
 
 # --- Commands ---

@@ -2,12 +2,8 @@
 
 from collections.abc import Hashable
 from enum import Enum
-from typing import Final
 
-from .vehicle_clock import is_boot_possible
-
-MAX_REORDERED: Final = 1_000_000
-"""Step back in time [us] that reordering explains."""
+from .vehicle_clock import REORDERING, is_boot_possible
 
 
 class RebootSign(Enum):
@@ -45,14 +41,15 @@ class RebootDetector:
         `before`: the time of the message before it in its stream [us]. `other`: that of one more message, of this
         stream or another one [us]. `elapsed`: time since the last message [s].
         """
-        is_earlier = min(before, other) > time + MAX_REORDERED
+        is_earlier = min(before, other) > time + REORDERING
         if self._suspected is None:
             if not is_earlier or not is_boot_possible(time, elapsed):
                 return RebootSign.NONE
-            self._suspected, self.before = stream, before
+            self._suspected = stream
+            self.before = before
             return RebootSign.FIRST
         is_same_stream = stream == self._suspected
-        is_back = time >= self.before - MAX_REORDERED
+        is_back = time >= self.before - REORDERING
         if is_back and is_same_stream:
             self._suspected = None
             return RebootSign.DAMAGED

@@ -12,7 +12,7 @@ from typing import Final
 
 from nedbus.clock import format_duration
 from nedbus.fusion import AID_TOPICS, FusionTracker
-from nedbus.timeline import MAX_REORDERED, RebootDetector, RebootSign
+from nedbus.timeline import REORDERING, RebootDetector, RebootSign
 from nedbus_msgs import BY_TOPIC, TOPICS, Address, FieldReader
 from nedbus_msgs.text import counted
 
@@ -158,7 +158,7 @@ class Vehicle:
                         Finding(kind, "end", f"{address.stream} resumed"), address.topic, time
                     )
             found = iter([*(found or ()), *self._comparison.add_estimate(stamp, message, missing)])
-        if not is_queued and (stamp < before - MAX_REORDERED or self._held is not None):
+        if not is_queued and (stamp < before - REORDERING or self._held is not None):
             # Only the previous message was damaged unless another one of this or another stream is later as well.
             other = earlier or self._newest_but(address)
             sign = self._reboots.add(address, stamp, before=before, other=other, elapsed=elapsed)
@@ -596,7 +596,7 @@ class Vehicle:
         """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
         expected = boot if self.boot is None else self.boot + time - self.time
         was_off = self._is_off
-        self._is_off = is_queued or abs(boot - expected) > 1e-6 * MAX_REORDERED
+        self._is_off = is_queued or abs(boot - expected) > 1e-6 * REORDERING
         self.time, self.boot = time, boot if was_off or is_queued or not self._is_off else expected
 
     def _emit_all(self, found: Iterable[Finding], address: Address, time: float) -> None:
