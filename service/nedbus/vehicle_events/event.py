@@ -12,7 +12,7 @@ from pydantic import Field
 from nedbus.samples import ARDUPILOT, OTHER_AUTOPILOT
 
 from .kinds import KINDS, SEVERITIES, Severity, importance
-from .rules import MAX_ALONE
+from .rules import WILD
 
 WINDOW: Final = 10.0
 """Seconds before an event in which events of related kinds are evidence; the start of an active one may be older."""
@@ -174,7 +174,7 @@ def without_wild(events: Iterable[Event]) -> list[Event]:
             begin = next(
                 (each for each in indices if (kept[each].vehicle, kept[each].kind) == key), None
             )
-            if begin is not None and event.time - kept[begin].time <= MAX_ALONE:
+            if begin is not None and event.time - kept[begin].time <= WILD:
                 del kept[begin]
                 if event.change != "begin":
                     continue

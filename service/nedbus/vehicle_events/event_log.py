@@ -15,7 +15,7 @@ from nedbus_msgs import Address
 from .detectors import Change, Finding
 from .event import ALL, AUTHORS, Condition, Event, State, state_of
 from .kinds import SEVERITIES, Severity
-from .rules import MAX_SILENCE, PAUSE, RECENT
+from .rules import PAUSE, RECENT, SILENCE
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -150,7 +150,7 @@ class EventLog:
                     [each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond
                 )
             if self.overload is not None:
-                self._settled = time + MAX_SILENCE  # delayed messages need time to arrive
+                self._settled = time + SILENCE  # delayed messages need time to arrive
             if time < self._settled:
                 self.settle(time)
                 return

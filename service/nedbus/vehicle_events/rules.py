@@ -101,7 +101,7 @@ RECENT: Final = 60.0
 """Seconds for which a single event affects the state of a vehicle."""
 
 # s without a position after which a vehicle is silent, if the state of its stream is unknown
-MAX_SILENCE: Final = 3.0
+SILENCE: Final = 3.0
 MIN_FIX_TYPE: Final = 3  # SensorGps.FIX_TYPE_3D
 # the condition begins below this (PX4's EKF2_REQ_NSATS) and ends at ENOUGH_SATELLITES
 FEW_SATELLITES: Final = 6
@@ -134,10 +134,10 @@ SINGLE_EVENTS: Final = 200  # single events of one kind
 # PX4 sends the others when they change
 PERIODIC: Final = ("VehicleLocalPosition", "SensorGps", "BatteryStatus")
 # s; a condition of a PERIODIC message that ends this soon, with the next one, may be wild
-MAX_ALONE: Final = 0.4
+WILD: Final = 0.4
 # s without a recurrence after which flapping, losses, rejections or an overload have ended
 PAUSE: Final = 5.0
-MAX_BURST: Final = 20.0  # s after which continuing losses are reported
+LOSS_PERIOD: Final = 20.0  # s after which continuing losses are reported
 
 MODES: Final[Mapping[int, str]] = {
     0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 6: "Position Slow",

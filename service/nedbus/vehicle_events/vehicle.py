@@ -194,7 +194,7 @@ class Vehicle:
         """Report bursts and flapping that have ended."""
         for kind, burst in list(self._bursts.items()):
             if time - burst.end <= rules.PAUSE and (
-                kind != "lost" or time - burst.begin <= rules.MAX_BURST
+                kind != "lost" or time - burst.begin <= rules.LOSS_PERIOD
             ):
                 continue
             del self._bursts[kind]
@@ -245,7 +245,7 @@ class Vehicle:
             end = Finding("duplicate", "end", f"only one publisher of {stream} left", switch=True)
             self.emit(begin if state == "duplicate" else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
-        if state is None and is_connected and time - self._main_time > rules.MAX_SILENCE:
+        if state is None and is_connected and time - self._main_time > rules.SILENCE:
             silent = "silent"
         if (
             silent is None
@@ -435,10 +435,7 @@ class Vehicle:
 
     def _is_alone(self, found: Finding) -> bool:
         """Return whether the value that changes now began with the message just before, of a PERIODIC stream."""
-        if (
-            KINDS[found.kind].message not in rules.PERIODIC
-            or self.time - self._before > rules.MAX_ALONE
-        ):
+        if KINDS[found.kind].message not in rules.PERIODIC or self.time - self._before > rules.WILD:
             return False
         held = [self.conditions[key] for key in _keys_of(found) if key in self.conditions]
         return any(
@@ -736,5 +733,5 @@ class _Supply:
             self.steps.append(last.stamp - last.earlier)
         is_known = len(self.steps) >= _MIN_STEPS
         return self.newest, max(
-            1e6 * rules.MAX_SILENCE, _INTERVALS * median(self.steps)
+            1e6 * rules.SILENCE, _INTERVALS * median(self.steps)
         ) if is_known else math.inf
