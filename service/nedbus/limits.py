@@ -58,6 +58,34 @@ KNOWN_TIMES: Final = 512
 
 # --- Events ---
 
+VEHICLES: Final = 1000
+"""Vehicles with events, because peers choose their names. Beyond it, the one that has been gone longest is \
+forgotten; others have no events."""
+
+GONE_VEHICLES: Final = 50
+"""Vehicles that are kept although they have been gone for over a minute, or as many as were ever present at once, \
+if those are more. Beyond it, those gone longest are forgotten."""
+
+EVENTS: Final = 2000
+"""Events that a process keeps, and those of a report. Beyond it, the oldest of the vehicle with the most is deleted."""
+
+EVENTS_OF_VEHICLE: Final = 20
+"""Events that a vehicle keeps, however many others have. Beyond it, they count against `EVENTS`."""
+
+FILE_EVENTS: Final = 100_000
+"""Events of a file. Beyond it, the oldest are left out, and counted."""
+
+RECENT_EVENTS: Final = 100
+"""Events of a vehicle among which the causes of the next one are searched. Older ones explain nothing."""
+
+REPORTED_TOPICS: Final = 30
+"""Topics of a vehicle in a report, those that nedbus defines first, because verdicts depend on them. \
+The others are left out."""
+
+COMPARED_MESSAGES: Final = 1000
+"""Messages of an estimate, and measurements, that wait to be compared. Beyond it, the oldest messages and the \
+measurements with the latest times are left out."""
+
 # --- Commands ---
 
 # --- Page ---

@@ -1,7 +1,7 @@
 """Vehicle events and their possible causes, derived from live or recorded messages; no I/O."""
 
 from .event import ALL, WINDOW, Condition, Event, State
-from .event_log import KEPT, MAX_VEHICLES, EventLog
+from .event_log import EventLog
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import (

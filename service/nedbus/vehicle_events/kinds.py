@@ -235,7 +235,8 @@ def importance(kind: str) -> int:
 
 def rank_vehicle(name: str, severity: Severity) -> tuple[int, str]:
     """Return a sort key for vehicles: worst severity first, then natural order of names (2 before 10)."""
-    return SEVERITIES.index(severity), re.sub(r"\d+", lambda found: found[0].zfill(20), name)
+    natural = re.sub(r"\d+", lambda number: number[0].zfill(20), name)
+    return SEVERITIES.index(severity), natural
 
 
 def flagged(message: str) -> list[Kind]:
