@@ -39,6 +39,39 @@ BATCH_MESSAGES: Final = 4096
 
 # --- Files ---
 
+CHANNELS_OF_VEHICLE: Final = 1000
+"""Channels of a vehicle in a recording, so that none uses up those of a file; a PX4 has about 300 topics. \
+Messages of further ones are left out, and counted."""
+
+CHANNELS: Final = 60_000
+"""Channels of a recording, because MCAP has 65,535, of which some are for log texts. \
+Messages of further ones are left out, and counted."""
+
+PENDING_BYTES: Final = 2**24
+"""Bytes of a recording that wait in memory for a flush. Beyond it, the file is flushed early."""
+
+BLOCK_BYTES: Final = 2**26
+"""Bytes of a chunk of an MCAP file, also decompressed, and of its index; ROS 2 and nedbus write up to 8 MiB. \
+A larger one is skipped, as damage."""
+
+DESCRIPTION_BYTES: Final = 2**20
+"""Bytes of a schema, a channel or statistics in an MCAP file; those of all possible channels have 655 kB. \
+A larger one counts as damage."""
+
+COMPRESSION: Final = 100
+"""Compression ratio of an MCAP file above `BLOCK_BYTES`, because a small file could fill the memory. \
+The rest of the file is skipped, as damage."""
+
+COMPRESSED_MESSAGE: Final = 2**16
+"""Decompressed bytes of a message that rosbag2 has compressed. A larger one is rejected."""
+
+WARNING_TEXT: Final = 1000
+"""Characters of a warning about a file, because names in it may be long. The rest is cut."""
+
+FILE_WARNINGS: Final = 100
+"""Warnings about one file, because each of its records may be damaged. Further ones are not listed."""
+
+
 # --- ULog ---
 
 # --- Time ---

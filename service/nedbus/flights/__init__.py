@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from .conversion import Conversion, convert, convert_files, convert_flight
     from .events import (
         EVENT_OPTIONS,
-        MAX_FILE_EVENTS,
         FileEvents,
         follow,
         follow_flight,
@@ -44,10 +43,7 @@ else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "conversion"): "Conversion convert convert_files convert_flight",
-        (
-            "",
-            "events",
-        ): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events"
+        ("", "events"): "EVENT_OPTIONS FileEvents follow follow_flight read_file_events"
         " read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",
         ("", "merge"): "no_utc require_files",
@@ -56,10 +52,8 @@ else:
             "readers",
         ): "FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "sample_events"): "detect_sample_events",
-        (
-            "",
-            "selection",
-        ): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
+        ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match"
+        " topics_of",
         ("", "utc"): "find_utc utc_of",
         ("mcap", "writer"): "RecordingWriter",
     }

@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
-from nedbus import Sample
+from nedbus import Sample, limits
 from nedbus.errors import NedbusError
-from nedbus.flights import EVENT_OPTIONS, MAX_FILE_EVENTS, follow_flight, open_messages, times_of
+from nedbus.flights import EVENT_OPTIONS, follow_flight, open_messages, times_of
 from nedbus.health import RejectionReport, Times
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
@@ -46,7 +46,7 @@ class Recording:
     def __init__(self, *paths: Path) -> None:
         self.name = ", ".join(path.name for path in paths)
         self.overview = Fleet(long=_OVERVIEW)
-        self.timeline = EventTimeline(EventLog(MAX_FILE_EVENTS), times=Times())
+        self.timeline = EventTimeline(EventLog(limits.FILE_EVENTS), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
