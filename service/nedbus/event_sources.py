@@ -45,9 +45,8 @@ def events(
 
         return LiveEvents(source, selection, within)
     if within is not None:
-        raise ArgumentError(
-            "within", within, "None with files and samples, which are read as a whole"
-        )
+        expected = "None with files and samples, which are read as a whole"
+        raise ArgumentError("within", within, expected)
     return _detect(source).history().of(selection)
 
 
@@ -79,6 +78,7 @@ def _detect(source: object) -> FileEvents:
     if not isinstance(source, Iterable):
         expected = "a file, several files, an open flight, samples, or a connected bus"
         raise ArgumentError("source", source, expected)
-    if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
-        return read_file_events(*[Path(each).expanduser() for each in source])
+    if isinstance(source, Sequence) and all(isinstance(item, str | Path) for item in source):
+        paths = [Path(path).expanduser() for path in source]
+        return read_file_events(*paths)
     return detect_sample_events(source)

@@ -115,6 +115,10 @@ REPORTED_TOPICS: Final = 30
 """Topics of a vehicle in a report, those that nedbus defines first, because verdicts depend on them. \
 The others are left out."""
 
+FUSION_MESSAGES: Final = 400
+"""Messages of an aid source, and of an external position, in the second that decides whether it is fused. \
+Beyond it, the oldest are left out."""
+
 COMPARED_MESSAGES: Final = 1000
 """Messages of an estimate, and measurements, that wait to be compared. Beyond it, the oldest messages and the \
 measurements with the latest times are left out."""
