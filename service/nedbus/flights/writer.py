@@ -278,7 +278,13 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         }
         return {name: value for name, value in metadata.items() if value}
 
-    def _register(self, topic: str, name: str, text: str, metadata: dict[str, str]) -> int:
+    def _register(
+        self,
+        topic: str,
+        name: str,
+        text: str,
+        metadata: dict[str, str],
+    ) -> int:
         schema = self._schemas.get((name, text))
         if schema is None:
             schema = self._writer.register_schema(name, "ros2msg", text.encode())

@@ -35,8 +35,13 @@ VISION_TOPICS: Final = (*AID_TOPICS, _ECHO, _MOCAP)
 """Topics that a vehicle publishes only while it receives an external position."""
 
 FUSION_TOPICS: Final = (
-    *VISION_TOPICS, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
-)  # fmt: skip
+    *VISION_TOPICS,
+    _FLAGS,
+    SELECTOR,
+    _ESTIMATE,
+    _BIAS,
+    _TEXT,
+)
 """Topics that a FusionTracker uses."""
 
 _PERIODIC: Final = frozenset(FUSION_TOPICS) - {_MOCAP, SELECTOR, _TEXT}

@@ -34,7 +34,13 @@ class RebootDetector:
         self._suspected: Hashable = None  # the stream of the first message
 
     def add(
-        self, stream: Hashable, time: int, *, before: int, other: int, elapsed: float
+        self,
+        stream: Hashable,
+        time: int,
+        *,
+        before: int,
+        other: int,
+        elapsed: float,
     ) -> RebootSign:
         """Return what a message shows.
 

@@ -127,7 +127,13 @@ class VehicleClock:
         """Discard the signs of a reboot, because something else shows that the vehicle continues to run."""
         self._older.clear()
 
-    def _add_current(self, stream: Hashable, time: int, newest: int, now: float | None) -> Reading:
+    def _add_current(
+        self,
+        stream: Hashable,
+        time: int,
+        newest: int,
+        now: float | None,
+    ) -> Reading:
         if self._is_wild(time, newest, now):
             return Reading(TimeKind.WILD, time, self.boot)
         is_step = bool(is_unix_time(time)) != bool(is_unix_time(newest))
@@ -138,7 +144,12 @@ class VehicleClock:
         return Reading(TimeKind.STEP if is_step else TimeKind.NEW, time, self.boot)
 
     def _add_older(
-        self, stream: Hashable, time: int, last: int, newest: int, now: float | None
+        self,
+        stream: Hashable,
+        time: int,
+        last: int,
+        newest: int,
+        now: float | None,
     ) -> Reading:
         if time < last - REORDERING:
             self._older.setdefault(stream, math.inf if now is None else now)
@@ -165,7 +176,13 @@ class VehicleClock:
             return 0.0
         return max(0.0, now - min(self._older.values()))
 
-    def _begin(self, stream: Hashable, time: int, now: float | None, kind: TimeKind) -> Reading:
+    def _begin(
+        self,
+        stream: Hashable,
+        time: int,
+        now: float | None,
+        kind: TimeKind,
+    ) -> Reading:
         if kind is TimeKind.REBOOT:
             self.boot += 1
             if self._modulus:

@@ -378,7 +378,13 @@ class _Contradiction:
     smallest_limit: float = math.inf
     is_reported: bool = False
 
-    def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
+    def update(
+        self,
+        name: str,
+        stamp: int,
+        error: float,
+        limit: float,
+    ) -> Finding | None:
         """Add an error, NaN if not measured; return the finding that begins or ends a contradiction, if any."""
         self.errors[name] = _Measured(stamp, error, limit)
         if not self.since and not abs(error) > limit:

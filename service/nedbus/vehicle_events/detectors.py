@@ -230,7 +230,13 @@ class AidDetector(ChangeDetector):
             initial = kind == "aid_unused" and self._is_first
             text = KINDS[kind].begin.format(self._label) + self._explain()
             yield Finding(
-                kind, "begin", text, (self.topic,), severity=severity, initial=initial, age=age
+                kind,
+                "begin",
+                text,
+                (self.topic,),
+                severity=severity,
+                initial=initial,
+                age=age,
             )
 
 
@@ -374,7 +380,14 @@ def _detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
         severity = "bad"
     elif level <= LogMessage.WARNING:
         severity = "watch"
-    yield Finding("text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity)
+    yield Finding(
+        "text",
+        "once",
+        text,
+        (rules.LEVELS[level],),
+        {"level": level},
+        severity=severity,
+    )
 
 
 def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -385,7 +398,14 @@ def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
         if level.value == was:
             continue
         if level.value == 0:
-            yield Finding(kind, "end", level.end, (), level.numbers, switch=True)
+            yield Finding(
+                kind,
+                "end",
+                level.end,
+                (),
+                level.numbers,
+                switch=True,
+            )
         elif level.value == 2:
             initial = was is None or not before
             # a vehicle may have no GNSS receiver
@@ -572,7 +592,14 @@ def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
         return
     severity: Severity | None = "watch" if warning in (1, 7) else None
     text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
-    yield Finding("battery", "begin", text, numbers=numbers, severity=severity, initial=not before)
+    yield Finding(
+        "battery",
+        "begin",
+        text,
+        numbers=numbers,
+        severity=severity,
+        initial=not before,
+    )
 
 
 def _warning_of(battery: Fields) -> int | None:

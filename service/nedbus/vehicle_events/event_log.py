@@ -65,9 +65,16 @@ class EventLog:
         return self._common.conditions.get(("overload", ""))
 
     def add(
-        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0,
-        is_estimate: bool = False, source: str | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        address: Address,
+        message: object,
+        time: float,
+        *,
+        missing: frozenset[str] = frozenset(),
+        lost: int = 0,
+        is_estimate: bool = False,
+        source: str | None = None,
+    ) -> None:
         """Add a message: a model, a row, or a dict of fields.
 
         `missing`: names of fields that were not provided. `lost`: messages lost before this one; with `is_estimate`

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
@@ -102,7 +102,13 @@ def _report_type() -> TypeAdapter[AccountReport]:
 
 
 def report_of(
-    event_log: EventLog, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
+    event_log: EventLog,
+    service: str,
+    host: str,
+    now: float,
+    *,
+    within: float,
+    to_utc: float = 0.0,
 ) -> AccountReport:
     """Return a report of the events in the last `within` seconds, and the state of each vehicle.
 
@@ -169,31 +175,29 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
     return {name: best[name] for name in sorted(best, key=order)}
 
 
-class ReportedEvent(NamedTuple):
-    """An event, and the report that contains it."""
-
-    report: AccountReport
-    event: Event
-
-
-def once_per_service(reports: Iterable[AccountReport]) -> list[ReportedEvent]:
+def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountReport, Event]]:
     """Return the events of reports in chronological order, each with its report.
 
     A service reports events of its link and its load for each of its vehicles; they occur once, with the vehicle ALL.
     Only equal ones are merged: the report about one vehicle replaces no event in that about another.
     """
-    events: list[ReportedEvent] = []
+    events: list[tuple[AccountReport, Event]] = []
     known = set[object]()
     for report in reports:
         for event in report.events:
             if event.kind not in OF_SERVICE:
-                events.append(ReportedEvent(report, event))
+                events.append((report, event))
                 continue
             key = (report.service, report.host, _content_of(event))
             if key not in known:
                 known.add(key)
-                events.append(ReportedEvent(report, replace(event, vehicle=ALL)))
-    return sorted(events, key=lambda reported: reported.event.time)
+                events.append((report, replace(event, vehicle=ALL)))
+
+    def time_of(reported: tuple[AccountReport, Event]) -> float:
+        _, event = reported
+        return event.time
+
+    return sorted(events, key=time_of)
 
 
 def _content_of(event: Event) -> tuple[object, ...]:

@@ -299,7 +299,14 @@ class _History:
             self._begin(event)
 
     def _add_single(self, event: Event) -> None:
-        span = Span(event.kind, event.severity, event.text, event.time, event, until=event.time)
+        span = Span(
+            event.kind,
+            event.severity,
+            event.text,
+            event.time,
+            event,
+            until=event.time,
+        )
         self.ended.append(span)
         if event.kind == "reboot":
             lost = [key for key in self._active if not KINDS[key.kind].kept_on_reboot]

@@ -16,9 +16,11 @@ _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?
 
 # Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles.
 _CLOCKS: Final[Mapping[str, str]] = {
-    "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
-    "boot": "seconds since boot", "start": "seconds since the start of the recording",
-}  # fmt: skip
+    "host": "UTC, from the clocks of the hosts",
+    "vehicle": "UTC, from the vehicle's messages",
+    "boot": "seconds since boot",
+    "start": "seconds since the start of the recording",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -123,7 +123,13 @@ class Vehicle:
         detector = self._detectors.get(address, _NEW)
         return detector is None or time < detector.resumes_at
 
-    def add(self, address: Address, message: object, time: float, missing: frozenset[str]) -> None:
+    def add(
+        self,
+        address: Address,
+        message: object,
+        time: float,
+        missing: frozenset[str],
+    ) -> None:
         """Add a message."""
         self.last_seen = time
         try:
@@ -330,7 +336,12 @@ class Vehicle:
         return is_flying or KINDS[condition.kind].on_ground != "info"
 
     def emit(
-        self, finding: Finding, topic: str, time: float, *, changed: float | None = None
+        self,
+        finding: Finding,
+        topic: str,
+        time: float,
+        *,
+        changed: float | None = None,
     ) -> None:
         """Begin or end the conditions of a finding, or report a single event.
 
@@ -344,7 +355,13 @@ class Vehicle:
         else:
             self._report_unless_frequent(finding, self._event(finding, topic, time))
 
-    def begin(self, finding: Finding, topic: str, time: float, since: float) -> None:
+    def begin(
+        self,
+        finding: Finding,
+        topic: str,
+        time: float,
+        since: float,
+    ) -> None:
         """Begin the conditions of a finding, active `since`; report an event unless they are initial or flapping."""
         keys = _keys_of(finding)
         kind = KINDS[finding.kind]
@@ -352,7 +369,14 @@ class Vehicle:
             return
         event = self._event(finding, topic, time, is_alone=self._is_alone(finding))
         severity = finding.severity or kind.severity
-        condition = Condition(finding.kind, severity, finding.text, since, event, finding.initial)
+        condition = Condition(
+            finding.kind,
+            severity,
+            finding.text,
+            since,
+            event,
+            finding.initial,
+        )
         for key in keys:
             self.usual.pop(key, None)
         if finding.initial and kind.usual:
@@ -365,7 +389,13 @@ class Vehicle:
             self.initial.append(condition)
         self._report_unless_frequent(finding, event)
 
-    def end(self, finding: Finding, topic: str, time: float, until: float) -> None:
+    def end(
+        self,
+        finding: Finding,
+        topic: str,
+        time: float,
+        until: float,
+    ) -> None:
         """End the conditions of a finding, active `until`; report an event unless they were initial or are flapping."""
         keys = _keys_of(finding)
         kind = KINDS[finding.kind]
@@ -473,7 +503,13 @@ class Vehicle:
         texts = [condition.text for condition in initial if condition.severity != "info"]
         return ", ".join(dict.fromkeys(texts))
 
-    def _count(self, kind: str, time: float, count: int, topic: str = "") -> None:
+    def _count(
+        self,
+        kind: str,
+        time: float,
+        count: int,
+        topic: str = "",
+    ) -> None:
         burst = self._bursts.setdefault(kind, _Burst(time, time))
         burst.end = time
         burst.count += count
@@ -563,7 +599,11 @@ class Vehicle:
         return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
 
     def _detect_flags(
-        self, instance: int, detect: detectors.Detect, before: Fields, after: Fields
+        self,
+        instance: int,
+        detect: detectors.Detect,
+        before: Fields,
+        after: Fields,
     ) -> Iterator[Finding]:
         if instance != self._ekf:
             return detectors.detect_unused(instance, before, after)

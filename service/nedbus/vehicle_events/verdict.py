@@ -200,7 +200,14 @@ def verdict_of(
     head = "no fault at that time; nearest: "
     if is_then:
         valid_since = _valid_since(events, since)
-        head = _head(worst, stories, times, valid_since, is_past=is_past, usable=usable)
+        head = _head(
+            worst,
+            stories,
+            times,
+            valid_since,
+            is_past=is_past,
+            usable=usable,
+        )
     evidence = _evidence(worst, stories, events)
     others = _others(worst, ranked, evidence.events, times)
     is_other_urgent = sum(story.is_bad for story in stories) > 1

@@ -53,8 +53,11 @@ _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 _FOOTER: Final = struct.Struct("<BQQQI8s")
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
-    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
-}  # fmt: skip
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.STATISTICS: Statistics,
+}
 
 
 class _IndexedChunk(NamedTuple):
