@@ -12,6 +12,7 @@ from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 
+from .conditions import Conditions
 from .detectors import Finding
 from .event import ALL, AUTHORS, Condition, Event, State, state_of
 from .kinds import SEVERITIES, Severity
@@ -40,7 +41,7 @@ class EventLog:
         self._keep = keep
         self._reader = reader
         self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # event numbers by vehicle
-        self._common = Vehicle(ALL, self._record)  # conditions of the link and the reader
+        self._common = Conditions(ALL, self._record)  # conditions of the link and the reader
         self._dropped = 0
         self._most_present = 0
         self._last_overload = 0.0
