@@ -42,6 +42,11 @@ class Span(Condition):
     end: Event | None = None
 
     @property
+    def stop(self) -> float:
+        """The time of its end; infinite while it is active."""
+        return math.inf if self.until is None else self.until
+
+    @property
     def is_of_estimate(self) -> bool:
         """True if it is a fault of the position estimate."""
         return KINDS[self.kind].message == "VehicleLocalPosition"
@@ -53,13 +58,13 @@ class Span(Condition):
 
     def holds(self, time: float) -> bool:
         """Return True if the condition is active at `time`, or the single event is recent."""
-        if self.until is not None and self.until == self.since:
-            return self.since <= time < self.until + RECENT
-        return self.is_active(time)
+        is_single = self.until == self.since
+        stop = self.since + RECENT if is_single else self.stop
+        return self.since <= time < stop
 
     def is_active(self, time: float) -> bool:
         """Return True if the condition is active at `time`; a single event never is."""
-        return self.since <= time and (self.until is None or time < self.until)
+        return self.since <= time < self.stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +90,11 @@ class Story:
     after: tuple[Event, ...]
     lacking: tuple[str, ...]
     in_flight: bool = True
+
+    @property
+    def stop(self) -> float:
+        """The time of its end; infinite while it is active."""
+        return math.inf if self.until is None else self.until
 
     @property
     def is_bad(self) -> bool:
@@ -129,8 +139,7 @@ class Story:
 
     def is_in(self, periods: Sequence[Period]) -> bool:
         """Return True if it lasted into one of these periods."""
-        stop = math.inf if self.until is None else self.until
-        return any(period.begin <= stop and self.since <= period.end for period in periods)
+        return any(period.begin <= self.stop and self.since <= period.end for period in periods)
 
 
 def stories_of(
@@ -170,7 +179,7 @@ def _stories_at(time: float, stories: Iterable[Story]) -> list[Story]:
     """Return the stories active at a time, else the last one before, else the first."""
     ordered = sorted(stories, key=lambda story: story.since)
     begun = [story for story in ordered if story.since <= time]
-    active = [story for story in begun if story.until is None or time <= story.until]
+    active = [story for story in begun if time <= story.stop]
     if active:
         return active
     if begun:
@@ -379,12 +388,11 @@ def _make_story(
 ) -> Story:
     """Return the story of a group of conditions; start and evidence are those of the first one."""
     span = group[0]
-    until = _end_of(group)
-    stop = math.inf if until is None else until
-    ends = [member.end for member in group if member.end is not None and member.until == until]
-    end = ends[0] if ends else None
-    used = {member.begin for member in group}
-    used |= {member.end for member in group if member.end is not None}
+    stop = max(member.stop for member in group)
+    ends = [member.end for member in group if member.end is not None]
+    last = [end for end in ends if end.time == stop]
+    end = last[0] if last else None
+    used = {*ends, *(member.begin for member in group)}
     before = [event for event in _evidence(span, spans, events) if event not in used]
     used.update(before)
     after: list[Event] = []
@@ -399,7 +407,7 @@ def _make_story(
         spans=tuple(group),
         what=_text_of(group),
         since=span.since,
-        until=until,
+        until=None if math.isinf(stop) else stop,
         begin=None if span.initial else span.begin,
         end=end,
         before=tuple(before),
@@ -407,16 +415,6 @@ def _make_story(
         after=tuple(after),
         lacking=_lacking(span, topics),
     )
-
-
-def _end_of(group: Iterable[Span]) -> float | None:
-    """Return when the last of these spans ended, None if one is active."""
-    last = -math.inf
-    for span in group:
-        if span.until is None:
-            return None
-        last = max(last, span.until)
-    return last
 
 
 def _is_notable(event: Event) -> bool:
@@ -466,7 +464,7 @@ def _with_texts(causes: Sequence[Event], near: Iterable[Event], until: float) ->
 
 def _has_recovered(span: Span, time: float) -> bool:
     """Return whether a condition ended well before a time."""
-    return span.end is not None and span.until is not None and span.until < time - TOGETHER
+    return span.end is not None and span.stop < time - TOGETHER
 
 
 def _other_starts(span: Span, near: Iterable[Event]) -> list[Event]:
@@ -541,12 +539,10 @@ def _is_consequence(story: Story, worse: Story) -> bool:
 
 def _outlasts(story: Story, worse: Story) -> bool:
     """Return True if a story lasts until now, or is a bad one of the estimate that lasts longer than another."""
-    if worse.until is None:
-        return False
     if story.until is None:
-        return True
+        return worse.until is not None
     is_bad_estimate = story.is_bad and story.spans[0].is_of_estimate
-    return is_bad_estimate and story.until > worse.until + TOGETHER
+    return is_bad_estimate and story.until > worse.stop + TOGETHER
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:

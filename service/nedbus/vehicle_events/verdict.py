@@ -243,9 +243,7 @@ def _is_past(story: Story, now: float) -> bool:
 
 
 def _is_during(story: Story, time: float) -> bool:
-    if time < story.since:
-        return False
-    return story.until is None or time <= story.until
+    return story.since <= time <= story.stop
 
 
 def _without_evidence(worst: Story, evidence: _Evidence) -> str:
@@ -353,9 +351,8 @@ def _lateness(worst: Story) -> float:
 
 def _first_bad(texts: Iterable[Event], worst: Story) -> list[Event]:
     """Return the first bad text during a fault, unless it is the fault."""
-    until = math.inf if worst.until is None else worst.until
     for text in texts:
-        if text.severity == "bad" and worst.since <= text.time <= until:
+        if text.severity == "bad" and _is_during(worst, text.time):
             return [] if text is worst.begin else [text]
     return []
 
