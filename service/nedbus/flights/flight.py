@@ -162,7 +162,7 @@ class Flight(AbstractContextManager["Flight"]):
         Raises ArgumentError for a `start` or `end` in UTC if the files do not provide UTC, AddressError for an invalid
         name. Iterating raises SourceError if a file has none of these topics.
         """
-        names = [topic_of(message, topic), *(topic_of(each) for each in more)]
+        names = [topic_of(message, topic), *map(topic_of, more)]
         if Selection(vehicle=vehicle).vehicles == (ANY,):
             vehicle = self._vehicle
         selection = Selection(names, vehicle, instance)
