@@ -6,12 +6,12 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from nedbus import limits
 from nedbus.health import AccountReport, Event, Times, VehicleReport, Verdict
 from nedbus.vehicle_events import ALL, by_vehicle, events_outside, verdict_of
 from nedbus_msgs import ANY, AddressError, ArgumentError, Selection, VehicleNames, vehicle_name
 
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
-_MAX_NAMED: Final = 20  # vehicles in an error
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +53,16 @@ class EventHistory:
         """
         if selection.vehicles == (ANY,):
             return self
-        for name in selection.vehicles:
+        selected = selection.vehicles
+        for name in selected:
             self._require(name)
+        events = [event for event in self.events if event.vehicle in (ALL, *selected)]
+        from_start = {name: text for name, text in self.from_start.items() if name in selected}
         return replace(
             self,
-            events=tuple(
-                each for each in self.events if each.vehicle in (ALL, *selection.vehicles)
-            ),
-            reports={name: self.reports[name] for name in selection.vehicles},
-            from_start={
-                name: text for name, text in self.from_start.items() if name in selection.vehicles
-            },
+            events=tuple(events),
+            reports={name: self.reports[name] for name in selected},
+            from_start=from_start,
         )
 
     def why(self, vehicle: str | int, *, at: str | None = None) -> Verdict:
@@ -79,12 +78,20 @@ class EventHistory:
         self._require(name)
         report = self.reports[name]
         events = [event for event in self.events if event.vehicle in (name, ALL)]
-        known_state = report.vehicles[name]
+        state = report.vehicles[name]
         verdict = verdict_of(
-            name, events, known_state.held, topics=known_state.topics, unknown=known_state.unknown, times=self.times,
-            end=report.now, at=self._moment(at, events), since=known_state.first,
-        )  # fmt: skip
-        return replace(verdict, others=tuple(events_outside(verdict.stories, events)))
+            name,
+            events,
+            state.held,
+            topics=state.topics,
+            unknown=state.unknown,
+            times=self.times,
+            end=report.now,
+            at=self._moment(at, events),
+            since=state.first,
+        )
+        others = events_outside(verdict.stories, events)
+        return replace(verdict, others=tuple(others))
 
     def verdicts(self, vehicle: VehicleNames = ANY, *, at: str | None = None) -> dict[str, Verdict]:
         """Return the verdict on each vehicle, worst first, or on the named ones in this order; errors as of `why`."""
@@ -94,10 +101,13 @@ class EventHistory:
         return {name: self.why(name, at=at) for name in names}
 
     def _require(self, vehicle: str) -> None:
-        if vehicle not in self.reports:
-            known = ", ".join([*self.reports][:_MAX_NAMED])
-            expected = f"one of {known}" if known else "a vehicle with messages, but there is none"
-            raise AddressError("vehicle", vehicle, expected, problem="is not in this history")
+        if vehicle in self.reports:
+            return
+        expected = "a vehicle with messages, but there is none"
+        if self.reports:
+            names = [*self.reports][: limits.SHOWN_NAMES]
+            expected = f"one of {', '.join(names)}"
+        raise AddressError("vehicle", vehicle, expected, problem="is not in this history")
 
     def _moment(self, at: str | None, events: list[Event]) -> float | None:
         """Return the time in question on the clock of the events; None for all."""
@@ -117,7 +127,8 @@ class EventHistory:
 
 def history_of_services(reports: Collection[AccountReport]) -> EventHistory:
     """Return the history of all services as one; times are Unix times by the clocks of the hosts [s]."""
-    events = sorted(
-        (event for report in reports for event in report.events), key=lambda event: event.time
-    )
+    events: list[Event] = []
+    for report in reports:
+        events += report.events
+    events.sort(key=lambda event: event.time)
     return EventHistory(tuple(events), by_vehicle(reports), Times(is_live=True))

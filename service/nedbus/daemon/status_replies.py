@@ -8,9 +8,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.client import QueryServer, ServiceStatus, reply_parts
-from nedbus.vehicle_events import ACCOUNT_PARAMETER, MAX_VEHICLES, AccountReport
+from nedbus.vehicle_events import ACCOUNT_PARAMETER, AccountReport
 from nedbus_msgs import status_key
 
 _FRESH: Final = 0.5  # s; a query for all vehicles of a service asks once for each of them
@@ -45,9 +45,9 @@ class StatusReplies:
         self._report: tuple[float, float, AccountReport] | None = None
 
     def add(self, vehicle: str) -> None:
-        """Reply for this vehicle, too, until the service ends; do nothing beyond MAX_VEHICLES."""
+        """Reply for this vehicle, too, until the service ends; do nothing beyond `limits.VEHICLES`."""
         with self._lock:
-            if vehicle in self._vehicles or len(self._vehicles) >= MAX_VEHICLES:
+            if vehicle in self._vehicles or len(self._vehicles) >= limits.VEHICLES:
                 return
             self._vehicles.add(vehicle)
         key = status_key(self._service, vehicle=vehicle, prefix=self._prefix)

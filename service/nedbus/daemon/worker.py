@@ -25,7 +25,7 @@ from nedbus.sources import (
     UnavailableTopics,
     parse_source,
 )
-from nedbus.timeline import MAX_PAUSE, Pace
+from nedbus.timeline import SKIPPED_PAUSE, Pace
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.vehicle_events import EventLog
@@ -295,7 +295,7 @@ class Worker:
         if pace.skipped:
             run.warnings = (
                 *run.warnings,
-                f"skipped pauses of more than {MAX_PAUSE:.0f} s ({pace.skipped})",
+                f"skipped pauses of more than {SKIPPED_PAUSE:.0f} s ({pace.skipped})",
             )
         self._warn(run)
         self._error = run.damage

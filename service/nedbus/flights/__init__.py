@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from .event_replay import EventReplay, ReplayedMessage, detect_events
     from .events import (
         EVENT_OPTIONS,
-        MAX_FILE_EVENTS,
         FileEvents,
         follow,
         follow_flight,
@@ -50,10 +49,7 @@ else:
     _NAMES = {
         ("", "conversion"): "Conversion convert convert_files convert_flight",
         ("", "event_replay"): "EventReplay ReplayedMessage detect_events",
-        (
-            "",
-            "events",
-        ): "EVENT_OPTIONS MAX_FILE_EVENTS FileEvents follow follow_flight read_file_events"
+        ("", "events"): "EVENT_OPTIONS FileEvents follow follow_flight read_file_events"
         " read_flight_events times_of",
         ("", "flight"): "Flight FlightSamples open_flight open_messages",
         ("", "merge"): "no_utc require_files",
@@ -62,10 +58,8 @@ else:
             "readers",
         ): "FlightReader ReadOptions check_recording find_format format_of open_reader",
         ("", "sample_events"): "detect_sample_events",
-        (
-            "",
-            "selection",
-        ): "absent_topics matching parse_topics require_one_vehicle single_match topics_of",
+        ("", "selection"): "absent_topics matching parse_topics require_one_vehicle single_match"
+        " topics_of",
         ("", "utc"): "find_utc utc_of",
         ("", "vehicles"): "path_of require_utc utc_offset_of vehicles_of",
         ("mcap", "writer"): "RecordingWriter",

@@ -6,23 +6,24 @@ from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
+from nedbus import limits
 from nedbus.samples import Batch
 from nedbus.timeline import UTC_COLUMNS
-from nedbus_msgs import Address, Definition, Encoded, Provenance, upgrade_with
+from nedbus_msgs import Definition, Provenance, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .readers import FileStream, Run
 
-_MAX_TIME: Final = 2**62  # us; later log times of a damaged file are of no use
+if TYPE_CHECKING:
+    from .flight import FlightMessage
 
 _Mask = npt.NDArray[np.bool_]
-_Message = tuple[Address, Definition[Any], Encoded, int, Provenance]  # with its log time [ns]
 
 
 class Decoded(NamedTuple):
@@ -40,9 +41,13 @@ class Decoded(NamedTuple):
 
     def utc_columns(self) -> dict[str, npt.NDArray[Any]]:
         """Return the columns of the valid messages for `UtcEstimate`, without the fields that all messages lack."""
-        known = [name for name in UTC_COLUMNS if name in (self.absent.dtype.names or ())]
-        names = [name for name in known if name == "timestamp" or not self.absent[name].all()]
-        return {name: self.messages[name][self.valid] for name in names}
+        fields = self.absent.dtype.names or ()
+        columns = {}
+        for name in UTC_COLUMNS:
+            is_provided = name in fields and not self.absent[name].all()
+            if is_provided or (name in fields and name == "timestamp"):
+                columns[name] = self.messages[name][self.valid]
+        return columns
 
 
 class Columns:
@@ -54,10 +59,11 @@ class Columns:
 
     def __init__(self) -> None:
         self.times = array("q")
-        self.reason = self.skipped = ""
+        self.reason = ""
+        self.skipped = ""
         self._parts: dict[FileStream, _Part] = {}
-        # the number of the part, and of the messages, of each run
-        self._runs = array("q"), array("q")
+        self._parts_of_runs = array("q")  # the number of the part of each run
+        self._lengths = array("q")  # of runs, in messages
         self._decoded: Decoded | None = None
 
     def __len__(self) -> int:
@@ -67,70 +73,84 @@ class Columns:
         """Add records."""
         part = self._parts.get(run.stream)
         if part is None:
-            part = self._parts[run.stream] = _Part(run.stream, len(self._parts))
-        self._runs[0].append(part.number)
-        self._runs[1].append(len(run.payloads))
-        self.times.extend([min(time, _MAX_TIME) for time in run.times])
+            part = _Part(run.stream, len(self._parts))
+            self._parts[run.stream] = part
+        self._parts_of_runs.append(part.number)
+        self._lengths.append(len(run.payloads))
+        self.times.extend([min(time, limits.LATEST_TIME) for time in run.times])
         reason = part.add(run.payloads)
         self.reason = self.reason or reason
 
     def decode(self, definition: Definition[Any]) -> Decoded:
         """Return the messages as those of a definition, once decoded."""
         if self._decoded is None:
-            found = [each.decode(definition) for each in self._parts.values()] or [
-                Decoded.empty(definition, 0)
-            ]
-            if len(found) == 1:
-                self._decoded = found[0]
-            else:
-                order = np.argsort(np.argsort(np.repeat(*self._runs), kind="stable"))
-                self._decoded = Decoded(
-                    *(np.concatenate(columns)[order] for columns in zip(*found, strict=True))
-                )
+            self._decoded = self._decode(definition)
         return self._decoded
+
+    def _decode(self, definition: Definition[Any]) -> Decoded:
+        parts = [part.decode(definition) for part in self._parts.values()]
+        if not parts:
+            return Decoded.empty(definition, 0)
+        if len(parts) == 1:
+            return parts[0]
+        # The parts follow one another; sorted by part, the messages in file order have these places.
+        by_part = np.argsort(np.repeat(self._parts_of_runs, self._lengths), kind="stable")
+        in_file_order = np.argsort(by_part)
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return Decoded(*(column[in_file_order] for column in columns))
 
 
 class _Part:
     """The records of one stream, or the fields of its messages."""
 
     def __init__(self, stream: FileStream, number: int) -> None:
-        self.number, self._stream = number, stream
-        self._data, self._fields = bytearray(), list[Mapping[str, Any]]()
+        self.number = number
+        self._stream = stream
+        self._data = bytearray()
+        self._fields: list[Mapping[str, Any]] = []  # if payloads are no bytes
         self._unusable: list[int] = []
-        self._size = 0 if stream.dtype is None else np.dtype(stream.dtype).itemsize
+        self._size = 0
+        if stream.dtype is not None:
+            self._size = np.dtype(stream.dtype).itemsize
 
     def __len__(self) -> int:
-        return len(self._data) // self._size if self._size else len(self._fields)
+        if not self._size:
+            return len(self._fields)
+        return len(self._data) // self._size
 
     def add(self, payloads: Sequence[Any]) -> str:
         """Add records; return why the first unusable one is."""
-        size = self._size
-        head = self._stream.head
-        reason = ""
-        if not size:
+        if not self._size:
             self._fields += payloads
-        elif not head or (
-            {*map(len, payloads)} == {size} and all(each.startswith(head) for each in payloads)
-        ):
-            self._data += b"".join(payloads)  # records without a head have exactly this size
-        else:
-            for payload in payloads:
-                is_usual = len(payload) == size and payload.startswith(head)
-                if not is_usual and (unusable := self._stream.check(payload)):
-                    reason = reason or unusable
-                    self._unusable.append(len(self))
-                    self._data += bytes(size)
-                else:
-                    self._data += payload[:size]  # PX4 appends bytes
-        return reason
+            return ""
+        if self._are_usual(payloads):
+            self._data += b"".join(payloads)
+            return ""
+        first_reason = ""
+        for payload in payloads:
+            reason = None if self._are_usual([payload]) else self._stream.check(payload)
+            if reason:
+                first_reason = first_reason or reason
+                self._unusable.append(len(self))
+                self._data += bytes(self._size)
+            else:
+                self._data += payload[: self._size]  # PX4 appends bytes
+        return first_reason
+
+    def _are_usual(self, payloads: Sequence[bytes]) -> bool:
+        """Return whether all have the expected size and head; without a head, a file has only such records."""
+        head = self._stream.head
+        if not head:
+            return True
+        has_size = {*map(len, payloads)} == {self._size}
+        return has_size and all(payload.startswith(head) for payload in payloads)
 
     def decode(self, definition: Definition[Any]) -> Decoded:
         """Return the messages as those of a definition."""
         if not self._size:
             return _decode_rows(definition, self._fields)
-        decoded = _decode_table(
-            self._stream, np.frombuffer(self._data, np.dtype(self._stream.dtype)), definition
-        )
+        table = np.frombuffer(self._data, np.dtype(self._stream.dtype))
+        decoded = _decode_table(self._stream, table, definition)
         decoded.valid[self._unusable] = False
         return decoded
 
@@ -141,33 +161,65 @@ def _decode_table(
     """Decode records, vectorized; fields whose type must be converted one by one."""
     columns = {name: table[name] for name in table.dtype.names or ()}
     plan = definition.plan(tuple(columns))
-    messages, valid, absent = decoded = Decoded.empty(definition, len(table))
-    for name in definition.all_fields - (plan.provided - stream.lacking):
+    decoded = Decoded.empty(definition, len(table))
+    messages = decoded.messages
+    valid = decoded.valid
+    absent = decoded.absent
+    provided = plan.provided - stream.lacking
+    for name in definition.all_fields - provided:
         absent[name] = True
-    rows = [stream.decode(row.tobytes()) for row in table] if stream.converted else []
-    for name, kind in stream.converted.items():
-        values = np.array(
-            [row.get(name, kind.absent) for row in rows], str if kind.is_text else kind.form[-1]
-        )
-        columns[name] = np.char.encode(values, "utf-8") if kind.is_text else values
+    for name, converted in _convert_columns(stream, table).items():
+        columns[name] = converted.values
         if name in plan.names:
-            absent[name] = [name not in row for row in rows]
+            absent[name] = converted.absent
     for name, old in plan.names.items():
         messages[name] = columns[old]
     for name, (olds, convert) in plan.converted.items():
-        parts = [np.full(len(table), np.nan) if old is None else columns[old] for old in olds]
-        messages[name] = [
-            convert(*values) for values in zip(*(part.tolist() for part in parts), strict=True)
-        ]
+        unknown = np.full(len(table), np.nan)
+        parts = [unknown if old is None else columns[old] for old in olds]
+        rows = zip(*(part.tolist() for part in parts), strict=True)
+        messages[name] = [convert(*values) for values in rows]
     valid[:] = arrays_of(definition).valid_mask(messages)
     for name, old in plan.names.items():
-        if messages[name].dtype.kind in "iu" and messages[name].dtype != columns[old].dtype:
-            is_same = messages[name] == columns[old]  # not beyond the range of the field
-            valid &= is_same.reshape(len(messages), -1).all(axis=1)
+        is_integer = messages[name].dtype.kind in "iu"
+        if is_integer and messages[name].dtype != columns[old].dtype:
+            is_in_range = messages[name] == columns[old]
+            valid &= _by_message(is_in_range).all(axis=1)
     for name in stream.strict_bools & columns.keys():
-        invalid = columns[name].astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
-        valid[invalid.reshape(len(messages), -1).any(axis=1)] = False
+        is_no_bool = columns[name].astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
+        valid[_by_message(is_no_bool).any(axis=1)] = False
     return decoded
+
+
+class _Converted(NamedTuple):
+    """The values of a field that were converted one by one, and which messages lack it."""
+
+    values: npt.NDArray[Any]
+    absent: list[bool]
+
+
+def _convert_columns(stream: FileStream, table: npt.NDArray[np.void]) -> dict[str, _Converted]:
+    """Return the fields whose type must be converted."""
+    if not stream.converted:
+        return {}
+    rows = [stream.decode(row.tobytes()) for row in table]
+    columns = {}
+    for name, kind in stream.converted.items():
+        given = [row.get(name, kind.absent) for row in rows]
+        absent = [name not in row for row in rows]
+        columns[name] = _Converted(_to_column(kind, given), absent)
+    return columns
+
+
+def _to_column(kind: Any, values: list[Any]) -> npt.NDArray[Any]:
+    if kind.is_text:
+        return np.char.encode(np.array(values, str), "utf-8")
+    return np.array(values, kind.form[-1])
+
+
+def _by_message(mask: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a mask with one row for each message, whether or not the field is an array."""
+    return mask.reshape(len(mask), -1)
 
 
 def _decode_rows(definition: Definition[Any], rows: Collection[Mapping[str, Any]]) -> Decoded:
@@ -210,16 +262,23 @@ class FlightBatch(Batch):
         return self._provenances
 
 
-def make_batches(messages: Iterable[_Message]) -> Iterator[FlightBatch]:
+def make_batches(messages: Iterable[FlightMessage]) -> Iterator[FlightBatch]:
     """Yield a batch for each type among these messages."""
-    by_definition: dict[Definition[Any], list[_Message]] = {}
-    for each in messages:
-        by_definition.setdefault(each[1], []).append(each)
+    by_definition: dict[Definition[Any], list[FlightMessage]] = {}
+    for message in messages:
+        by_definition.setdefault(message.definition, []).append(message)
     for definition, own in by_definition.items():
-        addresses, _, encoded, received, provenances = zip(*own, strict=True)
-        arrays, _ = arrays_of(definition).decode(b"".join(each.payload for each in encoded))
+        payloads = b"".join(message.encoded.payload for message in own)
+        arrays, _ = arrays_of(definition).decode(payloads)
+        addresses = [message.address for message in own]
         indices = {address: index for index, address in enumerate(dict.fromkeys(addresses))}
-        index = np.fromiter(map(indices.__getitem__, addresses), np.intp, len(own))
+        index = np.fromiter((indices[address] for address in addresses), np.intp, len(own))
         yield FlightBatch(
-            arrays, definition.model, tuple(indices), index, 0, received, list(provenances)
+            arrays,
+            definition.model,
+            tuple(indices),
+            index,
+            0,
+            [message.received for message in own],
+            [message.provenance for message in own],
         )

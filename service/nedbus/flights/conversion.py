@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_MAX_START: Final = 2**63  # ns; leaves room for later times in 64 bits
+_LATEST_START: Final = 2**63  # ns; leaves room for later times in 64 bits
 _CHUNK: Final = 1024  # messages per write
 _CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses a few seconds of a typical flight
-_MAX_LOGGED: Final = 5  # rejected messages logged per file
+_LOGGED: Final = 5  # rejected messages of a file; all are counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,17 +75,17 @@ def convert_files(
     rejected. No partial file is left behind. Needs the extra `mcap`, else raises ConfigError.
     """
     sources = [source] if isinstance(source, str | Path) else source
-    paths = [Path(each).expanduser() for each in sources]
+    paths = [Path(path).expanduser() for path in sources]
     _load_writer()  # raises ConfigError without the extra, before the files are read
     names = parse_topics(topics if isinstance(topics, str) else ",".join(topics))
     name = None if vehicle is None else check_vehicle(vehicle_name(vehicle))
     with open_messages(paths, ReadOptions(topics_of(names), name)) as flight:
         summary = convert_flight(flight, Path(output).expanduser(), on_progress=on_progress)
-        absent = absent_topics(
-            names, {address.topic for address in flight.definitions}, "this file"
-        )
-    warnings = (*flight.warnings, *(f"{paths[0]}: {text}" for text in absent))
-    return Conversion(summary, warnings, flight.damaged)
+        known = {address.topic for address in flight.definitions}
+        absent = absent_topics(names, known, "this file")
+    warnings = [*flight.warnings]
+    warnings += [f"{paths[0]}: {text}" for text in absent]
+    return Conversion(summary, tuple(warnings), flight.damaged)
 
 
 def convert_flight(flight: Flight, path: Path, *, on_progress: Callable[[int, int], object]) -> str:
@@ -126,26 +126,34 @@ def convert(
     """
     check_recording(path)
     try:
-        with (
-            atomic_write(path) as part,
-            _load_writer()(
+        with atomic_write(path) as part:
+            new_writer = _load_writer()
+            with new_writer(
                 part, chunk_size=_CHUNK_BYTES, boot_utc=boot_utc, starts=starts
-            ) as writer,
-        ):
-            rejected, reason = _write(
-                messages, writer, starts or {}, source=source, on_progress=on_progress
-            )
-            if rejected and not writer.messages:
-                raise SourceError(
-                    str(path),
-                    f"not written, because all {rejected} messages are rejected: {reason}",
+            ) as writer:
+                rejections = _write(
+                    messages, writer, starts or {}, source=source, on_progress=on_progress
                 )
+                if rejections.count and not writer.messages:
+                    raise SourceError(str(path), rejections.problem)
     except OSError as exc:  # an OutputError names the temporary file
-        raise OutputError(
-            path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc
-        ) from exc
+        cause = exc.__cause__ if isinstance(exc.__cause__, OSError) else exc
+        raise OutputError(path, cause) from exc
     written = counted(writer.messages, "message")
-    return f"{written}, {rejected} rejected" if rejected else written
+    return f"{written}, {rejections.count} rejected" if rejections.count else written
+
+
+@dataclass(slots=True)
+class _Rejections:
+    """Number of rejected messages, and the reason of the first."""
+
+    count: int = 0
+    reason: str = ""
+
+    @property
+    def problem(self) -> str:
+        """Why nothing is written."""
+        return f"not written, because all {self.count} messages are rejected: {self.reason}"
 
 
 def _load_writer() -> type[RecordingWriter]:
@@ -161,34 +169,34 @@ def _write(
     *,
     source: str,
     on_progress: Callable[[int], object],
-) -> tuple[int, str]:
-    """Write the valid messages; return the number of rejected ones, and the reason of the first."""
+) -> _Rejections:
+    """Write the valid messages; return the rejected ones."""
     pending: list[tuple[Message, Address, Provenance, int]] = []
-    rejected = 0
-    first_reason = ""
+    rejections = _Rejections()
     start = None
-    for done, each in enumerate(messages, 1):
-        definition = each.definition or BY_TOPIC[each.address.topic]
+    for done, received in enumerate(messages, 1):
+        address = received.address
+        definition = received.definition or BY_TOPIC[address.topic]
         try:
-            message = upgrade_with(definition, each.fields)
+            message = upgrade_with(definition, received.fields)
         except ValidationError as exc:
-            rejected += 1
-            if rejected <= _MAX_LOGGED:
-                reason = each.error or describe(exc, definition)
-                first_reason = first_reason or reason
-                extra = about("rejected", each.address, source=source, reason=reason)
-                _log.warning("%s rejected: %s", each.address, reason, extra=extra)
+            rejections.count += 1
+            if rejections.count <= _LOGGED:
+                reason = received.error or describe(exc, definition)
+                rejections.reason = rejections.reason or reason
+                extra = about("rejected", address, source=source, reason=reason)
+                _log.warning("%s rejected: %s", address, reason, extra=extra)
             continue
         if start is None:
-            first = starts.get(each.address.vehicle, message.timestamp)
-            start = min(first * 1000, _MAX_START)
-        provenance = Provenance(
-            each.source or source, definition.all_fields - message.model_fields_set
-        )
-        pending.append((message, each.address, provenance, start + round(each.at * 1e9)))
+            first = starts.get(address.vehicle, message.timestamp)
+            start = min(first * 1000, _LATEST_START)
+        missing = definition.all_fields - message.model_fields_set
+        provenance = Provenance(received.source or source, missing)
+        logged = start + round(received.at * 1e9)
+        pending.append((message, address, provenance, logged))
         if len(pending) == _CHUNK:
             writer.write_messages(pending)
             pending.clear()
             on_progress(done)
     writer.write_messages(pending)
-    return rejected, first_reason
+    return rejections

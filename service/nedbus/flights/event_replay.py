@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+from nedbus import limits
 from nedbus.errors import ArgumentError
 from nedbus.event_history import EventHistory
 from nedbus.samples import Sample
@@ -14,7 +15,6 @@ from nedbus_msgs import Address
 
 from .events import (
     EVENT_OPTIONS,
-    MAX_FILE_EVENTS,
     follow_flight,
     read_file_events,
     read_flight_events,
@@ -48,7 +48,7 @@ class EventReplay:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self.event_log = EventLog(MAX_FILE_EVENTS)
+        self.event_log = EventLog(limits.FILE_EVENTS)
         self._flight = open_messages(paths, EVENT_OPTIONS)
 
     @property

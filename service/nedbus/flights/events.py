@@ -8,23 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from nedbus import limits
 from nedbus.errors import InvalidMessageError
 from nedbus.event_history import EventHistory
 from nedbus.samples import SourceMessage
+from nedbus.timeline import UtcOffset
 from nedbus.vehicle_events import EVENT_TOPICS, EventLog, Times, by_vehicle, report_of
 
 from .flight import Flight, open_messages
 from .readers import ReadOptions
-
-MAX_FILE_EVENTS: Final = 100_000
-"""Maximum number of events of a file; beyond it, the oldest are discarded."""
 
 EVENT_OPTIONS: Final = ReadOptions(topics={*EVENT_TOPICS})
 """Options to read the messages from which events are derived."""
 
 # s of flight time between checks for silent streams and settled events
 _CHECK_INTERVAL: Final = 0.5
-_MAX_CHECKED: Final = 120.0  # s of a pause that are checked; by then all events have settled
+_CHECKED_PAUSE: Final = 120.0  # s of a pause that are checked; by then all events have settled
 # s after the last message; events that have not settled by then are reported as they are
 _SETTLE_TIME: Final = 10.0
 
@@ -42,15 +41,16 @@ class FileEvents:
         """Return the retained events and the state of each vehicle at the end."""
         events, total = self.event_log.events_since(0)
         report = report_of(self.event_log, "", "", self.end, within=math.inf)
-        held = {
-            name: vehicle.held_from_start
-            for name, vehicle in sorted(self.event_log.vehicles.items())
-        }
+        from_start = {}
+        for name, vehicle in sorted(self.event_log.vehicles.items()):
+            text = vehicle.held_from_start
+            if text:
+                from_start[name] = text
         return EventHistory(
             events=tuple(sorted(events, key=lambda event: event.time)),
             reports=by_vehicle([report]),
             times=self.times,
-            from_start={name: text for name, text in held.items() if text},
+            from_start=from_start,
             dropped=total - len(events),
             warnings=self.warnings,
         )
@@ -58,7 +58,7 @@ class FileEvents:
 
 def read_file_events(*paths: Path) -> FileEvents:
     """Detect the events in files; raise the errors of `nedbus.open` and its samples."""
-    event_log = EventLog(MAX_FILE_EVENTS)
+    event_log = EventLog(limits.FILE_EVENTS)
     with open_messages(paths, EVENT_OPTIONS) as flight:
         for _ in follow_flight(flight, event_log):
             pass
@@ -68,7 +68,7 @@ def read_file_events(*paths: Path) -> FileEvents:
 
 def read_flight_events(flight: Flight) -> FileEvents:
     """Detect the events of the selected vehicle in an open flight; raise the errors of its call."""
-    event_log = EventLog(MAX_FILE_EVENTS)
+    event_log = EventLog(limits.FILE_EVENTS)
     ended = set[str]()
     end = 0.0
     readers = flight._open({*EVENT_TOPICS})
@@ -86,18 +86,25 @@ def read_flight_events(flight: Flight) -> FileEvents:
 
 def times_of(flight: Flight) -> Times:
     """Return the clocks of the vehicles of a flight, with remarks on them; reads the files."""
-    offsets, remarks = dict[str, float](), dict[str, str]()
+    offsets = dict[str, float]()
+    remarks = dict[str, str]()
     for name, utc in flight._utc_by_name.items():
-        remark = utc
-        if not isinstance(utc, str):
+        if isinstance(utc, str):
+            remark = utc
+        else:
             offsets[name] = utc.offset_us / 1e6
-            seconds = utc.corrected_us / 1e6
-            remark = (
-                f"{utc.source} corrected its UTC by {seconds:+.1f} s in flight" if seconds else ""
-            )
+            remark = _remark_on(utc)
         if remark:
-            remarks[name] = str(remark)
+            remarks[name] = remark
     return Times(offsets=offsets, remarks=remarks)
+
+
+def _remark_on(utc: UtcOffset) -> str:
+    """Return that a source corrected its UTC in flight, "" if it did not."""
+    seconds = utc.corrected_us / 1e6
+    if not seconds:
+        return ""
+    return f"{utc.source} corrected its UTC by {seconds:+.1f} s in flight"
 
 
 def follow_flight(
@@ -114,7 +121,8 @@ def follow(
 
     `ended`: vehicles without further messages, which do not count as silent.
     """
-    checks, due = Checks(event_log, ended), 0.0
+    checks = Checks(event_log, ended)
+    due = 0.0
     for message in messages:
         if message.dropout:
             event_log.add_dropout(message.address.vehicle, message.dropout, due)
@@ -138,7 +146,8 @@ class Checks:
     """Checks of an event log for silence and settled events, twice a second of flight time."""
 
     def __init__(self, event_log: EventLog, ended: Collection[str] = ()) -> None:
-        self._event_log, self._ended = event_log, ended
+        self._event_log = event_log
+        self._ended = ended
         self._checked = 0.0
 
     def advance(self, due: float) -> None:
@@ -147,7 +156,7 @@ class Checks:
             return
         if self._event_log.vehicles.keys() <= set(self._ended):
             self._checked = due  # no vehicle is active between two files
-        settled = self._checked + _MAX_CHECKED
+        settled = self._checked + _CHECKED_PAUSE
         while due - self._checked >= _CHECK_INTERVAL:
             self._checked += _CHECK_INTERVAL
             self._update(self._checked)
@@ -161,5 +170,6 @@ class Checks:
 
     def _update(self, time: float) -> None:
         vehicles = self._event_log.vehicles
-        mains = (vehicles[name].main for name in self._ended if name in vehicles)
-        self._event_log.update(time, {main: "ended" for main in mains if main})
+        mains = [vehicles[name].main for name in self._ended if name in vehicles]
+        states = {main: "ended" for main in mains if main is not None}
+        self._event_log.update(time, states)

@@ -11,9 +11,10 @@ from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypedDict, Unpack, overload
 from weakref import WeakSet
 
+from nedbus import limits
 from nedbus.errors import ArgumentError, ClosedError, InvalidMessageError, SourceError
 from nedbus.samples import M_co, Sample, SourceMessage
 from nedbus.timeline import UtcOffset, provides_utc, to_unix_ns
@@ -43,8 +44,17 @@ if TYPE_CHECKING:
 
     from .columns import Columns
 
-_BATCH: Final = 4096  # messages per batch at most, of all types
 _BUILT_IN: Final = ReadOptions()
+
+
+class FlightMessage(NamedTuple):
+    """A valid message of a flight; `received`: its log time [ns]."""
+
+    address: Address
+    definition: Definition[Any]
+    encoded: Encoded
+    received: int
+    provenance: Provenance
 
 
 class Select(TypedDict, total=False):
@@ -75,9 +85,8 @@ def open_flight(
     """
     paths = [path] if isinstance(path, str | Path) else path
     options = ReadOptions(topics=None, layout=layout)
-    flight = Flight(
-        [Path(each).expanduser() for each in paths], options, vehicle=vehicle_name(vehicle)
-    )
+    expanded = [Path(path).expanduser() for path in paths]
+    flight = Flight(expanded, options, vehicle=vehicle_name(vehicle))
     flight._begin(watches_utc=True)
     return flight
 
@@ -87,6 +96,13 @@ def open_messages(paths: Sequence[Path], options: ReadOptions = _BUILT_IN) -> Fl
     flight = Flight(paths, options)
     flight._begin()
     return flight
+
+
+class _Period(NamedTuple):
+    """A part of a flight: seconds since its first message; `end`: None for the rest of it."""
+
+    start: float
+    end: float | None = None
 
 
 class Flight(AbstractContextManager["Flight"]):
@@ -112,7 +128,8 @@ class Flight(AbstractContextManager["Flight"]):
         self._columns: list[dict[Address, Columns]] = []
         self._ended: set[str] = set()  # vehicles without further messages in the first pass
         self._samples = WeakSet[FlightSamples[Any]]()  # open ones, which `close` closes
-        self._is_complete = self._is_closed = False
+        self._is_complete = False
+        self._is_closed = False
 
     @overload
     def __call__(
@@ -145,13 +162,14 @@ class Flight(AbstractContextManager["Flight"]):
         Raises ArgumentError for a `start` or `end` in UTC if the files do not provide UTC, AddressError for an invalid
         name. Iterating raises SourceError if a file has none of these topics.
         """
-        names = [topic_of(message, topic), *(topic_of(each) for each in more)]
-        chosen: VehicleNames = (
-            self._vehicle if Selection(vehicle=vehicle).vehicles == (ANY,) else vehicle
-        )
-        selection = Selection(names, chosen, instance)
+        names = [topic_of(message, topic), *map(topic_of, more)]
+        if Selection(vehicle=vehicle).vehicles == (ANY,):
+            vehicle = self._vehicle
+        selection = Selection(names, vehicle, instance)
         topics = None if selection.topics == (ANY,) else set(selection.topics)
-        period = self._seconds(start, "start"), None if end is None else self._seconds(end, "end")
+        period = _Period(self._seconds(start, "start"))
+        if end is not None:
+            period = _Period(period.start, self._seconds(end, "end"))
         samples = FlightSamples[Any](self, self._open(topics), selection, period, rows=rows)
         self._samples.add(samples)
         return samples
@@ -176,11 +194,14 @@ class Flight(AbstractContextManager["Flight"]):
     def duration(self) -> float:
         """Seconds from the first to the last message, by the vehicle's clock, pauses included."""
         self._complete()
-        durations = [reader.order.duration for reader in self._readers]
-        if len(durations) == 1:
-            return durations[0]
-        ends = [start + duration for start, duration in zip(self._starts, durations, strict=True)]
-        return max(ends) - min(self._starts)
+        readers = self._readers
+        if len(readers) == 1:
+            return readers[0].order.duration
+        starts = self._starts
+        ends = [
+            start + reader.order.duration for start, reader in zip(starts, readers, strict=True)
+        ]
+        return max(ends) - min(starts)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -202,7 +223,9 @@ class Flight(AbstractContextManager["Flight"]):
         for name, utc in self._utc_by_name.items():
             if isinstance(utc, UtcOffset) and self._vehicle in (ANY, name):
                 known.append(utc)
-        return known[0] if len(known) == 1 else None
+        if len(known) != 1:
+            return None
+        return known[0]
 
     def close(self) -> None:
         """Close the flight and its samples, which then raise ClosedError; a second call does nothing."""
@@ -297,30 +320,28 @@ class Flight(AbstractContextManager["Flight"]):
     def _utc(self) -> list[Mapping[str, UtcOffset | str]]:
         """The UTC offset of each vehicle of each file, by its own name, or why it is unknown."""
         if self._columns:
-            return [
-                utc_of_columns(own, reader)
-                for own, reader in zip(self._columns, self._readers, strict=True)
-            ]
+            pairs = zip(self._columns, self._readers, strict=True)
+            return [utc_of_columns(columns, reader) for columns, reader in pairs]
         if self._watches and self._is_complete:
-            return [
-                watch.results(reader)
-                for watch, reader in zip(self._watches, self._readers, strict=True)
-            ]
+            watched = zip(self._watches, self._readers, strict=True)
+            return [watch.results(reader) for watch, reader in watched]
         # a file may have other topics only
         topics = None if self._options.topics is None else _BUILT_IN.topics
-        found: list[Mapping[str, UtcOffset | str]] = []
+        options = replace(self._options, topics=topics)
+        offsets: list[Mapping[str, UtcOffset | str]] = []
         for path in self._paths:
-            with open_reader(path, replace(self._options, topics=topics)) as reader:
-                found.append(read_utc(reader))
-        return found
+            with open_reader(path, options) as reader:
+                offsets.append(read_utc(reader))
+        return offsets
 
     @property
     def _utc_by_name(self) -> dict[str, UtcOffset | str]:
         """The UTC offset of each vehicle, or why it is unknown."""
-        found = dict[str, UtcOffset | str]()
-        for own, names in zip(self._utc, self._names, strict=True):
-            found |= {names.get(vehicle, vehicle): utc for vehicle, utc in own.items()}
-        return found
+        by_name = dict[str, UtcOffset | str]()
+        for offsets, names in zip(self._utc, self._names, strict=True):
+            for vehicle, utc in offsets.items():
+                by_name[names.get(vehicle, vehicle)] = utc
+        return by_name
 
     @cached_property
     def _names(self) -> list[Names]:
@@ -329,17 +350,15 @@ class Flight(AbstractContextManager["Flight"]):
             return [{}]
         files = []
         for reader, utc in zip(self._readers, self._utc, strict=True):
-            files.append(
-                (reader.path, utc.keys() | {address.vehicle for address in reader.definitions})
-            )
+            vehicles = {address.vehicle for address in reader.definitions}
+            files.append((reader.path, vehicles | utc.keys()))
         return [*distinct_names(files)]
 
     @cached_property
     def _starts(self) -> list[float]:
         """The Unix time of the first message of each file [s]; raise SourceError if it is unknown."""
-        return [
-            _start_of(reader, utc) for reader, utc in zip(self._readers, self._utc, strict=True)
-        ]
+        files = zip(self._readers, self._utc, strict=True)
+        return [_start_of(reader, utc) for reader, utc in files]
 
     def _find(self, address: Address) -> tuple[int, Address]:
         """Return the number of the file that has an address, and the address in this file."""
@@ -352,26 +371,26 @@ class Flight(AbstractContextManager["Flight"]):
     @property
     def _first_stamps(self) -> dict[str, int]:
         """The timestamp of each vehicle at the first message of its file [us]."""
-        found = dict[str, int]()
+        stamps = dict[str, int]()
         for reader, names in zip(self._readers, self._names, strict=True):
             for own in {address.vehicle for address in reader.definitions}:
                 stamp = reader.order.axis.stamp_at(own, 0.0)
                 if stamp is not None and stamp > 0:
-                    found[names.get(own, own)] = stamp
-        return found
+                    stamps[names.get(own, own)] = stamp
+        return stamps
 
     def _definitions_of(self, readers: Sequence[FlightReader]) -> dict[Address, Definition[Any]]:
         """Return the definition of each stream that a pass has met so far."""
-        found = dict[Address, Definition[Any]]()
+        definitions = dict[Address, Definition[Any]]()
         for reader, names in zip(readers, self._names, strict=True):
-            found |= {
-                renamed(address, names): known for address, known in [*reader.definitions.items()]
-            }
-        return found
+            # a copy, because another thread may read on meanwhile
+            for address, definition in [*reader.definitions.items()]:
+                definitions[renamed(address, names)] = definition
+        return definitions
 
     def _warnings_of(self, readers: Sequence[FlightReader]) -> tuple[str, ...]:
         """Return damage, omissions and renamed vehicles that a pass has met so far, each with its file."""
-        found = []
+        warnings = []
         for reader, names in zip(readers, self._names, strict=True):
             texts = []
             for own, name in names.items():
@@ -380,8 +399,8 @@ class Flight(AbstractContextManager["Flight"]):
                         f"vehicle {own} is named {name} here, because several files have a vehicle {own}"
                     )
             texts += [*reader.warnings, *reader.remarks]
-            found += [f"{reader.path}: {text}" for text in texts]
-        return tuple(found)
+            warnings += [f"{reader.path}: {text}" for text in texts]
+        return tuple(warnings)
 
     def _seconds(self, time: float | datetime, name: str) -> float:
         """Return seconds since the first message."""
@@ -412,7 +431,7 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         flight: Flight,
         readers: Sequence[FlightReader],
         selection: Selection,
-        period: tuple[float, float | None],
+        period: _Period,
         *,
         rows: bool,
     ) -> None:
@@ -420,7 +439,8 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         self._readers = readers
         self._selection = selection
         self._rows = rows
-        self._start, self._end = period
+        self._start = period.start
+        self._end = period.end
         self.skipped: Counter[Address] = Counter()
         self._reasons: dict[Address, str] = {}
         self._matches = lru_cache(10_000)(selection.matches)
@@ -430,12 +450,11 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
     @property
     def warnings(self) -> list[str]:
         """Damage, omissions and invalid messages so far."""
-        count = self.skipped
-        invalid = [
-            f"skipped {count[each]} messages of {each} as invalid ({text})"
-            for each, text in self._reasons.items()
-        ]
-        return [*self._flight._warnings_of(self._readers), *invalid]
+        warnings = [*self._flight._warnings_of(self._readers)]
+        for address, reason in self._reasons.items():
+            count = self.skipped[address]
+            warnings.append(f"skipped {count} messages of {address} as invalid ({reason})")
+        return warnings
 
     @property
     def damaged(self) -> bool:
@@ -458,8 +477,8 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         """Iterate over messages as NumPy arrays, up to 4096 of one type, with the same validation."""
         from .columns import make_batches
 
-        while ahead := list(islice(self._messages, _BATCH)):
-            yield from make_batches(ahead)
+        while messages := list(islice(self._messages, limits.BATCH_MESSAGES)):
+            yield from make_batches(messages)
             if self._is_aborted:
                 raise ClosedError
 
@@ -476,7 +495,8 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
             raise ClosedError
         address, definition, encoded, received, provenance = next(self._messages)
         codec = codec_of(definition)
-        message: Any = (codec.decode_row if self._rows else codec.decode)(encoded.payload)
+        decode = codec.decode_row if self._rows else codec.decode
+        message: Any = decode(encoded.payload)
         return Sample(message, address, received, provenance=provenance)
 
     def abort(self) -> None:
@@ -487,20 +507,20 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _select(self) -> Generator[tuple[Address, Definition[Any], Encoded, int, Provenance]]:
-        """Yield address, definition, payload, log time [ns] and provenance of the selected messages."""
-        flight = self._flight
+    def _select(self) -> Generator[FlightMessage]:
+        """Yield the selected messages, and count the invalid ones."""
         readers = self._readers
-        is_found = False
+        make = tuple.__new__  # half the time of the constructor
+        is_any_selected = False
         try:
-            for message in flight._merge(readers, lambda _: None):
+            for message in self._flight._merge(readers, lambda _: None):
                 is_late = self._end is not None and message.at > self._end
-                if is_late and is_found:
+                if is_late and is_any_selected:
                     return
                 address = message.address
                 if not self._matches(address):
                     continue
-                is_found = True
+                is_any_selected = True
                 if is_late:
                     return
                 if message.at < self._start:
@@ -513,23 +533,19 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
                     continue
                 definition = message.definition or BY_TOPIC[address.topic]
                 time = to_unix_ns(message.time, boot_utc_of(readers))
-                yield (
-                    address,
-                    definition,
-                    encoded,
-                    time,
-                    _provenance(message.source, encoded.missing),
-                )
+                provenance = Provenance(message.source, encoded.missing)
+                yield make(FlightMessage, (address, definition, encoded, time, provenance))
         finally:
             close_all(readers)
-        if not is_found:
-            where = readers[0].path if len(readers) == 1 else f"any of the {len(readers)} files"
-            # raises an AddressError
-            matching(where, sorted(flight._definitions_of(readers)), self._selection)
+        if not is_any_selected:
+            self._raise_unmatched()
 
-
-def _provenance(source: str | None, missing: frozenset[str]) -> Provenance:
-    return Provenance(source, missing)
+    def _raise_unmatched(self) -> None:
+        """Raise AddressError, because the files have none of the selected addresses."""
+        readers = self._readers
+        addresses = sorted(self._flight._definitions_of(readers))
+        where = readers[0].path if len(readers) == 1 else f"any of the {len(readers)} files"
+        matching(where, addresses, self._selection)
 
 
 def close_all(readers: Sequence[FlightReader]) -> None:

@@ -62,18 +62,30 @@ def renamed(address: Address, names: Names) -> Address:
 
 def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict[str, str]]:
     """Map the vehicles of each file to unique names; a vehicle that is in several files is named after its file."""
-    counts = Counter(vehicle for _, vehicles in flights for vehicle in vehicles)
-    taken, found = set(counts), []
+    counts: Counter[str] = Counter()
+    for _, vehicles in flights:
+        counts.update(vehicles)
+    taken = set(counts)
+    names_of_files = []
     for path, vehicles in flights:
-        base = re.sub(r"[^A-Za-z0-9_-]", "_", path.name.partition(".")[0])[:60] or "flight"
         names = {}
         for vehicle in sorted(vehicles):
-            free = (
-                each
-                for each in (base, *(f"{base}_{number}" for number in range(2, 999)))
-                if each not in taken
-            )
-            names[vehicle] = vehicle if counts[vehicle] == 1 else next(free)
-            taken.add(names[vehicle])
-        found.append(names)
-    return found
+            name = vehicle
+            if counts[vehicle] > 1:
+                name = _free_name(path, taken)
+            names[vehicle] = name
+            taken.add(name)
+        names_of_files.append(names)
+    return names_of_files
+
+
+def _free_name(path: Path, taken: Collection[str]) -> str:
+    """Return a name after a file that no vehicle has."""
+    stem = path.name.partition(".")[0]
+    base = re.sub(r"[^A-Za-z0-9_-]", "_", stem)[:60] or "flight"
+    name = base
+    number = 1
+    while name in taken:
+        number += 1
+        name = f"{base}_{number}"
+    return name

@@ -7,13 +7,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from nedbus import limits
 from nedbus.errors import ArgumentError
 from nedbus.samples import Sample
 from nedbus.timeline import Order
 from nedbus.vehicle_events import EVENT_TOPICS, EventLog, Times
 from nedbus_msgs import Address, is_unix_time
 
-from .events import MAX_FILE_EVENTS, Checks, FileEvents
+from .events import Checks, FileEvents
 
 
 @dataclass(slots=True)
@@ -40,12 +41,13 @@ def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
 
     Raises ArgumentError for anything but a sample.
     """
-    event_log = EventLog(MAX_FILE_EVENTS)
+    event_log = EventLog(limits.FILE_EVENTS)
     offsets = dict[str, float]()
     due = 0.0
     checks = Checks(event_log)
-    for each in Order[_Received]().arrange(_received(samples)):
-        sample, due = each.sample, each.at
+    for received in Order[_Received]().arrange(_received(samples)):
+        sample = received.sample
+        due = received.at
         checks.advance(due)
         event_log.add(
             sample.address,
@@ -55,17 +57,18 @@ def detect_sample_events(samples: Iterable[Sample[Any]]) -> FileEvents:
             lost=sample.lost,
             source=sample.source,
         )
-        if is_unix_time(each.time) and not is_unix_time(each.timestamp):
-            offset = (each.time - each.timestamp) / 1e6
-            # with the least delay
-            offsets[sample.vehicle] = min(offset, offsets.get(sample.vehicle, math.inf))
+        if is_unix_time(received.time) and not is_unix_time(received.timestamp):
+            offset = (received.time - received.timestamp) / 1e6
+            least = offsets.get(sample.vehicle, math.inf)
+            offsets[sample.vehicle] = min(offset, least)  # that with the least delay
     checks.end(due)
     event_log.label_first_events()
     return FileEvents(event_log, Times(offsets=offsets), due, ())
 
 
 def _received(samples: Iterable[Sample[Any]]) -> Iterator[_Received]:
-    topics, streams = {*EVENT_TOPICS}, dict[Address, Address]()
+    topics = {*EVENT_TOPICS}
+    streams = dict[Address, Address]()
     for sample in samples:
         if not isinstance(sample, Sample):
             raise ArgumentError(

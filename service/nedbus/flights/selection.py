@@ -2,12 +2,10 @@
 
 from collections.abc import Collection, Iterable, Sequence, Set
 from pathlib import Path
-from typing import Final
 
+from nedbus import limits
 from nedbus.errors import AddressError
 from nedbus_msgs import ANY, MESSAGES, TOPICS, Address, Selection, get_topic
-
-_MAX_NAMED: Final = 10  # addresses listed in an error
 
 
 def parse_topics(text: str) -> tuple[str, ...]:
@@ -21,17 +19,21 @@ def parse_topics(text: str) -> tuple[str, ...]:
 
 def topics_of(names: Collection[str]) -> Set[str] | None:
     """Return the topics of names from `parse_topics`, by default the built-in ones; None means all."""
-    return (
-        None
-        if ANY in names
-        else {topic for name in names for topic in _topics_of(name)} or TOPICS.keys()
-    )
+    if ANY in names:
+        return None
+    topics = set[str]()
+    for name in names:
+        topics |= _topics_of(name)
+    return topics or TOPICS.keys()
 
 
 def absent_topics(names: Collection[str], topics: Collection[str], where: str) -> list[str]:
     """Return a list of at most one warning: the requested topics and messages missing from `topics`."""
-    absent = [name for name in names if name != ANY and _topics_of(name).isdisjoint(topics)]
-    return [f"{where} has no messages of {', '.join(absent)}"] if absent else []
+    asked = [name for name in names if name != ANY]
+    absent = [name for name in asked if _topics_of(name).isdisjoint(topics)]
+    if not absent:
+        return []
+    return [f"{where} has no messages of {', '.join(absent)}"]
 
 
 def _topics_of(name: str) -> Set[str]:
@@ -42,18 +44,28 @@ def matching(
     where: Path | str, addresses: Sequence[Address], selection: Selection
 ) -> list[Address]:
     """Return the selected addresses of a flight; raise AddressError if there are none."""
-    topics, vehicles = selection.topics, selection.vehicles
-    steps: list[tuple[str, object, Selection]] = [
-        ("vehicle", " or ".join(vehicles), Selection(vehicle=vehicles)),
-        ("topic", " or ".join(topics), Selection(topics, vehicles)),
-        ("instance", selection.instance, selection),
-    ]
-    for part, value, step in steps:
+    without_topic = Selection(vehicle=selection.vehicles)
+    without_instance = Selection(selection.topics, selection.vehicles)
+    for part, step in {
+        "vehicle": without_topic,
+        "topic": without_instance,
+        "instance": selection,
+    }.items():
         if not any(map(step.matches, addresses)):
-            raise AddressError(
-                part, value, f"one of {_list(addresses)}", problem=f"is not in {where}"
-            )
+            expected = f"one of {_list(addresses)}"
+            value = _value_of(part, selection)
+            raise AddressError(part, value, expected, problem=f"is not in {where}")
     return list(filter(selection.matches, addresses))
+
+
+def _value_of(part: str, selection: Selection) -> object:
+    """Return what a selection has for "vehicle", "topic" or "instance", as an error shows it."""
+    values = {
+        "vehicle": " or ".join(selection.vehicles),
+        "topic": " or ".join(selection.topics),
+        "instance": selection.instance,
+    }
+    return values[part]
 
 
 def single_match(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
@@ -61,38 +73,34 @@ def single_match(path: Path, addresses: Sequence[Address], selection: Selection)
 
     The first instance of a topic that only the file defines has no instance number: the topic alone selects it.
     """
-    found = matching(path, addresses, selection)
-    plain = [address for address in found if address.instance is None]
-    found = (
-        plain
-        if len(plain) == 1 and len({(each.vehicle, each.topic) for each in found}) == 1
-        else found
-    )
+    matches = matching(path, addresses, selection)
+    is_one_topic = len({(address.vehicle, address.topic) for address in matches}) == 1
+    plain = [address for address in matches if address.instance is None]
+    if is_one_topic and len(plain) == 1:
+        matches = plain
     lacking = [
         part
         for part in ("topic", "vehicle", "instance")
-        if len({getattr(each, part) for each in found}) > 1
+        if len({getattr(address, part) for address in matches}) > 1
     ]
     if lacking:
-        problem = f"one stream of {path}, but several match; set {' and '.join(lacking)} to one of {_list(found)}"
-        given = {
-            "topic": " or ".join(selection.topics),
-            "vehicle": " or ".join(selection.vehicles),
-            "instance": selection.instance,
-        }
-        raise AddressError(lacking[0], given[lacking[0]], problem)
-    return found
+        names = " and ".join(lacking)
+        expected = (
+            f"one stream of {path}, but several match; set {names} to one of {_list(matches)}"
+        )
+        raise AddressError(lacking[0], _value_of(lacking[0], selection), expected)
+    return matches
 
 
 def require_one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle: str) -> None:
     """Raise AddressError if these addresses, selected by `vehicle`, belong to several vehicles."""
     vehicles = sorted({address.vehicle for address in addresses})
     if len(vehicles) > 1:
-        raise AddressError(
-            "vehicle", vehicle, f"one vehicle of {where}: {', '.join(vehicles[:_MAX_NAMED])}"
-        )
+        names = ", ".join(vehicles[: limits.SHOWN_NAMES])
+        raise AddressError("vehicle", vehicle, f"one vehicle of {where}: {names}")
 
 
 def _list(addresses: Sequence[Address]) -> str:
-    more = len(addresses) - _MAX_NAMED
-    return ", ".join(map(str, addresses[:_MAX_NAMED])) + (f" and {more} more" if more > 0 else "")
+    text = ", ".join(map(str, addresses[: limits.SHOWN_NAMES]))
+    more = len(addresses) - limits.SHOWN_NAMES
+    return f"{text} and {more} more" if more > 0 else text

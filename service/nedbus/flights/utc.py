@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from nedbus.log_event import about
 from nedbus.samples import Sample
 from nedbus.timeline import UTC_COLUMNS, UtcOffset, provides_utc
-from nedbus_msgs import ANY, TOPICS, Address, FieldReader, Selection, vehicle_name
+from nedbus_msgs import ANY, TOPICS, Address, Definition, FieldReader, Selection, vehicle_name
 
 from .readers import FileStream, FlightReader, Record, Run, open_reader
 from .selection import matching, require_one_vehicle
@@ -46,11 +46,11 @@ def utc_of(
 
     Raises AddressError for several vehicles unless `vehicle` names one, and the errors of `read`.
     """
-    found = find_utc(flight, vehicle=vehicle)
-    if isinstance(found, UtcOffset):
-        return found
-    if found:
-        _log.warning("UTC is unknown: %s", found, extra=about("incomplete"))
+    utc = find_utc(flight, vehicle=vehicle)
+    if isinstance(utc, UtcOffset):
+        return utc
+    if utc:
+        _log.warning("UTC is unknown: %s", utc, extra=about("incomplete"))
     return None
 
 
@@ -60,29 +60,11 @@ def find_utc(
     vehicle: str | int = ANY,
 ) -> UtcOffset | str:
     """Return what `utc_of` returns, or why it is unknown, "" if no message contains UTC."""
-    from nedbus.timeline import UtcEstimate
-
-    vehicle, estimate = vehicle_name(vehicle), UtcEstimate()
+    vehicle = vehicle_name(vehicle)
     if isinstance(flight, Mapping):
-        for name, messages in flight.items():
-            lacking = (messages.dtype.metadata or {}).get("missing", ())
-            provided = set(messages.dtype.names or ()).difference(lacking)
-            estimate.add(
-                name, {each: messages[each] for each in provided.intersection(UTC_COLUMNS)}
-            )
-        return estimate.result()
+        return _utc_of_arrays(flight)
     if not isinstance(flight, str | Path):
-        samples = [each for each in flight if vehicle in (ANY, each.vehicle)]
-        require_one_vehicle("the samples", (each.address for each in samples), vehicle)
-        for sample in samples:
-            values = zip(UTC_COLUMNS, _READ(sample.message), strict=True)
-            known = {
-                each: [value]
-                for each, value in values
-                if value is not None and each not in sample.missing
-            }
-            estimate.add(sample.address.stream, known)
-        return estimate.result()
+        return _utc_of_samples(flight, vehicle)
     path = Path(flight).expanduser()
     with open_reader(path) as reader:
         offsets = read_utc(reader)
@@ -91,12 +73,39 @@ def find_utc(
         return offsets[addresses[0].vehicle]
 
 
+def _utc_of_arrays(flight: Mapping[str, MessageArray]) -> UtcOffset | str:
+    from nedbus.timeline import UtcEstimate
+
+    estimate = UtcEstimate()
+    for stream, messages in flight.items():
+        metadata: Mapping[str, Any] = messages.dtype.metadata or {}
+        provided = set(messages.dtype.names or ()).difference(metadata.get("missing", ()))
+        names = provided.intersection(UTC_COLUMNS)
+        estimate.add(stream, {name: messages[name] for name in names})
+    return estimate.result()
+
+
+def _utc_of_samples(samples: Iterable[Sample[Any]], vehicle: str) -> UtcOffset | str:
+    from nedbus.timeline import UtcEstimate
+
+    estimate = UtcEstimate()
+    selected = [sample for sample in samples if vehicle in (ANY, sample.vehicle)]
+    require_one_vehicle("the samples", (sample.address for sample in selected), vehicle)
+    for sample in selected:
+        columns = {}
+        for name, value in zip(UTC_COLUMNS, _READ(sample.message), strict=True):
+            if value is not None and name not in sample.missing:
+                columns[name] = [value]
+        estimate.add(sample.address.stream, columns)
+    return estimate.result()
+
+
 def read_utc(reader: FlightReader) -> dict[str, UtcOffset | str]:
     """Read a file; return the UTC offset of each vehicle, or why it is unknown."""
-    found = FileUtc()
-    for stream, payloads, _ in reader.runs():
-        found.add(stream, payloads)
-    return found.results(reader)
+    utc = FileUtc()
+    for run in reader.runs():
+        utc.add(run.stream, run.payloads)
+    return utc.results(reader)
 
 
 def utc_of_columns(
@@ -142,20 +151,15 @@ class FileUtc:
         if address.topic not in TOPICS:
             return
         if not provides_utc(stream.definition):
-            stamps = [
-                stream.timestamp(payload)[0] or 0
-                for payload in payloads
-                if not stream.check(payload)
-            ]
+            intact = [payload for payload in payloads if not stream.check(payload)]
+            stamps = [stream.timestamp(payload)[0] or 0 for payload in intact]
             self._estimates[address.vehicle].add(address.stream, {"timestamp": stamps})
             return
         columns = self._columns.setdefault(address, Columns())
         columns.add(Run(stream, payloads, []))
         if len(columns) >= _BATCH:
             del self._columns[address]
-            self._estimates[address.vehicle].add(
-                address.stream, columns.decode(stream.definition).utc_columns()
-            )
+            self._add_columns(address, columns, stream.definition)
 
     def results(self, reader: FlightReader) -> dict[str, UtcOffset | str]:
         """Return the UTC offset of each vehicle, or why it is unknown, at the end of a file."""
@@ -163,8 +167,11 @@ class FileUtc:
             self.add(stream, payloads)
         self._payloads.clear()
         for address, columns in self._columns.items():
-            own = columns.decode(reader.definitions[address])
-            self._estimates[address.vehicle].add(address.stream, own.utc_columns())
+            self._add_columns(address, columns, reader.definitions[address])
         self._columns.clear()
         vehicles = {address.vehicle for address in reader.definitions}
         return {vehicle: self._estimates[vehicle].result(reader.boot_utc) for vehicle in vehicles}
+
+    def _add_columns(self, address: Address, columns: Columns, definition: Definition[Any]) -> None:
+        decoded = columns.decode(definition)
+        self._estimates[address.vehicle].add(address.stream, decoded.utc_columns())

@@ -12,13 +12,14 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import repeat
-from operator import itemgetter
+from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any, Final, cast
+from typing import IO, Any, Final, NamedTuple, cast
 
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
 
+from nedbus import limits
 from nedbus.atomic_write import sync_folder
 from nedbus.errors import OutputError
 from nedbus.log_event import about
@@ -29,11 +30,7 @@ from nedbus_msgs.messages import LogMessage
 _log = logging.getLogger(__name__)
 
 _CHUNK: Final = 2**23  # bytes; flushing every second makes smaller chunks
-_MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
-_MAX_CHANNELS: Final = 1000  # per vehicle, so none uses up those of a file; a PX4 has 300 topics
-# of at most 65,535 in an MCAP file, which also has a log channel per vehicle
-_MAX_ALL_CHANNELS: Final = 60_000
-_MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have larger timestamps
+_LATEST: Final = 2**64 - 1  # ns that MCAP can hold; a damaged log may have larger timestamps
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0)
     + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0)
@@ -57,11 +54,52 @@ uint32 nanosec
 # FATAL, ERROR, WARN, INFO, DEBUG, by PX4's severity
 _LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)
 
-# log time [ns], channel, payload, publish time [ns], sequence number
-_Encoded = tuple[int, int, bytes, int, int]
-_Streams = Iterable[tuple[Address, Provenance]]  # of each message
-# log time [ns], publish time [ns] and sequence number of each message
-_Times = Iterable[tuple[int, int, int]]
+
+class _Logged(NamedTuple):
+    """A message to write; `logged`: its log time [ns]."""
+
+    message: Message
+    address: Address
+    provenance: Provenance
+    logged: int
+
+
+class _Encoded(NamedTuple):
+    """A message as a file contains it: log time [ns], channel, payload, publish time [ns] and sequence number."""
+
+    logged: int
+    channel: int
+    payload: bytes
+    published: int
+    number: int
+
+
+class _Times(NamedTuple):
+    """Log time [ns], publish time [ns] and sequence number of a message."""
+
+    logged: int
+    published: int
+    number: int = 0
+
+
+class _Channel(NamedTuple):
+    """The id of a channel, and the layout of its messages."""
+
+    number: int
+    layout: Layout
+
+
+class _Payloads(NamedTuple):
+    """The payloads of messages in one layout, one after the other, and the size of each."""
+
+    size: int
+    data: bytes
+
+    def at(self, index: int) -> bytes:
+        return self.data[index * self.size : (index + 1) * self.size]
+
+
+_Stream = tuple[Address, Provenance]
 
 
 class RecordingWriter(AbstractContextManager["RecordingWriter"]):
@@ -90,7 +128,8 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self.path = Path(path)
         self._boot_utc = boot_utc
         self._starts = starts or {}
-        self.messages = self.omitted = 0
+        self.messages = 0
+        self.omitted = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
         # Large chunks: the writer keeps an index per chunk and channel in memory.
@@ -105,9 +144,7 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
             self.path.unlink(missing_ok=True)
             raise
         self._schemas: dict[tuple[str, str], int] = {}  # by type and text
-        self._channels: dict[
-            Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]
-        ] = {}
+        self._channels: dict[Definition[Any], dict[_Stream, _Channel]] = {}
         self._numbers: Counter[str] = Counter()  # of channels, by vehicle
         self._log_channels = dict[str, int]()  # by vehicle; RecordingReader ignores these
 
@@ -115,80 +152,71 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
         self,
         messages: MessageArray,
         definition: Definition[Any],
-        streams: _Streams,
+        streams: Iterable[_Stream],
         *,
         logged: Iterable[int],
         published: Iterable[int],
         sequence: Iterable[int] = repeat(0),
     ) -> None:
         """Write messages of one type, each with its stream, log and publish time [ns], and sequence number."""
-        self._add(
-            self._encode(
-                messages, definition, streams, zip(logged, published, sequence, strict=False)
-            )
-        )
+        times = map(_Times, logged, published, sequence)
+        self._add(self._encode(messages, definition, streams, times))
 
     def write_messages(self, messages: Iterable[tuple[Message, Address, Provenance, int]]) -> None:
         """Write messages of any types, each with address, provenance and log time [ns], sorted by log time.
 
         The publish time of a message is its timestamp.
         """
-        by_kind: dict[Definition[Any], list[tuple[Message, Address, Provenance, int]]] = {}
-        for each in messages:
-            by_kind.setdefault(each[0].DEFINITION, []).append(each)
+        by_definition: dict[Definition[Any], list[_Logged]] = {}
+        for given in messages:
+            logged = _Logged(*given)
+            by_definition.setdefault(logged.message.DEFINITION, []).append(logged)
         encoded: list[_Encoded] = []
-        for definition, own in by_kind.items():
-            array = arrays_of(definition).of([message for message, *_ in own])
-            streams = ((address, provenance) for _, address, provenance, _ in own)
-            times = (
-                (logged, min(message.timestamp * 1000, _MAX_TIME), 0) for message, *_, logged in own
-            )
-            encoded += self._encode(array, definition, streams, times)
-        self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file sequentially
+        for definition, own in by_definition.items():
+            array = arrays_of(definition).of([logged.message for logged in own])
+            streams = ((logged.address, logged.provenance) for logged in own)
+            encoded += self._encode(array, definition, streams, map(_times_of, own))
+        self._add(sorted(encoded, key=attrgetter("logged")))  # a replay reads the file sequentially
 
     def _encode(
-        self, messages: MessageArray, definition: Definition[Any], streams: _Streams, times: _Times
+        self,
+        messages: MessageArray,
+        definition: Definition[Any],
+        streams: Iterable[_Stream],
+        times: Iterable[_Times],
     ) -> Iterator[_Encoded]:
-        encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
+        codec = arrays_of(definition)
+        payloads: dict[Layout, _Payloads] = {}
         channels = self._channels.setdefault(definition, {})
-        for index, stream, (logged, published, number) in zip(
-            range(len(messages)), streams, times, strict=False
-        ):
-            found = channels.get(stream) or self._new_channel(definition, *stream)
-            if found is None:
+        for index, stream, time in zip(range(len(messages)), streams, times, strict=False):
+            channel = channels.get(stream) or self._new_channel(definition, *stream)
+            if channel is None:
                 self.omitted += 1
                 continue
-            channel, layout = found
-            if layout not in encoded:
-                payloads = arrays_of(definition).encode_cdr(messages, layout)
-                encoded[layout] = payloads.itemsize, payloads.tobytes()
-            size, data = encoded[layout]
-            yield (
-                logged,
-                channel,
-                data[index * size : (index + 1) * size],
-                published,
-                max(0, number) % 2**32,
-            )
+            layout = channel.layout
+            if layout not in payloads:
+                records = codec.encode_cdr(messages, layout)
+                payloads[layout] = _Payloads(records.itemsize, records.tobytes())
+            payload = payloads[layout].at(index)
+            number = max(0, time.number) % 2**32
+            yield _Encoded(time.logged, channel.number, payload, time.published, number)
             self.messages += 1
             if definition is LogMessage.DEFINITION:
-                text, vehicle = arrays_of(definition).to_message(messages[index]), stream[0].vehicle
-                if vehicle not in self._log_channels:
-                    self._log_channels[vehicle] = self._register(
-                        f"/{vehicle}/log", _LOG_TYPE, _LOG_DEFINITION, {}
-                    )
-                yield (
-                    logged,
-                    self._log_channels[vehicle],
-                    _encode_log(vehicle, text, logged),
-                    published,
-                    0,
-                )
+                text: Any = codec.to_message(messages[index])
+                yield self._encode_log(stream[0].vehicle, text, time)
+
+    def _encode_log(self, vehicle: str, message: LogMessage, time: _Times) -> _Encoded:
+        """Return a log message for the log channel of its vehicle."""
+        if vehicle not in self._log_channels:
+            channel = self._register(f"/{vehicle}/log", _LOG_TYPE, _LOG_DEFINITION, {})
+            self._log_channels[vehicle] = channel
+        payload = _log_payload(vehicle, message, time.logged)
+        return _Encoded(time.logged, self._log_channels[vehicle], payload, time.published, 0)
 
     def _add(self, encoded: Iterable[_Encoded]) -> None:
         with _writing(self.path):
-            for logged, channel, data, published, number in encoded:
-                self._writer.add_message(channel, logged, data, published, number)
+            for logged, channel, payload, published, number in encoded:
+                self._writer.add_message(channel, logged, payload, published, number)
 
     def flush(self) -> None:
         """Sync all messages written so far to disk."""
@@ -212,47 +240,64 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
 
     def _new_channel(
         self, definition: Definition[Any], address: Address, provenance: Provenance
-    ) -> tuple[int, Layout] | None:
-        """Return the id and layout of a new channel, None beyond the limit of a vehicle or of the file."""
-        if (
-            self._numbers[address.vehicle] >= _MAX_CHANNELS
-            or self._numbers.total() >= _MAX_ALL_CHANNELS
-        ):
+    ) -> _Channel | None:
+        """Return a new channel, None beyond the limit of a vehicle or of the file."""
+        vehicle = address.vehicle
+        is_vehicle_full = self._numbers[vehicle] >= limits.CHANNELS_OF_VEHICLE
+        if is_vehicle_full or self._numbers.total() >= limits.CHANNELS:
             if not self.omitted:
-                text = "%s: not recording some messages of vehicle %s, which has more than %d topics and provenances"
-                _log.warning(
-                    text,
-                    self.path,
-                    address.vehicle,
-                    _MAX_CHANNELS,
-                    extra=about("incomplete", address),
-                )
+                self._warn_of_omission(address)
             return None
-        self._numbers[address.vehicle] += 1
+        self._numbers[vehicle] += 1
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
-        known = {
-            "vehicle": address.vehicle, "topic": address.topic,
-            "instance": "" if address.instance is None else str(address.instance), "source": provenance.source or "",
+        number = self._register(
+            f"/{address}",
+            ros2_type(definition),
+            definition_text(definition, layout),
+            self._metadata(address, provenance),
+        )
+        channel = _Channel(number, layout)
+        self._channels[definition][address, provenance] = channel
+        return channel
+
+    def _warn_of_omission(self, address: Address) -> None:
+        text = "%s: not recording some messages of vehicle %s, which has more than %d topics and provenances"
+        extra = about("incomplete", address)
+        _log.warning(text, self.path, address.vehicle, limits.CHANNELS_OF_VEHICLE, extra=extra)
+
+    def _metadata(self, address: Address, provenance: Provenance) -> dict[str, str]:
+        """Return what a channel says about its messages."""
+        metadata = {
+            "vehicle": address.vehicle,
+            "topic": address.topic,
+            "instance": "" if address.instance is None else str(address.instance),
+            "source": provenance.source or "",
             "boot_time_utc_us": str(self._boot_utc or ""),
             "start_time_us": str(self._starts.get(address.vehicle, "")),
             "missing": " ".join(sorted(provenance.missing)),
-        }  # fmt: skip
-        metadata = {name: value for name, value in known.items() if value}
-        channel = self._register(
-            f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata
-        )
-        self._channels[definition][address, provenance] = channel, layout
-        return channel, layout
+        }
+        return {name: value for name, value in metadata.items() if value}
 
-    def _register(self, topic: str, name: str, text: str, metadata: dict[str, str]) -> int:
-        if (name, text) not in self._schemas:
-            self._schemas[name, text] = self._writer.register_schema(name, "ros2msg", text.encode())
-        return self._writer.register_channel(
-            topic, "cdr", self._schemas[name, text], {_ROS2: "", **metadata}
-        )
+    def _register(
+        self,
+        topic: str,
+        name: str,
+        text: str,
+        metadata: dict[str, str],
+    ) -> int:
+        schema = self._schemas.get((name, text))
+        if schema is None:
+            schema = self._writer.register_schema(name, "ros2msg", text.encode())
+            self._schemas[name, text] = schema
+        return self._writer.register_channel(topic, "cdr", schema, {_ROS2: "", **metadata})
 
 
-def _encode_log(vehicle: str, message: LogMessage, time_ns: int) -> bytes:
+def _times_of(logged: _Logged) -> _Times:
+    published = logged.message.timestamp * 1000
+    return _Times(logged.logged, min(published, _LATEST))
+
+
+def _log_payload(vehicle: str, message: LogMessage, time_ns: int) -> bytes:
     """Encode a vehicle's log message as the CDR payload of _LOG_TYPE."""
     seconds = min(time_ns // 10**9, 2**31 - 1)
     body = struct.pack("<iIB", seconds, time_ns % 10**9, _LOG_LEVELS[message.severity])
@@ -275,11 +320,12 @@ class _AppendFile:
 
     def __init__(self, path: Path) -> None:
         self.raw = path.open("xb", buffering=0)
-        self._pending, self._offset = bytearray(), 0
+        self._pending = bytearray()
+        self._offset = 0
 
     def write(self, data: bytes) -> int:
         self._pending += data
-        if len(self._pending) > _MAX_PENDING_BYTES:
+        if len(self._pending) > limits.PENDING_BYTES:
             self.sync()
         return len(data)
 
@@ -307,5 +353,8 @@ class _AppendFile:
 
     def _write_at_offset(self, data: bytes) -> None:
         rest = memoryview(data)
+        offset = self._offset
         while rest:
-            rest = rest[os.pwrite(self.raw.fileno(), rest, self._offset + len(data) - len(rest)) :]
+            written = os.pwrite(self.raw.fileno(), rest, offset)
+            offset += written
+            rest = rest[written:]

@@ -13,7 +13,7 @@ EV_BITS: Final = {"position": 1, "height": 2, "velocity": 4, "yaw": 8}
 _MIN_RATE: Final = 5.0  # Hz; EKF2 starts to fuse if two samples are less than 200 ms apart
 # s between time_usec and its arrival, beyond which EKF2's buffer does not take a message
 _OLD: Final = 0.2
-_MAX_ERROR: Final = 1e-5  # of the norm of q
+_NORM_TOLERANCE: Final = 1e-5  # of q
 USELESS_VARIANCE: Final = 1e4  # m^2; such a measurement has no effect
 _LARGE_RATIO: Final = 20.0  # of a yaw in another order or frame; noise has less
 
@@ -97,11 +97,14 @@ def cause_of(name: str, states: Mapping[str, State], ratio: float, echo: Echo) -
         return ""
     if not echo.is_echoed:
         return _cause_without_echo(name, states, ratio, echo)
-    if wrong := _wrong_field(name, echo):
+    wrong = _wrong_field(name, echo)
+    if wrong:
         return wrong
     if state == "rejected":
         return _cause_of_rejection(name, states, ratio)
-    return "" if state == "unknown" else _cause_of_disuse(name, states, echo)
+    if state == "unknown":
+        return ""
+    return _cause_of_disuse(name, states, echo)
 
 
 def _cause_of_disuse(name: str, states: Mapping[str, State], echo: Echo) -> str:
@@ -144,7 +147,7 @@ def _wrong_field(name: str, echo: Echo) -> str:
     if name == "yaw":
         if math.isnan(echo.norm_error):
             wrong = Cause.NO_ATTITUDE
-        elif echo.norm_error > _MAX_ERROR:
+        elif echo.norm_error > _NORM_TOLERANCE:
             wrong = Cause.QUATERNION
     elif name == "velocity" and not echo.velocity_frame:
         wrong = Cause.VELOCITY_FRAME

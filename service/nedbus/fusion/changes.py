@@ -38,20 +38,16 @@ def fusion_changes(
         vehicle = vehicles.setdefault(sample.vehicle, _Vehicle())
         if not vehicle.tracker.add_sample(sample):
             continue
-        report = vehicle.tracker.fusion(
-            sample.vehicle, None if sent is None else sent.get(sample.vehicle)
-        )
-        state = (
-            [(quantity.state, quantity.cause) for quantity in report.quantities],
-            report.remarks,
-            report.missing,
-        )
+        own = None if sent is None else sent.get(sample.vehicle)
+        report = vehicle.tracker.fusion(sample.vehicle, own)
+        quantities = [(quantity.state, quantity.cause) for quantity in report.quantities]
+        state = (quantities, report.remarks, report.missing)
         now = vehicle.tracker.now / 1e6
         if state != vehicle.changed:
-            vehicle.changed, vehicle.since = state, now
+            vehicle.changed = state
+            vehicle.since = now
         is_open = any(quantity.state == "unknown" for quantity in report.quantities)
-        if state != vehicle.reported and now - vehicle.since >= (
-            _UNDECIDED if is_open else _SETTLED
-        ):
+        needed = _UNDECIDED if is_open else _SETTLED
+        if state != vehicle.reported and now - vehicle.since >= needed:
             vehicle.reported = state
             yield now, report

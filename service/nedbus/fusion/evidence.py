@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
+from nedbus import limits
 from nedbus.samples import PositionStatus, Sample
 from nedbus_msgs import FieldReader
 
@@ -34,8 +35,13 @@ VISION_TOPICS: Final = (*AID_TOPICS, _ECHO, _MOCAP)
 """Topics that a vehicle publishes only while it receives an external position."""
 
 FUSION_TOPICS: Final = (
-    *VISION_TOPICS, _FLAGS, SELECTOR, _ESTIMATE, _BIAS, _TEXT,
-)  # fmt: skip
+    *VISION_TOPICS,
+    _FLAGS,
+    SELECTOR,
+    _ESTIMATE,
+    _BIAS,
+    _TEXT,
+)
 """Topics that a FusionTracker uses."""
 
 _PERIODIC: Final = frozenset(FUSION_TOPICS) - {_MOCAP, SELECTOR, _TEXT}
@@ -50,7 +56,6 @@ _REBOOT: Final = 1_000_000  # us back in time
 _PAUSE: Final = 10_000_000  # us ahead, more than between any two messages
 _AHEAD: Final = 500_000  # us
 _LARGE_BIAS: Final = 1.0  # m
-_MAX_MESSAGES: Final = 400  # in the window
 _UNSUPPORTED: Final = "ODOMETRY: unsupported"  # PX4's text
 
 _read_aid: Final = FieldReader(
@@ -82,13 +87,23 @@ class _Received(NamedTuple):
 _read_received: Final = FieldReader(_Received._fields)
 
 
+class _Use(NamedTuple):
+    """What EKF2 did with one measurement."""
+
+    time: int
+    is_fused: bool
+    is_rejected: bool
+
+
+def _recent_uses() -> deque[_Use]:
+    return deque(maxlen=limits.FUSION_MESSAGES)
+
+
 @dataclass(slots=True)
 class _Aid:
-    """Messages of one quantity in the window: (time, fused, rejected); and its state."""
+    """Messages of one quantity in the window, and its state."""
 
-    recent: deque[tuple[int, bool, bool]] = field(
-        default_factory=lambda: deque(maxlen=_MAX_MESSAGES)
-    )
+    recent: deque[_Use] = field(default_factory=_recent_uses)
     ratio: float = math.nan
     first: int = 0  # of the messages that follow a silence [us]
     state: State = "unknown"
@@ -109,17 +124,18 @@ class FusionTracker:
 
     def _reset(self) -> None:
         self._aids = {name: _Aid() for name in QUANTITIES}
-        self._echo_times: deque[int] = deque(maxlen=_MAX_MESSAGES)
+        self._echo_times: deque[int] = deque(maxlen=limits.FUSION_MESSAGES)
         self._changes: deque[int] = deque(maxlen=_CONFIRMED)  # times at which reset_counter changed
         self._received: _Received | None = None  # the last message of _ECHO
-        self._mocap = self._unsupported = 0  # time of the last one
+        self._mocap = 0  # time of the last one
+        self._unsupported = 0  # time of the last one
         self._newest_sample = 0  # the largest timestamp_sample since boot
         self._ahead = 0.0  # how far it was ahead when it arrived [s]
         self._flags: dict[str, bool] = {}
         self._has_aids = False
         self._eph = math.nan
         self._is_valid: bool | None = None  # xy_valid of the estimate
-        self._bias = math.nan, math.nan
+        self._bias = (math.nan, math.nan)
 
     def add_sample(self, sample: Sample[Any]) -> bool:
         """Add a sample; return False for one from before the subscription, of which only the EKF in use counts."""
@@ -146,12 +162,14 @@ class FusionTracker:
             self._flags = {name: bool(value) for name, value in values.items() if value is not None}
         elif topic == _ESTIMATE:
             _, eph, is_valid = _read_estimate(message)
-            self._eph, self._is_valid = _number(eph), bool(is_valid)
+            self._eph = _number(eph)
+            self._is_valid = bool(is_valid)
         elif topic == _BIAS:
             self._add_bias(message)
         elif topic == SELECTOR:
-            primary = _read_primary(message)[1]
-            self.primary = primary if isinstance(primary, int) else self.primary
+            _, primary = _read_primary(message)
+            if isinstance(primary, int):
+                self.primary = primary
         elif topic == _TEXT and _UNSUPPORTED in str(_read_text(message)[1]):
             self._unsupported = time
         self._update()
@@ -165,7 +183,8 @@ class FusionTracker:
         was_odd = self._is_odd
         self._is_odd = is_odd and bool(self.now)
         if not self._is_odd:
-            self.now = max(self.now, time) if topic in _PERIODIC else self.now
+            if topic in _PERIODIC:
+                self.now = max(self.now, time)
             return True
         if was_odd:
             if time < self.now:
@@ -175,71 +194,82 @@ class FusionTracker:
 
     def _add_aid(self, topic: str, message: object) -> None:
         time, fused, rejected, ratio, instance = _read_aid(message)
-        name = next((name for name, short in QUANTITIES.items() if topic == f"{_AID}{short}"), None)
+        name = _NAMES.get(topic)
         if name is None or (instance is not None and instance != self.primary):
             return
         self._has_aids = True
         aid = self._aids[name]
-        if not aid.recent or time - aid.recent[-1][0] > _SILENCE:
+        if not aid.recent or time - aid.recent[-1].time > _SILENCE:
             aid.recent.clear()
             aid.first = time
-        aid.recent.append((time, bool(fused), bool(rejected)))
+        aid.recent.append(_Use(time, bool(fused), bool(rejected)))
         aid.ratio = _largest(ratio)
 
     def _add_echo(self, message: object) -> None:
         before = self._received
-        self._received = received = _Received._make(_read_received(message))
-        time, sample = received.timestamp, received.timestamp_sample
+        received = _Received._make(_read_received(message))
+        self._received = received
+        time = received.timestamp
+        sample = received.timestamp_sample
         if self._echo_times and time - self._echo_times[-1] > _SILENCE:
             self._echo_times.clear()
         self._echo_times.append(time)
         if before is not None and before.reset_counter != received.reset_counter:
             self._changes.append(time)
         if isinstance(sample, int) and sample > self._newest_sample:
-            self._newest_sample, self._ahead = sample, (sample - time) / 1e6
+            self._newest_sample = sample
+            self._ahead = (sample - time) / 1e6
 
     def _add_bias(self, message: object) -> None:
-        bias = _read_bias(message)[1]
+        _, bias = _read_bias(message)
         if isinstance(bias, tuple | list) and len(bias) >= 2:
-            self._bias = _number(bias[0]), _number(bias[1])
+            self._bias = (_number(bias[0]), _number(bias[1]))
 
     def _update(self) -> None:
         """Set the state of each quantity, and since when it holds."""
         for name, aid in self._aids.items():
             state, since = self._state_of(name, aid)
             if state != aid.state:
-                aid.state, aid.since = state, since
+                aid.state = state
+                aid.since = since
 
     def _state_of(self, name: str, aid: _Aid) -> tuple[State, int]:
-        while aid.recent and aid.recent[0][0] < self.now - _WINDOW:
-            aid.recent.popleft()
-        if not aid.recent or self.now - aid.recent[-1][0] > _SILENCE:
+        recent = aid.recent
+        while recent and recent[0].time < self.now - _WINDOW:
+            recent.popleft()
+        if not recent or self.now - recent[-1].time > _SILENCE:
             return self._state_without_aid(name)
-        last = [*aid.recent][-_CONFIRMED:]  # what EKF2 does now
-        rejected = [time for time, _, is_rejected in aid.recent if is_rejected]
-        if len(rejected) >= max(_CONFIRMED, _REJECTED_SHARE * len(aid.recent)):
+        rejected = [use.time for use in recent if use.is_rejected]
+        if len(rejected) >= max(_CONFIRMED, _REJECTED_SHARE * len(recent)):
             return "rejected", rejected[0]
-        if last[-1][1]:
-            return "fused", next(time for time, is_fused, _ in aid.recent if is_fused)
-        if any(is_fused for _, is_fused, _ in last):
+        if recent[-1].is_fused:
+            first = next(use.time for use in recent if use.is_fused)
+            return "fused", first
+        is_undecided = any(use.is_fused for use in [*recent][-_CONFIRMED:])
+        if is_undecided:
             return aid.state, aid.since
-        if aid.recent[-1][0] - aid.first < _START and aid.state in ("unknown", "not received"):
+        is_starting = recent[-1].time - aid.first < _START
+        if is_starting and aid.state in ("unknown", "not received"):
             return "unknown", self.now
         return "not used", aid.first
 
     def _state_without_aid(self, name: str) -> tuple[State, int]:
         """Return the state of a quantity whose measurements EKF2 does not report."""
         is_echoed = bool(self._echo_times) and self._is_recent(self._echo_times[-1])
-        is_refused = self._is_recent(self._mocap) or self._is_recent(self._unsupported, _TEXT_TIME)
-        if self._aids[name].state == "unknown" and not (is_echoed or is_refused):
-            return "unknown", self.now
-        if is_echoed and self.now - self._echo_times[0] < _SILENCE:
-            return "unknown", self.now
-        if is_echoed and not self._has_aids:
-            if name not in self._flags or self.now - self._echo_times[0] < _FLAGS_LATE:
+        if not is_echoed:
+            is_refused = self._is_recent(self._mocap)
+            is_refused |= self._is_recent(self._unsupported, _TEXT_TIME)
+            if self._aids[name].state == "unknown" and not is_refused:
                 return "unknown", self.now
-            return ("fused" if self._flags[name] else "not used"), self.now
-        return "not received", self.now
+            return "not received", self.now
+        age = self.now - self._echo_times[0]
+        if age < _SILENCE:
+            return "unknown", self.now
+        if self._has_aids:
+            return "not received", self.now
+        if name not in self._flags or age < _FLAGS_LATE:
+            return "unknown", self.now
+        return ("fused" if self._flags[name] else "not used"), self.now
 
     def _is_recent(self, time: int, limit: int = _SILENCE) -> bool:
         return bool(time) and self.now - time <= limit
@@ -251,15 +281,26 @@ class FusionTracker:
         quantities = []
         for name, aid in self._aids.items():
             cause = cause_of(name, states, aid.ratio, echo)
-            since = aid.since / 1e6 if aid.since and aid.state != "unknown" else None
+            since = None
+            if aid.since and aid.state != "unknown":
+                since = aid.since / 1e6
             quantities.append(QuantityFusion(name, aid.state, since, aid.ratio, cause))
         variance = math.nan
-        if echo.is_echoed and self._received is not None and self._received.position_variance:
-            variance = _number(self._received.position_variance[0])
+        received = self._received
+        if echo.is_echoed and received is not None and received.position_variance:
+            variance = _number(received.position_variance[0])
+        remarks = self._remarks(states, variance, is_sent=bool(echo.is_sent))
         return Fusion(
-            vehicle, tuple(quantities), sent, echo.rate, self._eph, variance, self._bias,
-            tuple(self._remarks(states, variance, is_sent=bool(echo.is_sent))), tuple(self._missing(echo)),
-        )  # fmt: skip
+            vehicle=vehicle,
+            quantities=tuple(quantities),
+            sent=sent,
+            echoed=echo.rate,
+            eph=self._eph,
+            variance=variance,
+            bias=self._bias,
+            remarks=tuple(remarks),
+            missing=tuple(self._missing(echo)),
+        )
 
     def diagnosis(self, topic: str) -> str:
         """Return why what a topic reports is not fused, without the remedy; "" if nothing explains it.
@@ -269,8 +310,9 @@ class FusionTracker:
         name = _NAMES.get(topic)
         if name is None:
             return ""
-        states: Mapping[str, State] = {each: aid.state for each, aid in self._aids.items()}
-        cause = cause_of(name, states, self._aids[name].ratio, self._describe_echo(None))
+        states: dict[str, State] = {own: aid.state for own, aid in self._aids.items()}
+        echo = self._describe_echo(None)
+        cause = cause_of(name, states, self._aids[name].ratio, echo)
         return cause.partition(": ")[0]
 
     def _describe_echo(self, sent: PositionStatus | None) -> Echo:
@@ -283,20 +325,31 @@ class FusionTracker:
         age = 0.0
         if received.timestamp_sample:
             age = (received.timestamp - received.timestamp_sample) / 1e6
-        times = [each for each in self._echo_times if each >= self.now - _WINDOW - _SILENCE]
-        rate = (
-            (len(times) - 1) / max(1e-6, (times[-1] - times[0]) / 1e6)
-            if len(times) > 1
-            else math.nan
-        )
         is_ahead = self._newest_sample > self.now + _AHEAD
         is_counting = len(self._changes) == _CONFIRMED and self._changes[0] > self.now - _WINDOW
         return Echo(
-            is_echoed=True, is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent, rate=rate,
-            pose_frame=received.pose_frame, velocity_frame=received.velocity_frame,
-            has_velocity=_is_known(received.velocity), norm_error=_norm_error(received.q), age=age,
-            ahead=self._ahead if is_ahead else 0.0, counts_messages=is_counting, quality=received.quality,
-        )  # fmt: skip
+            is_echoed=True,
+            is_mocap=is_mocap,
+            is_type_unsupported=is_unsupported,
+            is_sent=is_sent,
+            rate=self._echo_rate(),
+            pose_frame=received.pose_frame,
+            velocity_frame=received.velocity_frame,
+            has_velocity=_is_known(received.velocity),
+            norm_error=_norm_error(received.q),
+            age=age,
+            ahead=self._ahead if is_ahead else 0.0,
+            counts_messages=is_counting,
+            quality=received.quality,
+        )
+
+    def _echo_rate(self) -> float:
+        """Return how many messages PX4 received per second, NaN before the second one."""
+        times = [time for time in self._echo_times if time >= self.now - _WINDOW - _SILENCE]
+        if len(times) < 2:
+            return math.nan
+        period = (times[-1] - times[0]) / 1e6
+        return (len(times) - 1) / max(1e-6, period)
 
     def _remarks(self, states: Mapping[str, State], variance: float, *, is_sent: bool) -> list[str]:
         remarks = []
@@ -328,9 +381,8 @@ def _number(value: object) -> float:
 
 def _largest(ratio: object) -> float:
     """Return the largest test ratio of all axes; NaN if one is NaN."""
-    values = (
-        [_number(each) for each in ratio] if isinstance(ratio, tuple | list) else [_number(ratio)]
-    )
+    axes = ratio if isinstance(ratio, tuple | list) else [ratio]
+    values = [_number(axis) for axis in axes]
     if any(map(math.isnan, values)):
         return math.nan
     return max(values, default=math.nan)
@@ -342,4 +394,6 @@ def _is_known(values: object) -> bool:
 
 def _norm_error(q: object) -> float:
     """Return the error of the norm of q, NaN if it is unknown."""
-    return abs(math.hypot(*q) - 1) if isinstance(q, tuple | list) else math.nan
+    if not isinstance(q, tuple | list):
+        return math.nan
+    return abs(math.hypot(*q) - 1)

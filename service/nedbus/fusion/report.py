@@ -61,9 +61,8 @@ class Fusion:
     @property
     def causes(self) -> tuple[str, ...]:
         """The causes of all quantities, each once."""
-        return tuple(
-            dict.fromkeys(quantity.cause for quantity in self.quantities if quantity.cause)
-        )
+        causes = [quantity.cause for quantity in self.quantities if quantity.cause]
+        return tuple(dict.fromkeys(causes))
 
     @property
     def lines(self) -> Sequence[str]:
@@ -72,12 +71,10 @@ class Fusion:
         if self.sent is not None:
             lines.append(f"sent: {self.sent.text}{self._delay_to_set}")
         lines += self._states
-        return [
-            *lines,
-            self._numbers,
-            *self.remarks,
-            *(f"not in the data: {each}" for each in self.missing),
-        ]
+        lines.append(self._numbers)
+        lines += self.remarks
+        lines += [f"not in the data: {evidence}" for evidence in self.missing]
+        return lines
 
     @property
     def _delay_to_set(self) -> str:
@@ -105,12 +102,9 @@ class Fusion:
 
     @property
     def _numbers(self) -> str:
-        rate = (
-            "no message from PX4 shows what it received"
-            if math.isnan(self.echoed)
-            else f"PX4 receives {self.echoed:.1f} Hz"
-        )
-        parts = [rate]
+        parts = ["no message from PX4 shows what it received"]
+        if not math.isnan(self.echoed):
+            parts = [f"PX4 receives {self.echoed:.1f} Hz"]
         if not math.isnan(self.variance):
             parts.append(f"with a deviation of {math.sqrt(self.variance):.2g} m")
         if not math.isnan(self.eph):

@@ -23,10 +23,17 @@ from nedbus.extras import lazy_exports
 from .arrivals import arrivals
 from .axis import Axis
 from .order import Order
-from .pace import MAX_PAUSE, Pace
-from .reboots import REORDER_WINDOW, RebootDetector, RebootSign
+from .pace import SKIPPED_PAUSE, Pace
+from .reboots import RebootDetector, RebootSign
 from .utc_offset import UTC_COLUMNS, UtcOffset, provides_utc, to_unix_ns, unix_seconds, utc_text
-from .vehicle_clock import Reading, RecentTimes, TimeKind, VehicleClock, is_boot_possible
+from .vehicle_clock import (
+    REORDER_WINDOW,
+    Reading,
+    RecentTimes,
+    TimeKind,
+    VehicleClock,
+    is_boot_possible,
+)
 
 if TYPE_CHECKING:
     from .utc_estimate import UtcEstimate, to_datetime64

@@ -17,9 +17,11 @@ def arrivals(records: Iterable[_T], time_of: Callable[[_T], int]) -> Iterator[tu
     held: _T | None = None
     for record in records:
         if held is not None:
-            time, following = time_of(held), time_of(record)
-            if last is None or time <= last + _SLACK or following >= time - _SLACK:
-                now += 0 if last is None else max(0, time - last)
+            time = time_of(held)
+            is_wild = last is not None and time > last + _SLACK and time > time_of(record) + _SLACK
+            if not is_wild:
+                if last is not None:
+                    now += max(0, time - last)
                 last = time
             yield now / 1e6, held
         held = record

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from collections import defaultdict
+from itertools import pairwise
 from operator import attrgetter
 from typing import Final, NamedTuple
 
@@ -47,9 +48,9 @@ class Axis:
         parts = self._parts.get(vehicle)
         if not parts:
             return None
-        ends = [each.begin for each in parts[1:]]
-        for part, end in zip(parts, [*ends, None], strict=True):
+        for part, following in pairwise(parts):
             place = part.base + stamp
-            if end is None or part.begin <= place < end:
+            if part.begin <= place < following.begin:
                 return (place - self.zero) / 1e6
-        return None
+        place = parts[-1].base + stamp
+        return (place - self.zero) / 1e6

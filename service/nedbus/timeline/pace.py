@@ -2,8 +2,8 @@
 
 from typing import Final
 
-MAX_PAUSE: Final = 60.0
-"""Longest pause of a replay [s]; a longer one takes no time."""
+SKIPPED_PAUSE: Final = 60.0
+"""A longer pause of a replay takes no time [s]."""
 
 
 class Pace:
@@ -21,7 +21,7 @@ class Pace:
     def publish_at(self, at: float) -> float:
         """Return when to publish the message at a time on the axis [s], as seconds since the first message."""
         step = at - self._last
-        if step > MAX_PAUSE:
+        if step > SKIPPED_PAUSE:
             self.skipped += 1
         elif step > 0:
             self._due += step

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from enum import Enum
-from typing import Final
 
-from .vehicle_clock import is_boot_possible
-
-REORDER_WINDOW: Final = 1_000_000
-"""Step back in time [us] that reordering explains."""
+from .vehicle_clock import REORDER_WINDOW, is_boot_possible
 
 
 class RebootSign(Enum):
@@ -40,7 +36,13 @@ class RebootDetector:
         self._suspected: Hashable = None  # the stream of the first message
 
     def add(
-        self, stream: Hashable, time: int, *, before: int, other: int, elapsed: float
+        self,
+        stream: Hashable,
+        time: int,
+        *,
+        before: int,
+        other: int,
+        elapsed: float,
     ) -> RebootSign:
         """Return what a message shows.
 
@@ -51,7 +53,8 @@ class RebootDetector:
         if self._suspected is None:
             if not is_earlier or not is_boot_possible(time, elapsed):
                 return RebootSign.NONE
-            self._suspected, self.before = stream, before
+            self._suspected = stream
+            self.before = before
             return RebootSign.FIRST
         is_same_stream = stream == self._suspected
         is_back = time >= self.before - REORDER_WINDOW

@@ -37,18 +37,20 @@ class UtcOffset:
 
     def at(self, timestamp: int) -> datetime:
         """Return the UTC of a `timestamp` from the same boot of this vehicle; Unix time is used as it is."""
-        return datetime.fromtimestamp(0, UTC) + timedelta(
-            microseconds=int(self.unix_us(int(timestamp)))
-        )
+        unix = int(self.unix_us(int(timestamp)))
+        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=unix)
 
     def unix_us(self, timestamps: Any) -> Any:
         """Return the Unix time [us] of a timestamp or an array of timestamps."""
-        return timestamps + self.offset_us * (1 - is_unix_time(timestamps))
+        is_since_boot = 1 - is_unix_time(timestamps)  # also of an array
+        return timestamps + self.offset_us * is_since_boot
 
 
 def to_unix_ns(time: int, boot_utc: int) -> int:
     """Return a time of a file [us], Unix time or since the boot at `boot_utc` (0 if unknown), in nanoseconds."""
-    return 1000 * (time if is_unix_time(time) else time + boot_utc)
+    if is_unix_time(time):
+        return 1000 * time
+    return 1000 * (time + boot_utc)
 
 
 def unix_seconds(time: float, offset: float | None) -> float | None:
@@ -58,8 +60,10 @@ def unix_seconds(time: float, offset: float | None) -> float | None:
     """
     if is_unix_time(time * 1e6):
         return time
-    unix = None if offset is None else time + offset
-    return unix if unix is not None and is_unix_time(unix * 1e6) else None
+    if offset is None:
+        return None
+    unix = time + offset
+    return unix if is_unix_time(unix * 1e6) else None
 
 
 def utc_text(times: Sequence[float]) -> str:
@@ -67,7 +71,8 @@ def utc_text(times: Sequence[float]) -> str:
     first, last = times
     if not is_unix_time(first * 1e6):
         return f"{first:.1f} to {last:.1f} s"
-    begin, end = (datetime.fromtimestamp(time, UTC) for time in times)
+    begin = datetime.fromtimestamp(first, UTC)
+    end = datetime.fromtimestamp(last, UTC)
     return f"{begin:%Y-%m-%d %H:%M:%S} to {end:%H:%M:%S} UTC"
 
 

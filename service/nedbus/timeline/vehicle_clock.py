@@ -6,19 +6,19 @@ from collections.abc import Hashable
 from enum import Enum
 from typing import Final, NamedTuple
 
+from nedbus import limits
 from nedbus_msgs import is_unix_time
 
-# us by which a message of a current stream may be older than the newest one
-_MAX_LATE: Final = 1_000_000
+REORDER_WINDOW: Final = 1_000_000
+"""Step back in time [us] that reordering explains."""
+
 # us by which a time since boot may exceed the time that passed: delays of a link
 _MARGIN: Final = 2_000_000
-_MAX_STREAMS: Final = 1000  # bounds the memory that a peer can use
-_MAX_REMEMBERED: Final = 512  # times of each stream that are known, to find copies
-_MAX_DOUBT: Final = 1.0  # s without a current message after which one stream is enough
+_DOUBT: Final = 1.0  # s without a current message after which one stream is enough
 # s without a current message after which another clock counts, possible or not
-_MAX_OTHER: Final = 10.0
+_OTHER_CLOCK: Final = 10.0
 # us by which a second link may be behind; the same time, later, is another boot
-_MAX_DELAY: Final = 10_000_000
+_LINK_DELAY: Final = 10_000_000
 _UNKNOWN_PAUSE: Final = 60_000_000  # us that may have passed if the arrival time is unknown
 
 
@@ -53,7 +53,7 @@ def is_boot_possible(time: int, elapsed: float | None) -> bool:
 
 
 class RecentTimes:
-    """The last 512 times of each stream, of up to 1000 streams."""
+    """The last times of each stream: `limits.KNOWN_TIMES` of up to `limits.VEHICLE_STREAMS`."""
 
     def __init__(self) -> None:
         self._times: dict[Hashable, OrderedDict[int, None]] = {}
@@ -66,11 +66,11 @@ class RecentTimes:
         """Add the time of a message."""
         times = self._times.get(stream)
         if times is None:
-            if len(self._times) >= _MAX_STREAMS:
+            if len(self._times) >= limits.VEHICLE_STREAMS:
                 return
             times = self._times[stream] = OrderedDict()
         times[time] = None
-        if len(times) > _MAX_REMEMBERED:
+        if len(times) > limits.KNOWN_TIMES:
             times.popitem(last=False)
 
 
@@ -91,7 +91,8 @@ class VehicleClock:
 
     def __init__(self, modulus: int | None = None) -> None:
         self.newest: int | None = None
-        self.boot = self.copies = 0
+        self.boot = 0
+        self.copies = 0
         self._modulus = modulus
         self._arrived: float | None = None  # time at which the newest message arrived
         self._ahead = math.inf  # time in the last message, if it was too far ahead [us]
@@ -107,13 +108,13 @@ class VehicleClock:
         time = self.unwrap(time, now)
         if self._known.contains(stream, time) and self._is_delay(self.newest - time, now):
             self.copies += 1
-            if time >= self.newest - _MAX_LATE:
+            if time >= self.newest - REORDER_WINDOW:
                 self._older.clear()  # a current message: the vehicle continues to run
             return Reading(TimeKind.COPY, time, self.boot)
         last = self._last.get(stream, time)
-        if stream in self._last or len(self._last) < _MAX_STREAMS:
+        if stream in self._last or len(self._last) < limits.VEHICLE_STREAMS:
             self._last[stream] = time
-        if time >= self.newest - _MAX_LATE:
+        if time >= self.newest - REORDER_WINDOW:
             return self._add_current(stream, time, self.newest, now)
         return self._add_older(stream, time, last, self.newest, now)
 
@@ -126,7 +127,13 @@ class VehicleClock:
         """Discard the signs of a reboot, because something else shows that the vehicle continues to run."""
         self._older.clear()
 
-    def _add_current(self, stream: Hashable, time: int, newest: int, now: float | None) -> Reading:
+    def _add_current(
+        self,
+        stream: Hashable,
+        time: int,
+        newest: int,
+        now: float | None,
+    ) -> Reading:
         if self._is_wild(time, newest, now):
             return Reading(TimeKind.WILD, time, self.boot)
         is_step = bool(is_unix_time(time)) != bool(is_unix_time(newest))
@@ -137,30 +144,51 @@ class VehicleClock:
         return Reading(TimeKind.STEP if is_step else TimeKind.NEW, time, self.boot)
 
     def _add_older(
-        self, stream: Hashable, time: int, last: int, newest: int, now: float | None
+        self,
+        stream: Hashable,
+        time: int,
+        last: int,
+        newest: int,
+        now: float | None,
     ) -> Reading:
-        if time < last - _MAX_LATE:
+        if time < last - REORDER_WINDOW:
             self._older.setdefault(stream, math.inf if now is None else now)
-        is_confirmed = len(self._older) >= min(2, len(self._last))
-        doubt = 0.0 if now is None else max(0.0, now - min(self._older.values(), default=now))
-        elapsed = self._elapsed(now)
-        is_synchronised = bool(is_unix_time(time)) and bool(is_unix_time(newest))
-        if is_synchronised or is_boot_possible(time, elapsed):
-            is_other = bool(self._older) and (is_confirmed or doubt >= _MAX_DOUBT)
-        else:
-            is_other = doubt >= _MAX_OTHER
-        if is_other:
+        if self._is_other_clock(time, newest, now):
             kind = TimeKind.STEP if is_unix_time(time) else TimeKind.REBOOT
             return self._begin(stream, time, now, kind)
         self._known.add(stream, time)
         return Reading(TimeKind.LATE, time, self.boot)
 
-    def _begin(self, stream: Hashable, time: int, now: float | None, kind: TimeKind) -> Reading:
+    def _is_other_clock(self, time: int, newest: int, now: float | None) -> bool:
+        """Return whether a message older than the newest one, and those before it, are on another clock."""
+        doubt = self._doubt(now)
+        is_synchronised = bool(is_unix_time(time)) and bool(is_unix_time(newest))
+        if not is_synchronised and not is_boot_possible(time, self._elapsed(now)):
+            return doubt >= _OTHER_CLOCK
+        if not self._older:
+            return False
+        is_confirmed = len(self._older) >= min(2, len(self._last))
+        return is_confirmed or doubt >= _DOUBT
+
+    def _doubt(self, now: float | None) -> float:
+        """Return since when streams are older than before, without a current message [s]."""
+        if now is None or not self._older:
+            return 0.0
+        return max(0.0, now - min(self._older.values()))
+
+    def _begin(
+        self,
+        stream: Hashable,
+        time: int,
+        now: float | None,
+        kind: TimeKind,
+    ) -> Reading:
         if kind is TimeKind.REBOOT:
             self.boot += 1
             if self._modulus:
                 time %= self._modulus
-        self.newest, self._arrived = time, now
+        self.newest = time
+        self._arrived = now
         self._ahead = math.inf
         self._last = {stream: time}
         self._older.clear()
@@ -170,8 +198,8 @@ class VehicleClock:
 
     def _is_delay(self, late: int, now: float | None) -> bool:
         """Return whether the delay of a link explains a message that is this late [us]."""
-        elapsed = self._elapsed(now)
-        return late + 1e6 * (elapsed or 0.0) <= _MAX_DELAY
+        elapsed = self._elapsed(now) or 0.0
+        return late + 1e6 * elapsed <= _LINK_DELAY
 
     def _elapsed(self, now: float | None) -> float | None:
         if now is None or self._arrived is None:
@@ -194,12 +222,14 @@ class VehicleClock:
         if begin and newest - before <= _UNKNOWN_PAUSE:
             return before  # a late message from before the wrap
         is_reboot = same > newest + passed and time <= passed
-        return time if is_reboot or same < newest - _UNKNOWN_PAUSE else same
+        if is_reboot or same < newest - _UNKNOWN_PAUSE:
+            return time
+        return same
 
     def _is_wild(self, time: int, newest: int, now: float | None) -> bool:
         """Return whether a time is too far ahead, and the message before does not confirm it."""
-        elapsed = self._elapsed(now)
-        passed = 0.0 if elapsed is None else 1e6 * elapsed
+        elapsed = self._elapsed(now) or 0.0
+        passed = 1e6 * elapsed
         is_ahead = time > newest + passed + _UNKNOWN_PAUSE
         is_confirmed = 0 <= time - self._ahead <= _UNKNOWN_PAUSE
         self._ahead = time if is_ahead else math.inf

@@ -1,7 +1,7 @@
 """Vehicle events and their possible causes, derived from live or recorded messages; no I/O."""
 
 from .event import ALL, WINDOW, Condition, Event, State
-from .event_log import KEPT, MAX_VEHICLES, EventLog
+from .event_log import EventLog
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import (
@@ -22,7 +22,27 @@ from .verdict import Verdict, verdict_of
 
 # The types of events, conditions, stories and reports are in `nedbus.health`; all other names are for nedbus itself.
 __all__ = [
-    "ALL", "EVENT_TOPICS", "FIXES", "KINDS", "MODES", "RECENT", "VALID", "EventLog", "Expectation", "Kind", "Severity",
-    "State", "by_vehicle", "events_outside", "faults_of", "once_per_service", "rank_vehicle", "report_of", "spans_of",
-    "state_at", "stories_of", "story_of", "verdict_of",
-]  # fmt: skip
+    "ALL",
+    "EVENT_TOPICS",
+    "FIXES",
+    "KINDS",
+    "MODES",
+    "RECENT",
+    "VALID",
+    "EventLog",
+    "Expectation",
+    "Kind",
+    "Severity",
+    "State",
+    "by_vehicle",
+    "events_outside",
+    "faults_of",
+    "once_per_service",
+    "rank_vehicle",
+    "report_of",
+    "spans_of",
+    "state_at",
+    "stories_of",
+    "story_of",
+    "verdict_of",
+]

@@ -5,25 +5,38 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
+from nedbus import limits
 from nedbus_msgs.frames import MapProjection
 
 from . import rules
 from .detectors import ChangeDetector, Detection, Finding, detect_nothing, read_fields
 
 AIR_DATA: Final = "vehicle_air_data"
-_GNSS: Final = (
-    "GNSS",
-    ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv"),
+
+
+class Reference(NamedTuple):
+    """The instrument of a topic with independent measurements, and its fields."""
+
+    instrument: str
+    fields: tuple[str, ...]
+
+
+_GNSS: Final = Reference(
+    "GNSS", ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv")
 )
 REFERENCES: Final = {
-    "vehicle_gps_position": _GNSS, "sensor_gps": _GNSS, AIR_DATA: ("barometer", ("baro_alt_meter", "baro_device_id")),
-    "vehicle_local_position_groundtruth": ("ground truth", ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")),
-}  # fmt: skip
-"""Topics with independent measurements, each with its instrument and its fields."""
+    "vehicle_gps_position": _GNSS,
+    "sensor_gps": _GNSS,
+    AIR_DATA: Reference("barometer", ("baro_alt_meter", "baro_device_id")),
+    "vehicle_local_position_groundtruth": Reference(
+        "ground truth", ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")
+    ),
+}
+"""Topics with independent measurements."""
 
 _ESTIMATE: Final = (
     "x",
@@ -42,10 +55,9 @@ _ESTIMATE: Final = (
 _INTERVAL: Final = 400_000
 # us by which comparisons follow the estimate: topics are written and sent in any order
 _DELAY: Final = 500_000
-_MAX_STEP: Final = 500_000  # us between the estimates before and after a measurement
+# us between the estimates before and after a measurement; it is not compared with those further apart
+_ADJACENT: Final = 500_000
 _FRESH: Final = 1_500_000  # us for which a comparison is valid
-_MAX_WAITING: Final = 100  # measurements; bounds the memory that a peer can use
-_MAX_ESTIMATES: Final = 1000
 _TWO_G: Final = 19.6  # m/s^2
 
 
@@ -53,22 +65,26 @@ class ReferenceDetector(ChangeDetector):
     """Detector for a topic in REFERENCES: collects its measurements, and runs the topic's `own` detection."""
 
     def __init__(self, topic: str, comparison: Comparison, own: Detection | None) -> None:
-        self._name, fields = REFERENCES[topic]
-        super().__init__(*(own or (fields, (), detect_nothing)))
-        self._read_reference = read_fields(fields, math.nan)
+        reference = REFERENCES[topic]
+        if own is None:
+            own = Detection(reference.fields, (), detect_nothing)
+        super().__init__(*own)
+        self._name = reference.instrument
+        self._read_reference = read_fields(reference.fields, math.nan)
         self._comparison = comparison
         self._interval = -1
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the topic's own findings, None if nothing has changed; remember the measurement."""
-        found = super().add(message, missing)
+        findings = super().add(message, missing)
         interval = self.stamp // _INTERVAL
         if interval != self._interval:
-            self._interval, values = interval, self._read_reference(message)
+            self._interval = interval
+            values = self._read_reference(message)
             # fields of AIR_DATA may have any type
             if all(isinstance(value, int | float) for value in values):
                 self._comparison.remember(_Measurement(self.stamp, self._name, values))
-        return found
+        return findings
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
@@ -113,7 +129,9 @@ class _Estimate(NamedTuple):
     @property
     def height(self) -> float:
         """Height above sea level, or above the unknown altitude of the origin [m]."""
-        return (self.altitude if self.has_origin else 0.0) - self.z
+        if self.has_origin:
+            return self.altitude - self.z
+        return -self.z
 
     @property
     def speed(self) -> float:
@@ -121,9 +139,9 @@ class _Estimate(NamedTuple):
 
     @property
     def height_limit(self) -> float:
-        return rules.HEIGHT_LIMIT + rules.HEIGHT_SHARE * (
-            0.0 if math.isnan(self.z) else abs(self.z)
-        )
+        if math.isnan(self.z):
+            return rules.HEIGHT_LIMIT
+        return rules.HEIGHT_LIMIT + rules.HEIGHT_SHARE * abs(self.z)
 
     @property
     def distance_limit(self) -> float:
@@ -146,15 +164,14 @@ class Comparison:
         self._height = _Contradiction("height")
         self._position = _Contradiction("position")
         self._origin = _Contradiction("origin")
-        # origin and first difference, by reference
-        self._offsets: dict[str, tuple[object, float]] = {}
+        self._offsets: dict[str, _Offset] = {}  # by reference
         self._waiting: list[_Measurement] = []  # by time
-        self._estimates: deque[_Message] = deque(maxlen=_MAX_ESTIMATES)
+        self._estimates: deque[_Message] = deque(maxlen=limits.COMPARED_MESSAGES)
 
     def remember(self, measurement: _Measurement) -> None:
         """Add a measurement, which is compared later."""
         insort(self._waiting, measurement)
-        if len(self._waiting) > _MAX_WAITING:  # the last ones have damaged times
+        if len(self._waiting) > limits.COMPARED_MESSAGES:  # the last ones have damaged times
             self._waiting.pop()
 
     def add_estimate(self, stamp: int, message: object, missing: frozenset[str]) -> list[Finding]:
@@ -169,41 +186,35 @@ class Comparison:
         while self._waiting and self._waiting[0].stamp <= stamp - _DELAY:
             measurement = self._waiting.pop(0)
             delay = (stamp - measurement.stamp) / 1e6
-            findings += [
-                replace(finding, age=finding.age + delay) for finding in self._compare(measurement)
-            ]
-        while estimates[0].stamp < stamp - 2 * _DELAY - _MAX_STEP:
+            changes = self._compare(measurement)
+            findings += [replace(finding, age=finding.age + delay) for finding in changes]
+        while estimates[0].stamp < stamp - 2 * _DELAY - _ADJACENT:
             estimates.popleft()
         return findings
 
     def _compare(self, measurement: _Measurement) -> list[Finding]:
         """Compare a measurement with the estimate at its time; return contradictions that begin or end."""
-        around = self._messages_around(measurement.stamp)
-        if around is None:
+        estimate = self._estimate_at(measurement.stamp)
+        if estimate is None:
             return []
-        estimate = self._interpolate(*around, measurement.stamp)
-        missing = around[0].missing | around[1].missing
-        if estimate.z_valid != 1 or "z_valid" in missing:
-            self._offsets.clear()
-            estimate = estimate._replace(z=math.nan)
-        if estimate.xy_valid != 1 or "xy_valid" in missing:
-            estimate = estimate._replace(x=math.nan, y=math.nan)
-        if measurement.name == "barometer":
-            error = self._error_of_barometer(measurement, estimate)
-        elif measurement.name == "ground truth":
-            error = self._error_of_truth(measurement, estimate)
-        else:
-            error = self._error_of_gnss(measurement, estimate)
-        name, stamp = measurement.name, measurement.stamp
+        error = self._error(measurement, estimate)
+        name = measurement.name
+        stamp = measurement.stamp
         changes = [
             self._height.update(name, stamp, error.height, error.height_limit),
             self._position.update(name, stamp, error.distance, error.distance_limit),
         ]
         if name == "GNSS" and estimate.z_global == 1 and not self._height.since:
-            changes.append(
-                self._origin.update(name, stamp, error.altitude, self._limit_of_origin(error))
-            )
+            limit = self._limit_of_origin(error)
+            changes.append(self._origin.update(name, stamp, error.altitude, limit))
         return [change for change in changes if change is not None]
+
+    def _error(self, measurement: _Measurement, estimate: _Estimate) -> _Error:
+        if measurement.name == "barometer":
+            return self._error_of_barometer(measurement, estimate)
+        if measurement.name == "ground truth":
+            return self._error_of_truth(measurement, estimate)
+        return self._error_of_gnss(measurement, estimate)
 
     def _limit_of_origin(self, error: _Error) -> float:
         """Return the limit of the origin's error [m].
@@ -214,20 +225,41 @@ class Comparison:
             return min(error.height_limit, self._origin.smallest_limit)
         return error.height_limit
 
-    def _messages_around(self, stamp: int) -> tuple[_Message, _Message] | None:
-        """Return the messages of the estimate before and after this time; None if they are far apart or missing."""
-        after = bisect_left(self._estimates, stamp, key=lambda message: message.stamp)
-        if not 0 < after < len(self._estimates):
+    def _estimate_at(self, stamp: int) -> _Estimate | None:
+        """Return the valid part of the estimate at this time; None between messages that are far apart or missing."""
+        index = bisect_left(self._estimates, stamp, key=lambda message: message.stamp)
+        if not 0 < index < len(self._estimates):
             return None
-        before, next_one = self._estimates[after - 1], self._estimates[after]
-        return (before, next_one) if next_one.stamp - before.stamp <= _MAX_STEP else None
+        before = self._estimates[index - 1]
+        after = self._estimates[index]
+        if after.stamp - before.stamp > _ADJACENT:
+            return None
+        estimate = self._interpolate(before, after, stamp)
+        missing = before.missing | after.missing
+        if estimate.z_valid != 1 or "z_valid" in missing:
+            self._offsets.clear()
+            estimate = estimate._replace(z=math.nan)
+        if estimate.xy_valid != 1 or "xy_valid" in missing:
+            estimate = estimate._replace(x=math.nan, y=math.nan)
+        return estimate
 
     def _interpolate(self, before: _Message, after: _Message, stamp: int) -> _Estimate:
-        first, second = _Estimate(*self._read(before.fields)), _Estimate(*self._read(after.fields))
+        old = _Estimate(*self._read(before.fields))
+        new = _Estimate(*self._read(after.fields))
         share = (stamp - before.stamp) / (after.stamp - before.stamp)
-        motion = [old + share * (new - old) for old, new in zip(first[:5], second[:5], strict=True)]
-        z_valid, xy_valid = min(first.z_valid, second.z_valid), min(first.xy_valid, second.xy_valid)
-        return _Estimate._make([*motion, z_valid, xy_valid, *second[7:]])
+
+        def between(first: float, second: float) -> float:
+            return first + share * (second - first)
+
+        return new._replace(
+            x=between(old.x, new.x),
+            y=between(old.y, new.y),
+            z=between(old.z, new.z),
+            vx=between(old.vx, new.vx),
+            vy=between(old.vy, new.vy),
+            z_valid=min(old.z_valid, new.z_valid),
+            xy_valid=min(old.xy_valid, new.xy_valid),
+        )
 
     def _error_of_barometer(self, measurement: _Measurement, estimate: _Estimate) -> _Error:
         """Return the change of the height difference, which a standard atmosphere and dynamic pressure limit."""
@@ -244,9 +276,8 @@ class Comparison:
         x, y, z, latitude, longitude, altitude = measurement.values
         height = self._relative("ground truth", estimate.height - altitude + z, estimate.has_origin)
         if math.isfinite(estimate.latitude):
-            north, east = MapProjection(estimate.latitude, estimate.longitude).project(
-                latitude, longitude
-            )
+            projection = MapProjection(estimate.latitude, estimate.longitude)
+            north, east = projection.project(latitude, longitude)
             distance = math.hypot(estimate.x - x - north, estimate.y - y - east)
         elif math.isfinite(estimate.x + estimate.y):
             north = self._relative("north", estimate.x - x, None)
@@ -270,23 +301,30 @@ class Comparison:
         # on opposite sides: the altitude and its change do not support each other
         if error * change < 0.0:
             height = 0.0
-        north, east = MapProjection(estimate.latitude, estimate.longitude).project(
-            latitude, longitude
-        )
-        eph, epv = (value if value > 0.0 else rules.UNKNOWN_ACCURACY for value in (eph, epv))
+        projection = MapProjection(estimate.latitude, estimate.longitude)
+        north, east = projection.project(latitude, longitude)
         return _Error(
-            height, math.hypot(estimate.x - north, estimate.y - east), error,
-            estimate.height_limit + rules.SIGMAS * epv, estimate.distance_limit + rules.SIGMAS * eph,
-        )  # fmt: skip
+            height=height,
+            distance=math.hypot(estimate.x - north, estimate.y - east),
+            altitude=error,
+            height_limit=estimate.height_limit + rules.SIGMAS * _accuracy(epv),
+            distance_limit=estimate.distance_limit + rules.SIGMAS * _accuracy(eph),
+        )
 
     def _relative(self, name: str, difference: float, origin: object) -> float:
         """Return the change of a difference since the first one with this origin; NaN if it is unknown."""
         if not math.isfinite(difference):
             return math.nan
         known = self._offsets.get(name)
-        if known is None or known[0] != origin:
-            self._offsets[name] = known = (origin, difference)
-        return difference - known[1]
+        if known is None or known.origin != origin:
+            known = _Offset(origin, difference)
+            self._offsets[name] = known
+        return difference - known.difference
+
+
+def _accuracy(value: float) -> float:
+    """Return the accuracy of a GNSS receiver [m], or a usual one if it provides none."""
+    return value if value > 0.0 else rules.UNKNOWN_ACCURACY
 
 
 def atmosphere_error(climbed: float) -> float:
@@ -310,47 +348,56 @@ class _Error(NamedTuple):
     distance_limit: float = math.inf
 
 
+class _Offset(NamedTuple):
+    """The first difference between estimate and reference since an origin was set [m]."""
+
+    origin: object
+    difference: float
+
+
+class _Measured(NamedTuple):
+    """The error that a reference last showed: its time [us], its size and its limit [m]."""
+
+    stamp: int
+    error: float
+    limit: float
+
+
 @dataclass(slots=True)
 class _Contradiction:
     """State of one quantity, contradicted while all errors exceed their limits in the same direction.
 
-    `errors`: last time [us], error and limit [m] by reference. `since`: time when all exceeded their limits [us], or 0.
+    `errors`: the last one of each reference. `since`: time when all exceeded their limits [us], or 0.
     `smallest_limit`: of those that were exceeded since then [m].
     """
 
     quantity: str
-    errors: dict[str, tuple[int, float, float]] = field(default_factory=dict)
+    errors: dict[str, _Measured] = field(default_factory=dict)
     since: int = 0
     worst: float = 0.0
     smallest_limit: float = math.inf
     is_reported: bool = False
 
-    def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
+    def update(
+        self,
+        name: str,
+        stamp: int,
+        error: float,
+        limit: float,
+    ) -> Finding | None:
         """Add an error, NaN if not measured; return the finding that begins or ends a contradiction, if any."""
-        self.errors[name] = (stamp, error, limit)
+        self.errors[name] = _Measured(stamp, error, limit)
         if not self.since and not abs(error) > limit:
             return None
         fresh = {
-            reference: (error, limit)
-            for reference, (time, error, limit) in self.errors.items()
-            if abs(stamp - time) <= _FRESH and math.isfinite(error)
+            reference: measured
+            for reference, measured in self.errors.items()
+            if abs(stamp - measured.stamp) <= _FRESH and math.isfinite(measured.error)
         }
-        is_alone = self.quantity != "position" and len(fresh) == 1
-        factor = 2.0 if is_alone else 1.0
-        directions = {
-            math.copysign(abs(error) > factor * limit, error) for error, limit in fresh.values()
-        }
-        if directions not in ({1.0}, {-1.0}):
-            was_reported, self.is_reported = self.is_reported, False
-            self.since, self.worst = 0, 0.0
-            self.smallest_limit = math.inf
-            kind = f"{self.quantity}_contradicted"
-            return (
-                Finding(kind, "end", f"{self.quantity} no longer contradicted")
-                if was_reported
-                else None
-            )
-        self.since, self.worst = self.since or stamp, max(self.worst, error, key=abs)
+        if not self._do_all_contradict(fresh.values()):
+            return self._end()
+        self.since = self.since or stamp
+        self.worst = max(self.worst, error, key=abs)
         self.smallest_limit = min(self.smallest_limit, limit)
         lasted = (stamp - self.since) / 1e6
         if self.is_reported or lasted < rules.CONTRADICTED[self.quantity]:
@@ -358,8 +405,28 @@ class _Contradiction:
         self.is_reported = True
         return self._begin(" and ".join(sorted(fresh)), lasted)
 
+    def _do_all_contradict(self, errors: Collection[_Measured]) -> bool:
+        """Return whether all errors exceed their limits in the same direction; a single one must exceed it twice."""
+        is_alone = self.quantity != "position" and len(errors) == 1
+        factor = 2.0 if is_alone else 1.0
+        exceed = [abs(measured.error) > factor * measured.limit for measured in errors]
+        signs = {math.copysign(1.0, measured.error) for measured in errors}
+        return all(exceed) and len(signs) == 1
+
+    def _end(self) -> Finding | None:
+        was_reported = self.is_reported
+        self.is_reported = False
+        self.since = 0
+        self.worst = 0.0
+        self.smallest_limit = math.inf
+        if not was_reported:
+            return None
+        text = f"{self.quantity} no longer contradicted"
+        return Finding(f"{self.quantity}_contradicted", "end", text)
+
     def _begin(self, references: str, lasted: float) -> Finding:
-        size, side = f"{abs(self.worst):.0f} m", "above" if self.worst > 0.0 else "below"
+        size = f"{abs(self.worst):.0f} m"
+        side = "above" if self.worst > 0.0 else "below"
         if self.quantity == "height":
             text = f"height {size} {side} {references} while z_valid is true"
         elif self.quantity == "position":

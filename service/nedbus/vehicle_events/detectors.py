@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, NamedTuple
 
 from nedbus_msgs import FieldReader
 from nedbus_msgs.messages import LogMessage, VehicleStatus
@@ -25,7 +25,7 @@ _EKF_FAULTS: Final = [kind for kind in flagged("EstimatorStatusFlags") if kind.n
 HEALTHY: Final[Fields] = {flag: not kind.bad for kind in _EKF_FAULTS for flag in kind.flags}
 """Flags of an EKF without faults."""
 
-_MAX_EKFS: Final = 9  # instances; 255 means none
+_EKFS: Final = range(9)  # instances; 255 means none
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +53,14 @@ class Finding:
 
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
 """Yield findings from the fields of the previous message ({} for the first one) and of the current message."""
-Detection = tuple[Sequence[str], Sequence[str], Detect]
-"""Fields whose changes trigger the function, other fields that it needs, and the function."""
+
+
+class Detection(NamedTuple):
+    """Fields whose changes trigger the function, other fields that it needs, and the function."""
+
+    compared: Sequence[str]
+    context: Sequence[str]
+    detect: Detect
 
 
 read_fields: Final = cache(FieldReader)
@@ -81,7 +87,8 @@ class ChangeDetector:
         self.last: object = None
         self._state: tuple[Any, ...] = ()
         self.missing = frozenset[str]()
-        self.stamp = self.earlier = 0
+        self.stamp = 0
+        self.earlier = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings in a message whose `missing` fields were not provided; None if nothing has changed."""
@@ -89,29 +96,41 @@ class ChangeDetector:
         self.earlier = self.stamp
         self.stamp = values[0]
         state = values[1:]
-        last, self.last = self.last, message
-        if state == self._state and (missing is self.missing or missing == self.missing):
+        last = self.last
+        self.last = message
+        # most messages provide the same object
+        is_same = missing is self.missing or missing == self.missing
+        if is_same and state == self._state:
             return None
         before = {} if last is None else self._by_name(last, self.missing)
-        self._state, self.missing = state, missing
+        self._state = state
+        self.missing = missing
         return self._detect(before, self._by_name(message, missing))
+
+    @property
+    def newest(self) -> int:
+        """The newer timestamp of the last two messages, one of which may be late or damaged [us]."""
+        return max(self.stamp, self.earlier)
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
-        self.last, self._state = None, ()
-        self.stamp = self.earlier = 0
+        self.last = None
+        self._state = ()
+        self.stamp = 0
+        self.earlier = 0
 
     def again(self, before: Fields) -> Iterator[Finding]:
         """Return the findings in the last message as if it followed one with these fields."""
-        return (
-            iter(())
-            if self.last is None
-            else self._detect(before, self._by_name(self.last, self.missing))
-        )
+        if self.last is None:
+            return iter(())
+        return self._detect(before, self._by_name(self.last, self.missing))
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
         values = zip(self._read_all.names, self._read_all(message), strict=True)
-        return {name: None if name in missing else value for name, value in values}
+        fields: Fields = dict(values)
+        for name in missing.intersection(fields):
+            fields[name] = None
+        return fields
 
 
 class TextDetector(ChangeDetector):
@@ -139,8 +158,10 @@ class AidDetector(ChangeDetector):
         self, topic: str, is_primary: Callable[[object], bool], explain: Callable[[], str]
     ) -> None:
         super().__init__(("fused", "innovation_rejected", "estimator_instance"), (), detect_nothing)
-        self.topic, self.kind = topic, ""  # of the condition that it began
-        self._is_primary, self._explain = is_primary, explain
+        self.topic = topic
+        self.kind = ""  # of the condition that it began
+        self._is_primary = is_primary
+        self._explain = explain
         self.reset()
 
     def reset(self) -> None:
@@ -158,17 +179,25 @@ class AidDetector(ChangeDetector):
             self._start_run(is_fused=None)
             return self._change_to("", f"{self._label}: another EKF is primary")
         is_fused = bool(fused)
-        if is_fused != self._is_fused or self.stamp - self.earlier > 1e6 * rules.AID_PAUSE:
+        is_after_pause = self.stamp - self.earlier > 1e6 * rules.AID_PAUSE
+        if is_fused != self._is_fused or is_after_pause:
             self._is_first = self._is_fused is None and self._is_first
             self._start_run(is_fused=is_fused)
         self._count += 1
-        self._rejected += bool(rejected)
+        if rejected:
+            self._rejected += 1
         if self._count < rules.AID_COUNT or self.stamp - self._since < 1e6 * rules.AID_HOLD:
             return iter(())
-        if is_fused:
-            return self._change_to("", "")
-        is_rejected = self.kind == "aid_rejected" or 2 * self._rejected > self._count
-        return self._change_to("aid_rejected" if is_rejected else "aid_unused", "")
+        return self._change_to(self._kind_of_run(), "")
+
+    def _kind_of_run(self) -> str:
+        """Return the kind of condition that this run of messages shows, "" if they are fused."""
+        if self._is_fused:
+            return ""
+        are_most_rejected = 2 * self._rejected > self._count
+        if are_most_rejected or self.kind == "aid_rejected":
+            return "aid_rejected"
+        return "aid_unused"
 
     def stop(self) -> Iterator[Finding]:
         """Return the end of the condition when messages no longer arrive."""
@@ -185,20 +214,29 @@ class AidDetector(ChangeDetector):
         self._count = 0
         self._rejected = 0
 
-    def _change_to(self, kind: str, text: str) -> Iterator[Finding]:
-        before, self.kind = self.kind, kind
-        is_new_run = not (before and kind)
-        age = (self.stamp - self._since) / 1e6 if is_new_run else 0.0
-        if before and before != kind:
-            yield Finding(
-                before, "end", text or KINDS[before].end.format(self._label), (self.topic,), age=age
-            )
-        if kind and before != kind:
+    def _change_to(self, kind: str, end: str) -> Iterator[Finding]:
+        """End the condition that it began, and begin one of this kind, "" for none; `end`: why it ends."""
+        before = self.kind
+        self.kind = kind
+        if kind == before:
+            return
+        # one condition replaces the other at once
+        age = 0.0 if before and kind else (self.stamp - self._since) / 1e6
+        if before:
+            text = end or KINDS[before].end.format(self._label)
+            yield Finding(before, "end", text, (self.topic,), age=age)
+        if kind:
             severity: Severity | None = "info" if self.topic in KINDS[kind].minor else None
             initial = kind == "aid_unused" and self._is_first
             text = KINDS[kind].begin.format(self._label) + self._explain()
             yield Finding(
-                kind, "begin", text, (self.topic,), severity=severity, initial=initial, age=age
+                kind,
+                "begin",
+                text,
+                (self.topic,),
+                severity=severity,
+                initial=initial,
+                age=age,
             )
 
 
@@ -214,7 +252,8 @@ class VisionDetector(ChangeDetector):
         self, is_fused: Callable[[], tuple[bool | None, int]], explain: Callable[[], str]
     ) -> None:
         super().__init__((), (), detect_nothing)
-        self._is_fused, self._explain = is_fused, explain
+        self._is_fused = is_fused
+        self._explain = explain
         self.is_unused = False
         self.is_missing = False
         self._arriving = 0  # first message after a pause [us]
@@ -223,8 +262,10 @@ class VisionDetector(ChangeDetector):
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         super().reset()
-        self.is_unused = self.is_missing = False
-        self._arriving = self._refused = 0
+        self.is_unused = False
+        self.is_missing = False
+        self._arriving = 0
+        self._refused = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding]:
         """Yield the findings in a message."""
@@ -271,220 +312,345 @@ class VisionDetector(ChangeDetector):
 
 def detection_of(message: str) -> Detection | None:
     """Return the detection for a message type, None if it has no events; positions use PositionDetector."""
+    if message == "VehicleLocalPosition":
+        return None
     kinds = flagged(message)
-    fields, context, further = _FURTHER.get(message, ((), (), None))
-    compared = *fields, *(flag for kind in kinds for flag in kind.flags)
+    flags = [flag for kind in kinds for flag in kind.flags]
+    further = _FURTHER.get(message)
+    if further is None:
+        if not flags:
+            return None
+        return Detection(flags, (), lambda before, after: detect_flags(kinds, before, after))
 
     def detect(before: Fields, after: Fields) -> Iterator[Finding]:
         yield from detect_flags(kinds, before, after)
-        if further is not None:
-            yield from further(before, after)
+        yield from further.detect(before, after)
 
-    return (compared, context, detect) if compared and message != "VehicleLocalPosition" else None
+    return Detection([*further.compared, *flags], further.context, detect)
+
+
+class _FlagChange(NamedTuple):
+    """The change of a flag; `is_event`: False for a condition that is active in the first message, or unknown now."""
+
+    is_event: bool
+    change: Change
 
 
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield conditions that begin or end; a change from or to an unknown value is not an event."""
     for kind in kinds:
-        found: dict[tuple[bool, Change], list[str]] = {}  # flags by (is an event, change)
+        changed: dict[_FlagChange, list[str]] = {}
         for name in kind.flags:
-            was, now = before.get(name), after.get(name)
-            if was is None and now == kind.bad and kind.initial:
-                found.setdefault((False, "begin"), []).append(name)
-            elif now is None and was == kind.bad:
-                found.setdefault((False, "end"), []).append(name)
-            elif was is not None and now is not None and was != now:
-                found.setdefault((True, "begin" if now == kind.bad else "end"), []).append(name)
-        for (is_event, change), flags in sorted(found.items()):
+            change = _change_of_flag(kind, before.get(name), after.get(name))
+            if change is not None:
+                changed.setdefault(change, []).append(name)
+        for (is_event, change_name), flags in sorted(changed.items()):
+            labels = ", ".join(kind.flags[flag] for flag in flags)
+            text = kind.begin if change_name == "begin" else kind.end
             severity: Severity | None = "info" if kind.minor.issuperset(flags) else None
-            text = (kind.begin if change == "begin" else kind.end).format(
-                ", ".join(map(kind.flags.__getitem__, flags))
-            )
             yield Finding(
-                kind.name, change, text, tuple(flags), severity=severity, initial=not is_event
+                kind.name,
+                change_name,
+                text.format(labels),
+                tuple(flags),
+                severity=severity,
+                initial=not is_event,
             )
+
+
+def _change_of_flag(kind: Kind, was: object, now: object) -> _FlagChange | None:
+    """Return how the condition of a flag changes; None for an unknown value."""
+    if was is None:
+        is_initial = now == kind.bad and kind.initial
+        return _FlagChange(is_event=False, change="begin") if is_initial else None
+    if now is None:
+        return _FlagChange(is_event=False, change="end") if was == kind.bad else None
+    if was == now:
+        return None
+    return _FlagChange(is_event=True, change="begin" if now == kind.bad else "end")
 
 
 def _detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
-    level, text = after["severity"], after["text"]
-    if level is not None and text:
-        is_bad, is_watch = level <= LogMessage.CRITICAL, level <= LogMessage.WARNING
-        severity: Severity = "bad" if is_bad else "watch" if is_watch else "info"
-        yield Finding(
-            "text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity
-        )
+    level = after["severity"]
+    text = after["text"]
+    if level is None or not text:
+        return
+    severity: Severity = "info"
+    if level <= LogMessage.CRITICAL:
+        severity = "bad"
+    elif level <= LogMessage.WARNING:
+        severity = "watch"
+    yield Finding(
+        "text",
+        "once",
+        text,
+        (rules.LEVELS[level],),
+        {"level": level},
+        severity=severity,
+    )
 
 
 def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
-    fix, was = after["fix_type"], before.get("fix_type")
-    satellites, earlier = after["satellites_used"], before.get("satellites_used")
-    if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
-        text = (
-            f"no GPS fix, {satellites} satellites"
-            if satellites in range(_UNKNOWN_SATELLITES)
-            else "no GPS fix"
-        )
-        yield Finding("gps_fix_lost", "begin", text, initial=True)
-    elif was is not None and fix is not None and was != fix:
-        names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
-        numbers = {"fix_before": was, "fix": fix}
-        change = f"{names[0]} to {names[1]}"
-        if satellites is not None and earlier is not None and satellites != earlier:
-            numbers |= {"satellites_before": earlier, "satellites": satellites}
-            change += f", satellites {earlier} to {satellites}"
-        if was >= rules.MIN_FIX_TYPE > fix:
-            yield Finding("gps_fix_lost", "begin", f"GPS fix lost: {change}", names, numbers)
-        elif was < rules.MIN_FIX_TYPE <= fix:
-            yield Finding("gps_fix_lost", "end", f"GPS fix regained: {change}", names, numbers)
-        elif names[0] != names[1]:
-            yield Finding("gps_fix", "once", f"GPS fix changed: {change}", names, numbers)
-    last = _gps_levels(before)
-    for kind, (level, begin, end, numbers) in _gps_levels(after).items():
-        if level in (0, 2) and level != last[kind][0]:
-            initial = level == 2 and (last[kind][0] is None or not before)
-            is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS receiver
-            severity: Severity | None = "info" if is_info else None
-            found = Finding(
-                kind, "begin", begin, (), numbers, severity=severity, initial=initial, switch=True
+    yield from _detect_fix(before, after)
+    earlier = _gps_levels(before)
+    for kind, level in _gps_levels(after).items():
+        was = earlier[kind].value
+        if level.value == was:
+            continue
+        if level.value == 0:
+            yield Finding(
+                kind,
+                "end",
+                level.end,
+                (),
+                level.numbers,
+                switch=True,
             )
-            yield found if level else Finding(kind, "end", end, (), numbers, switch=True)
+        elif level.value == 2:
+            initial = was is None or not before
+            # a vehicle may have no GNSS receiver
+            is_info = initial and kind == "few_satellites"
+            severity: Severity | None = "info" if is_info else None
+            yield Finding(
+                kind,
+                "begin",
+                level.begin,
+                (),
+                level.numbers,
+                severity=severity,
+                initial=initial,
+                switch=True,
+            )
 
 
-def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
-    """Return level (None if unknown), texts and numbers by kind; a condition begins at level 2 and ends at level 0."""
-    satellites, few = gps.get("satellites_used"), None
-    if satellites is not None and satellites != _UNKNOWN_SATELLITES:
-        few = (satellites < rules.FEW_SATELLITES) + (satellites < rules.ENOUGH_SATELLITES)
+def _detect_fix(before: Fields, after: Fields) -> Iterator[Finding]:
+    fix = after["fix_type"]
+    was = before.get("fix_type")
+    if fix is None or fix == was:
+        return
+    if was is None:
+        if fix < rules.MIN_FIX_TYPE:
+            yield Finding("gps_fix_lost", "begin", _text_without_fix(after), initial=True)
+        return
+    names = (rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix)))
+    numbers = {"fix_before": was, "fix": fix}
+    change = f"{names[0]} to {names[1]}"
+    satellites = after["satellites_used"]
+    earlier = before.get("satellites_used")
+    if satellites is not None and earlier is not None and satellites != earlier:
+        numbers |= {"satellites_before": earlier, "satellites": satellites}
+        change += f", satellites {earlier} to {satellites}"
+    if was >= rules.MIN_FIX_TYPE > fix:
+        yield Finding("gps_fix_lost", "begin", f"GPS fix lost: {change}", names, numbers)
+    elif was < rules.MIN_FIX_TYPE <= fix:
+        yield Finding("gps_fix_lost", "end", f"GPS fix regained: {change}", names, numbers)
+    elif names[0] != names[1]:
+        yield Finding("gps_fix", "once", f"GPS fix changed: {change}", names, numbers)
+
+
+def _text_without_fix(gps: Fields) -> str:
+    satellites = gps["satellites_used"]
+    if satellites in range(_UNKNOWN_SATELLITES):
+        return f"no GPS fix, {satellites} satellites"
+    return "no GPS fix"
+
+
+class _Level(NamedTuple):
+    """How bad the reception is: begins a condition at 2 and ends it at 0; None if unknown. Its texts and numbers."""
+
+    value: int | None
+    begin: str
+    end: str
+    numbers: Fields
+
+
+def _gps_levels(gps: Fields) -> dict[str, _Level]:
+    """Return the levels by kind of condition."""
+    satellites = gps.get("satellites_used")
+    count = f"{satellites} satellites"
     indicator, jammed, spoofed = (gps.get(name) or 0 for name in _INTERFERENCE)
-    jamming = (
-        2 if jammed > 1 else (indicator >= rules.JAMMING_BEGIN) + (indicator >= rules.JAMMING_END)
-    )
-    state = f", state {jammed}" if jammed > 1 else ""
-    count, jam = f"{satellites} satellites", f"GNSS jamming: indicator {indicator}"
-    spoof = f"GNSS spoofing: state {spoofed}"
+    jamming = f"GNSS jamming: indicator {indicator}"
+    if jammed > 1:
+        jamming += f", state {jammed}"
     return {
-        "few_satellites": (few, f"only {count}", count, {"satellites": satellites}),
-        "jamming": (
-            jamming,
-            f"{jam}{state}",
-            "GNSS jamming ended",
-            {"indicator": indicator, "state": jammed},
+        "few_satellites": _Level(
+            _level_of_satellites(satellites),
+            begin=f"only {count}",
+            end=count,
+            numbers={"satellites": satellites},
         ),
-        "spoofing": (2 if spoofed > 1 else 0, spoof, "GNSS spoofing ended", {"state": spoofed}),
+        "jamming": _Level(
+            _level_of_jamming(indicator, jammed),
+            begin=jamming,
+            end="GNSS jamming ended",
+            numbers={"indicator": indicator, "state": jammed},
+        ),
+        "spoofing": _Level(
+            2 if spoofed > 1 else 0,
+            begin=f"GNSS spoofing: state {spoofed}",
+            end="GNSS spoofing ended",
+            numbers={"state": spoofed},
+        ),
     }
+
+
+def _level_of_satellites(count: int | None) -> int | None:
+    if count is None or count == _UNKNOWN_SATELLITES:
+        return None
+    if count < rules.FEW_SATELLITES:
+        return 2
+    return 1 if count < rules.ENOUGH_SATELLITES else 0
+
+
+def _level_of_jamming(indicator: int, state: int) -> int:
+    if state > 1 or indicator >= rules.JAMMING_BEGIN:
+        return 2
+    return 1 if indicator >= rules.JAMMING_END else 0
 
 
 def _detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the end of fake position fusion in an EstimatorStatusFlags if no other horizontal aiding replaces it."""
-    was, now = ([name for name in rules.AIDING if fields.get(name)] for fields in (before, after))
-    if was and not now and rules.FAKE_AIDING.keys() >= set(was):
-        text = f"no horizontal aiding: EKF stopped fusing {', '.join(map(rules.AIDING.__getitem__, was))}"
+    was = [name for name in rules.AIDING if before.get(name)]
+    now = [name for name in rules.AIDING if after.get(name)]
+    is_only_fake = rules.FAKE_AIDING.keys() >= set(was)
+    if was and is_only_fake and not now:
+        labels = ", ".join(rules.AIDING[name] for name in was)
+        text = f"no horizontal aiding: EKF stopped fusing {labels}"
         yield Finding("not_aided", "once", text)
 
 
 def _detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
-    was, now = before.get("arming_state"), after["arming_state"]
-    if now is not None and (was is None or (was == _ARMED) != (now == _ARMED)):
-        kind = "armed" if now == _ARMED else "disarmed"
-        yield Finding(kind, "once", kind, initial=was is None)
-    was, now = before.get("nav_state"), after["nav_state"]
-    if was is not None and now is not None and was != now:
-        names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
-        yield Finding(
-            "mode",
-            "once",
-            f"mode changed from {names[0]} to {names[1]}",
-            names,
-            {"from": was, "to": now},
-        )
-
+    yield from _detect_arming(before.get("arming_state"), after["arming_state"])
+    yield from _detect_mode(before.get("nav_state"), after["nav_state"])
     yield from _detect_transition(before, after)
+    yield from _detect_vehicle_type(before.get("vehicle_type"), after["vehicle_type"])
+
+
+def _detect_arming(was: int | None, now: int | None) -> Iterator[Finding]:
+    if now is None:
+        return
+    is_armed = now == _ARMED
+    if was is None or is_armed != (was == _ARMED):
+        kind = "armed" if is_armed else "disarmed"
+        yield Finding(kind, "once", kind, initial=was is None)
+
+
+def _detect_mode(was: int | None, now: int | None) -> Iterator[Finding]:
+    if was is None or now is None or was == now:
+        return
+    names = (rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now)))
+    text = f"mode changed from {names[0]} to {names[1]}"
+    yield Finding("mode", "once", text, names, {"from": was, "to": now})
 
 
 def _detect_transition(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the begin and end of a VTOL's transition, and the vehicle type that it changes."""
-    was, now = before.get("in_transition_mode"), after["in_transition_mode"]
+    """Yield the begin and end of a VTOL's transition."""
+    was = before.get("in_transition_mode")
+    now = after["in_transition_mode"]
     if now and not was:
-        aim = {True: " to fixed wing", False: " to rotary wing"}.get(
-            after["in_transition_to_fw"], ""
-        )
+        aims = {True: " to fixed wing", False: " to rotary wing"}
+        aim = aims.get(after["in_transition_to_fw"], "")
         yield Finding("transition", "begin", f"VTOL transition{aim}", initial=was is None)
     elif was and now is False:
         yield Finding("transition", "end", "VTOL transition ended")
-    old, new = before.get("vehicle_type"), after["vehicle_type"]
-    if old is not None and new is not None and old != new:
-        names = rules.VEHICLE_TYPES.get(old, str(old)), rules.VEHICLE_TYPES.get(new, str(new))
-        text = f"vehicle type changed from {names[0]} to {names[1]}"
-        yield Finding("vehicle_type", "once", text, names, {"from": old, "to": new})
+
+
+def _detect_vehicle_type(was: int | None, now: int | None) -> Iterator[Finding]:
+    """Yield the vehicle type that a VTOL's transition changes."""
+    if was is None or now is None or was == now:
+        return
+    names = (rules.VEHICLE_TYPES.get(was, str(was)), rules.VEHICLE_TYPES.get(now, str(now)))
+    text = f"vehicle type changed from {names[0]} to {names[1]}"
+    yield Finding("vehicle_type", "once", text, names, {"from": was, "to": now})
 
 
 def _detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
-    was, now = before.get("landed"), after["landed"]
-    if was is not None and now is not None and was != now:
-        kind, text = ("landed", "landing detected") if now else ("takeoff", "takeoff detected")
-        yield Finding(kind, "once", text)
+    was = before.get("landed")
+    now = after["landed"]
+    if was is None or now is None or was == now:
+        return
+    if now:
+        yield Finding("landed", "once", "landing detected")
+    else:
+        yield Finding("takeoff", "once", "takeoff detected")
 
 
 def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
-    known = ({"connected": True, "warning": 0} | before, after)
-    was, warning = (
-        0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known
-    )
+    was = _warning_of(before) if before else 0
+    warning = _warning_of(after)
     if warning is None or was is None or was == warning:
         return
-    remaining = after["remaining"]
     numbers = {"warning": warning}
     left = ""
+    remaining = after["remaining"]
     if remaining is not None and 0 <= remaining <= 1:
-        numbers = {"warning": warning, "remaining": remaining}
+        numbers["remaining"] = remaining
         left = f", {100 * remaining:.0f} % left"
-    if warning:
-        severity: Severity | None = "watch" if warning in (1, 7) else None
-        text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
-        yield Finding(
-            "battery", "begin", text, numbers=numbers, severity=severity, initial=not before
-        )
-    else:
-        yield Finding(
-            "battery",
-            "end",
-            f"battery no longer {rules.WARNINGS.get(was, was)}{left}",
-            numbers=numbers,
-        )
+    if not warning:
+        text = f"battery no longer {rules.WARNINGS.get(was, was)}{left}"
+        yield Finding("battery", "end", text, numbers=numbers)
+        return
+    severity: Severity | None = "watch" if warning in (1, 7) else None
+    text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
+    yield Finding(
+        "battery",
+        "begin",
+        text,
+        numbers=numbers,
+        severity=severity,
+        initial=not before,
+    )
+
+
+def _warning_of(battery: Fields) -> int | None:
+    """Return the warning of a battery, 0 for one that is not connected, None if unknown."""
+    if battery["connected"] is False:
+        return 0
+    warning: int | None = battery["warning"]
+    return warning
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield a change of the primary EKF; fields of EKF_SELECTOR, which is not built in, may have any type."""
-    was, now = (each.get("primary_instance") for each in (before, after))
-    if type(now) is int and now in range(_MAX_EKFS):
-        yield selected(now, was if type(was) is int and was in range(_MAX_EKFS) else None)
+    now = _ekf_of(after)
+    if now is not None:
+        yield selected(now, _ekf_of(before))
+
+
+def _ekf_of(selection: Fields) -> int | None:
+    instance = selection.get("primary_instance")
+    if type(instance) is int and instance in _EKFS:
+        return instance
+    return None
 
 
 def selected(now: int, was: int | None) -> Finding:
     """Return the finding that an EKF became primary; without an event if the previous one is unknown."""
-    numbers = {"to": now} if was is None else {"from": was, "to": now}
+    numbers = {"to": now}
+    if was is not None:
+        numbers = {"from": was, "to": now}
     text = f"primary EKF changed from {was} to {now}"
     return Finding("ekf_changed", "once", text, numbers=numbers, initial=was is None)
 
 
 def detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the faults of an EKF that is not primary."""
-    for each in detect_flags(_EKF_FAULTS, before, after):
-        names = tuple(f"{instance}:{name}" for name in each.names)
-        text = f"EKF {instance} (not primary): {each.text.removeprefix('EKF ')}"
-        yield replace(each, kind="other_ekf", severity=None, text=text, names=names)
+    for finding in detect_flags(_EKF_FAULTS, before, after):
+        names = tuple(f"{instance}:{name}" for name in finding.names)
+        text = f"EKF {instance} (not primary): {finding.text.removeprefix('EKF ')}"
+        yield replace(finding, kind="other_ekf", severity=None, text=text, names=names)
 
 
 # Detection beyond flags, by message.
 _FURTHER: Final[Mapping[str, Detection]] = {
-    "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), _detect_aiding),
-    "LogMessage": (("severity", "text"), (), _detect_text),
-    "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), _detect_gps),
-    "VehicleStatus": (
+    "EstimatorStatusFlags": Detection([*rules.FAKE_AIDING], (), _detect_aiding),
+    "LogMessage": Detection(("severity", "text"), (), _detect_text),
+    "SensorGps": Detection(("fix_type", "satellites_used", *_INTERFERENCE), (), _detect_gps),
+    "VehicleStatus": Detection(
         ("arming_state", "nav_state", "in_transition_mode", "vehicle_type"),
         ("in_transition_to_fw",),
         _detect_status,
     ),
-    "BatteryStatus": (("warning", "connected"), ("remaining",), _detect_battery),
-    "VehicleLandDetected": (("landed",), (), _detect_landing),
+    "BatteryStatus": Detection(("warning", "connected"), ("remaining",), _detect_battery),
+    "VehicleLandDetected": Detection(("landed",), (), _detect_landing),
 }

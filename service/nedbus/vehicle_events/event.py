@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal
 
@@ -12,7 +12,7 @@ from pydantic import Field
 from nedbus_msgs import ARDUPILOT, OTHER_AUTOPILOT
 
 from .kinds import KINDS, SEVERITIES, Severity, importance
-from .rules import MAX_ALONE
+from .rules import WILD
 
 WINDOW: Final = 10.0
 """Seconds before an event in which events of related kinds are evidence; the start of an active one may be older."""
@@ -89,12 +89,15 @@ class Event:
         """The text; of an autopilot in quotes after its author, with the number of equal ones that it stands for."""
         if self.origin != "px4":
             return self.text
+        quoted = f'{self.author or "PX4"}: "{self.text}"'
         count = self.numbers.get(SUPPRESSED)
-        return f'{self.author or "PX4"}: "{self.text}"{f", the last of {count:.0f} suppressed texts" if count else ""}'
+        if not count:
+            return quoted
+        return f"{quoted}, the last of {count:.0f} suppressed texts"
 
     def later(self, seconds: float) -> Event:
         """Return this event and its evidence on a clock that is ahead by `seconds`."""
-        evidence = tuple(each.later(seconds) for each in self.evidence)
+        evidence = tuple(event.later(seconds) for event in self.evidence)
         return replace(self, time=max(0.0, self.time + seconds), evidence=evidence)
 
 
@@ -133,18 +136,26 @@ def rank(condition: Condition, until: float | None) -> tuple[int, int, float]:
 
     Order: severity; importance of the kind; duration, or the largest number of a single event.
     """
+    return (
+        SEVERITIES.index(condition.severity),
+        importance(condition.kind),
+        -_size(condition, until),
+    )
+
+
+def _size(condition: Condition, until: float | None) -> float:
+    """Return the largest number of a single event, or the duration of a condition [s]."""
     if condition.begin.change == "once":
-        size = max(map(abs, condition.begin.numbers.values()), default=0.0)
-    else:
-        size = math.inf if until is None else round(until - condition.since, 2)
-    return SEVERITIES.index(condition.severity), importance(condition.kind), -size
+        return max(map(abs, condition.begin.numbers.values()), default=0.0)
+    if until is None:
+        return math.inf
+    return round(until - condition.since, 2)
 
 
 def state_of(conditions: Iterable[Condition]) -> State:
     """Return the state of a vehicle, set by the worst of these conditions and recent single events."""
-    counting = (
-        each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless
-    )
+    faults = [condition for condition in conditions if condition.severity != "info"]
+    counting = [condition for condition in faults if not KINDS[condition.kind].stateless]
     ordered = sorted(counting, key=lambda condition: rank(condition, None))
     if not ordered:
         return State("info", "ok", None, ())
@@ -158,28 +169,46 @@ def without_wild(events: Iterable[Event]) -> list[Event]:
     A condition that recurs within WINDOW is real, since the stream is not sound otherwise.
     """
     events = list(events)
-    wild, last = set[int](), dict[tuple[str, str], Event]()  # ids of events
-    for event in events:
-        if ALONE in event.numbers:
-            before = last.get((event.vehicle, event.kind))
-            last[event.vehicle, event.kind] = event
-            if before is None or event.time - before.time > WINDOW:
-                wild.add(id(event))
-            else:
-                wild.discard(id(before))
+    wild = _wild_events(events)
     kept: list[Event] = []
     for event in events:
-        if id(event) in wild:
-            key, indices = (event.vehicle, event.kind), range(len(kept) - 1, -1, -1)
-            begin = next(
-                (each for each in indices if (kept[each].vehicle, kept[each].kind) == key), None
-            )
-            if begin is not None and event.time - kept[begin].time <= MAX_ALONE:
-                del kept[begin]
-                if event.change != "begin":
-                    continue
-        kept.append(event)
+        if id(event) not in wild:
+            kept.append(event)
+            continue
+        begin = _begin_of(event, kept)
+        if begin is None:
+            kept.append(event)
+            continue
+        del kept[begin]
+        if event.change == "begin":  # another condition, which the wild one interrupted
+            kept.append(event)
     return kept
+
+
+def _wild_events(events: Iterable[Event]) -> set[int]:
+    """Return the ids of events that end a value which one message alone had, and that do not recur."""
+    wild = set[int]()
+    last: dict[tuple[str, str], Event] = {}
+    for event in events:
+        if ALONE not in event.numbers:
+            continue
+        key = (event.vehicle, event.kind)
+        before = last.get(key)
+        last[key] = event
+        if before is None or event.time - before.time > WINDOW:
+            wild.add(id(event))
+        else:
+            wild.discard(id(before))
+    return wild
+
+
+def _begin_of(event: Event, earlier: Sequence[Event]) -> int | None:
+    """Return the index of the last event of the same kind, None if it is older than a wild message can be."""
+    for index in reversed(range(len(earlier))):
+        begin = earlier[index]
+        if (begin.vehicle, begin.kind) == (event.vehicle, event.kind):
+            return index if event.time - begin.time <= WILD else None
+    return None
 
 
 def explain(
@@ -191,22 +220,24 @@ def explain(
     `conditions`: active ones count, however old. Possible causes of a start are other starts and PX4's texts; of an
     end, other ends since the condition began; of a correction of the estimate, all of these.
     """
-    causes, latest = KINDS[event.kind].causes, dict[object, Event]()
-    earliest = event.time - min(WINDOW, WINDOW if event.lasted is None else event.lasted)
+    causes = KINDS[event.kind].causes
+    latest: dict[object, Event] = {}
+    window = WINDOW
+    if event.lasted is not None:
+        window = min(WINDOW, event.lasted)
     for other in near:
-        is_near = earliest <= other.time <= event.time + late
-        if other is not event and other.kind in causes and is_near and _may_explain(other, event):
+        if other is event or other.kind not in causes:
+            continue
+        is_near = event.time - window <= other.time <= event.time + late
+        if is_near and _may_explain(other, event):
             latest[other.text if other.kind == "text" else other.kind] = other
     if event.change != "end":
         for condition in conditions:
             begin = condition.begin
             is_before = begin.time <= event.time + late  # an event may be reported late
-            if (
-                condition.kind in causes
-                and is_before
-                and not begin.is_minor
-                and _is_notable(condition.kind, condition)
-            ):
+            if condition.kind not in causes or not is_before or begin.is_minor:
+                continue
+            if _is_notable(condition.kind, condition.severity):
                 latest.setdefault(condition.kind, begin)
     return sorted(latest.values(), key=lambda cause: cause.time)
 
@@ -221,13 +252,13 @@ def _may_explain(cause: Event, event: Event) -> bool:
         return not cause.is_minor
     if event.change == "end":
         return cause.change != "begin" and not cause.is_minor
-    return cause.change != "end" and not cause.is_minor and _is_notable(cause.kind, cause)
+    if cause.change == "end" or cause.is_minor:
+        return False
+    return _is_notable(cause.kind, cause.severity)
 
 
-def _is_notable(kind: str, found: Event | Condition) -> bool:
+def _is_notable(kind: str, severity: Severity) -> bool:
     """Return whether a start is not routine: info because of the kind, or on the ground, but not by its size."""
-    return (
-        found.severity != "info"
-        or KINDS[kind].severity == "info"
-        or KINDS[kind].on_ground == "info"
-    )
+    if severity != "info":
+        return True
+    return "info" in (KINDS[kind].severity, KINDS[kind].on_ground)

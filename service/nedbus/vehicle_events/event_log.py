@@ -6,30 +6,20 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from itertools import takewhile
-from typing import Final
 
+from nedbus import limits
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 
-from .detectors import Change, Finding
+from .conditions import Conditions
+from .detectors import Finding
 from .event import ALL, AUTHORS, Condition, Event, State, state_of
 from .kinds import SEVERITIES, Severity
-from .rules import MAX_SILENCE, PAUSE, RECENT
+from .rules import PAUSE, RECENT, SILENCE
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
-
-KEPT: Final = 2000
-"""Maximum number of events in an event log; beyond it, the oldest event of the vehicle with the most is deleted."""
-
-MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an event log; beyond it, the vehicle that has been gone longest is forgotten."""
-
-MAX_GONE: Final = 50
-"""Maximum number of vehicles gone for over a minute, or the highest number ever present at once if that is larger."""
-
-_SHARE: Final = 20  # events guaranteed to each vehicle while others have more
 
 
 class EventLog:
@@ -39,30 +29,36 @@ class EventLog:
 
     `reader`: what may be overloaded, as its events name it: a reader, or a service.
     `reported`: total number of events. `counts`: number of events by vehicle (until forgotten) and severity.
-    `refused`: number of messages from vehicles beyond MAX_VEHICLES.
+    `refused`: number of messages from vehicles beyond `limits.VEHICLES`.
     """
 
-    def __init__(self, keep: int = KEPT, *, reader: str = "reader") -> None:
-        self._events: dict[int, Event] = {}
+    def __init__(self, keep: int = limits.EVENTS, *, reader: str = "reader") -> None:
+        self._events: dict[int, Event] = {}  # by number
         self.vehicles: dict[str, Vehicle] = {}
         self.counts: Counter[tuple[str, Severity]] = Counter()
-        self.reported = self.refused = 0
-        self._keep, self._reader = keep, reader
+        self.reported = 0
+        self.refused = 0
+        self._keep = keep
+        self._reader = reader
         self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # event numbers by vehicle
-        self._common = Vehicle(ALL, self._record)  # conditions of the link and the reader
-        self._dropped = self._most_present = 0
-        self._last_overload = self._settled = self._full_until = 0.0
+        self._common = Conditions(ALL, self._record)  # conditions of the link and the reader
+        self._dropped = 0
+        self._most_present = 0
+        self._last_overload = 0.0
+        self._settled = 0.0
+        self._full_until = 0.0
         self._lock = threading.RLock()
 
     @property
     def events(self) -> list[Event]:
         """The retained events, in the order in which they were reported."""
-        return self.events_since(0)[0]
+        events, _ = self.events_since(0)
+        return events
 
     @property
     def is_full(self) -> bool:
         """True if new vehicles are ignored."""
-        return len(self.vehicles) >= MAX_VEHICLES
+        return len(self.vehicles) >= limits.VEHICLES
 
     @property
     def overload(self) -> Condition | None:
@@ -70,9 +66,16 @@ class EventLog:
         return self._common.conditions.get(("overload", ""))
 
     def add(
-        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0,
-        is_estimate: bool = False, source: str | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        address: Address,
+        message: object,
+        time: float,
+        *,
+        missing: frozenset[str] = frozenset(),
+        lost: int = 0,
+        is_estimate: bool = False,
+        source: str | None = None,
+    ) -> None:
         """Add a message: a model, a row, or a dict of fields.
 
         `missing`: names of fields that were not provided. `lost`: messages lost before this one; with `is_estimate`
@@ -84,26 +87,26 @@ class EventLog:
         if vehicle is not None and not lost and vehicle.skips(address, time):
             return
         with self._lock:
-            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(
-                address.vehicle, time
-            ):
-                if lost:
-                    vehicle.count_lost(lost, "" if is_estimate else address.stream, time)
-                vehicle.author = AUTHORS.get(source, vehicle.author)
-                vehicle.add(address, message, time, missing)
+            vehicle = self._vehicle(address.vehicle, time)
+            if vehicle is None:
+                return
+            if lost:
+                vehicle.count_lost(lost, "" if is_estimate else address.stream, time)
+            vehicle.author = AUTHORS.get(source, vehicle.author)
+            vehicle.add(address, message, time, missing)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
         """Record a logging dropout of a vehicle that starts at `time`."""
         with self._lock:
-            if known := self.vehicles.get(vehicle) or self._new_vehicle(vehicle, time):
+            known = self._vehicle(vehicle, time)
+            if known is not None:
                 known.add_dropout(seconds, time)
 
     def reject(self, address: Address, reason: str, time: float) -> None:
         """Record a rejected message."""
         with self._lock:
-            if vehicle := self.vehicles.get(address.vehicle) or self._new_vehicle(
-                address.vehicle, time
-            ):
+            vehicle = self._vehicle(address.vehicle, time)
+            if vehicle is not None:
                 vehicle.reject(address.stream, reason, time)
 
     def update(
@@ -121,43 +124,52 @@ class EventLog:
         `states`: states of position streams by address ("stale", "gone", "duplicate", ...); None if not observed.
         `link`: fault of the router link, "" if it is up. `dropped`: messages dropped by this reader since it started.
         `is_behind`: the reader has a backlog. `present`: vehicles with a publisher. Others are forgotten after an hour
-        of silence with the link up, or earlier beyond MAX_GONE. If None, no vehicle is forgotten.
+        of silence with the link up, or earlier beyond `limits.GONE_VEHICLES`. If None, no vehicle is forgotten.
         An overloaded reader reports no silent vehicles, because their messages may be in its backlog.
         """
         with self._lock:
-            change: Change = "begin" if link else "end"
-            self._common.emit(
-                Finding("link_down", change, link or "link restored", switch=True), "", time
-            )
-            if dropped > self._dropped or is_behind:
-                self._last_overload = time
-                text = f"{self._reader} overloaded: messages are delayed or dropped"
-                self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
-            elif time - self._last_overload > PAUSE:
-                text = f"messages dropped so far: {dropped}; {self._reader} caught up"
-                ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
-                self._common.emit(ended, "", time, changed=self._last_overload)
-            self._dropped = dropped
+            self._update_link(link, time)
+            self._update_overload(dropped, time, is_behind=is_behind)
             if present is not None:
-                for here in filter(
-                    None, map(self.vehicles.get, self.vehicles if link else present)
-                ):
-                    here.last_seen = time
+                # nobody is gone while the link is down
+                self._see(self.vehicles if link else present, time)
                 self._most_present = max(self._most_present, len(present))
-                gone = self._gone(time)
-                beyond = gone[: -max(MAX_GONE, self._most_present)]
-                self._forget(
-                    [each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond
-                )
+                self._forget_gone(time)
             if self.overload is not None:
-                self._settled = time + MAX_SILENCE  # delayed messages need time to arrive
+                self._settled = time + SILENCE  # delayed messages need time to arrive
             if time < self._settled:
                 self.settle(time)
                 return
             self._common.settle(time)
             for vehicle in self.vehicles.values():
-                state = None if states is None or vehicle.main is None else states.get(vehicle.main)
+                state = None
+                if states is not None and vehicle.main is not None:
+                    state = states.get(vehicle.main)
                 vehicle.update(time, state, is_connected=not link)
+
+    def _update_link(self, fault: str, time: float) -> None:
+        if fault:
+            finding = Finding("link_down", "begin", fault, switch=True)
+        else:
+            finding = Finding("link_down", "end", "link restored", switch=True)
+        self._common.emit(finding, "", time)
+
+    def _update_overload(self, dropped: int, time: float, *, is_behind: bool) -> None:
+        if dropped > self._dropped or is_behind:
+            self._last_overload = time
+            text = f"{self._reader} overloaded: messages are delayed or dropped"
+            self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
+        elif time - self._last_overload > PAUSE:
+            text = f"messages dropped so far: {dropped}; {self._reader} caught up"
+            ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
+            self._common.emit(ended, "", time, changed=self._last_overload)
+        self._dropped = dropped
+
+    def _see(self, names: Iterable[str], time: float) -> None:
+        for name in names:
+            vehicle = self.vehicles.get(name)
+            if vehicle is not None:
+                vehicle.last_seen = time
 
     def settle(self, time: float) -> None:
         """Report ended bursts of losses and rejections, and ended flapping; also call it at the end of a file."""
@@ -170,16 +182,15 @@ class EventLog:
         with self._lock:
             known = self.vehicles.get(vehicle)
             if known is None and self.is_full:
-                return State("watch", f"no events: more than {MAX_VEHICLES} vehicles", None, ())
+                return State("watch", f"no events: more than {limits.VEHICLES} vehicles", None, ())
             return known.state(time) if known is not None else state_of(())
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
         """Return the retained events after the first `seen` reported ones, and the number of all reported events."""
         with self._lock:
-            new = [
-                self._events[number]
-                for number in takewhile(lambda number: number >= seen, reversed(self._events))
-            ]
+            # dicts keep the order of insertion: from the newest back to the last seen one
+            unseen = takewhile(lambda number: number >= seen, reversed(self._events))
+            new = [self._events[number] for number in unseen]
             return new[::-1], self.reported
 
     def label_first_events(self) -> None:
@@ -189,30 +200,48 @@ class EventLog:
             if event.boot is None and known is not None and known.boot is not None:
                 self._events[number] = replace(event, boot=known.boot + event.time - known.time)
 
-    def _new_vehicle(self, name: str, time: float) -> Vehicle | None:
-        """Return a new vehicle; None if the event log is full."""
+    def _vehicle(self, name: str, time: float) -> Vehicle | None:
+        """Return a vehicle, a new one if necessary; None if the event log is full."""
+        known = self.vehicles.get(name)
+        if known is not None:
+            return known
         if self.is_full and time >= self._full_until:
             self._full_until = time + 1.0
             self._forget(self._gone(time)[:1])
         if self.is_full:
-            if not self.refused:
-                text = "more than %d vehicles: the others have no events; select vehicles with --vehicle"
-                _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
-            self.refused += 1
+            self._refuse()
             return None
-        vehicle = self.vehicles[name] = Vehicle(name, self._record, self._common, first=time)
+        vehicle = Vehicle(name, self._record, self._common, first=time)
+        self.vehicles[name] = vehicle
         return vehicle
 
-    def _gone(self, time: float) -> list[tuple[float, str]]:
-        """Return the time last seen and the name of each vehicle not seen for a minute, longest gone first."""
-        return sorted(
-            (each.last_seen, name)
-            for name, each in self.vehicles.items()
-            if time - each.last_seen > RECENT
-        )
+    def _refuse(self) -> None:
+        if not self.refused:
+            text = (
+                "more than %d vehicles: the others have no events; select vehicles with --vehicle"
+            )
+            _log.warning(text, limits.VEHICLES, extra=about("incomplete"))
+        self.refused += 1
 
-    def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:
-        for _, name in vehicles:
+    def _gone(self, time: float) -> list[str]:
+        """Return the vehicles that were not seen for a minute, longest gone first, then by name."""
+        names = [
+            name for name, vehicle in self.vehicles.items() if time - vehicle.last_seen > RECENT
+        ]
+        return sorted(names, key=lambda name: (self.vehicles[name].last_seen, name))
+
+    def _forget_gone(self, time: float) -> None:
+        """Forget the vehicles that are gone for an hour; if there are none, those beyond the limit."""
+        gone = self._gone(time)
+        forgotten = [
+            name for name in gone if time - self.vehicles[name].last_seen > TIMINGS.forgotten
+        ]
+        kept = max(limits.GONE_VEHICLES, self._most_present)
+        beyond = gone[:-kept]
+        self._forget(forgotten or beyond)
+
+    def _forget(self, names: Iterable[str]) -> None:
+        for name in names:
             del self.vehicles[name]
             for severity in SEVERITIES:
                 del self.counts[name, severity]
@@ -223,9 +252,18 @@ class EventLog:
         self.counts[event.vehicle, event.severity] += 1
         self.reported += 1
         if len(self._events) > self._keep:
-            name = max(self._numbers, key=lambda each: len(self._numbers[each]))
-            if len(self._numbers[name]) <= _SHARE:
-                name = next(iter(self._events.values())).vehicle
-            del self._events[self._numbers[name].popleft()]
-            if not self._numbers[name]:
-                del self._numbers[name]
+            self._delete_oldest(self._vehicle_with_most_events())
+
+    def _vehicle_with_most_events(self) -> str:
+        """Return the vehicle with the most events, that of the oldest event if none has many."""
+        name = max(self._numbers, key=lambda name: len(self._numbers[name]))
+        if len(self._numbers[name]) > limits.EVENTS_OF_VEHICLE:
+            return name
+        oldest = next(iter(self._events.values()))
+        return oldest.vehicle
+
+    def _delete_oldest(self, name: str) -> None:
+        numbers = self._numbers[name]
+        del self._events[numbers.popleft()]
+        if not numbers:
+            del self._numbers[name]

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
+from nedbus import limits
 from nedbus.clock import format_duration, format_since, format_utc
 from nedbus_msgs.text import counted
 
@@ -17,8 +18,6 @@ VALID: Final[Mapping[str, str]] = {
     "vz": "v_z_valid",
 }
 """Quantities whose validity a health check can require, and their flags in VehicleLocalPosition."""
-
-_MAX_RECENT: Final = 20  # recent events listed
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,61 +40,79 @@ def faults_of(
 ) -> list[str]:
     """Return the faults that fail a health check, one line each; `only`: consider only reports of this host."""
     checked = [report for report in reports if only is None or report.host == only]
-    vehicles = {
-        name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()
+    states = {
+        name: _StateAt(report.now, report.vehicles[name])
+        for name, report in by_vehicle(checked).items()
     }
-    missing = [name for name in expected.expect if name not in vehicles]
-    active = [name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent]
-    names = f": {', '.join(active[:20])}" if active else ""
-    faults = [
-        f"vehicle {name} is missing: it has no publisher{names and f'; published{names}'}"
-        for name in missing
-    ]
-    if len(active) < (expected.vehicles or 0):
-        faults.append(f"messages arrive from {len(active)} of {expected.vehicles} vehicles{names}")
-    for name, (now, vehicle) in vehicles.items():
+    faults = [*_faults_of_fleet(states, expected)]
+    for name, state in states.items():
         if not expected.expect or name in expected.expect:
-            faults += [
-                f"vehicle {name}: {fault}"
-                for fault in _faults_of_vehicle(name, vehicle, now, expected)
-            ]
-    return list(dict.fromkeys([*faults, *_recent_faults(checked, expected)]))
+            own = _faults_of_vehicle(name, state, expected)
+            faults += [f"vehicle {name}: {fault}" for fault in own]
+    faults += _recent_faults(checked, expected)
+    return list(dict.fromkeys(faults))
 
 
-def _faults_of_vehicle(
-    name: str, vehicle: VehicleReport, now: float, expected: Expectation
-) -> Iterator[str]:
-    invalid = [each for each in expected.valid if VALID[each] in vehicle.flags]
-    unknown = [each for each in expected.valid if VALID[each] in vehicle.unknown]
+class _StateAt(NamedTuple):
+    """The state of a vehicle, and the time of its report."""
+
+    now: float
+    vehicle: VehicleReport
+
+
+def _faults_of_fleet(states: Mapping[str, _StateAt], expected: Expectation) -> Iterator[str]:
+    """Yield the missing vehicles, and that there are too few."""
+    active = [name for name, state in states.items() if not state.vehicle.is_silent]
+    names = ", ".join(active[: limits.SHOWN_NAMES])
+    published = f"; published: {names}" if names else ""
+    for name in expected.expect:
+        if name not in states:
+            yield f"vehicle {name} is missing: it has no publisher{published}"
+    if expected.vehicles is not None and len(active) < expected.vehicles:
+        of_names = f": {names}" if names else ""
+        yield f"messages arrive from {len(active)} of {expected.vehicles} vehicles{of_names}"
+
+
+def _faults_of_vehicle(name: str, state: _StateAt, expected: Expectation) -> Iterator[str]:
+    now, vehicle = state
+    worst = f"{vehicle.text}{format_since(vehicle.since, now)}"
     if vehicle.is_silent:
         if name in expected.expect or not vehicle.is_forgotten(now):
-            yield f"{vehicle.text}{format_since(vehicle.since, now)}"
-    elif invalid:
-        since = min(filter(None, (vehicle.flags[VALID[each]] for each in invalid)), default=None)
+            yield worst
+        return
+    invalid = [quantity for quantity in expected.valid if VALID[quantity] in vehicle.flags]
+    if invalid:
+        starts = [vehicle.flags[VALID[quantity]] for quantity in invalid]
+        since = min((start for start in starts if start), default=None)
         yield f"{', '.join(invalid)} not valid{format_since(since, now)}"
     elif expected.well and vehicle.severity == "bad":
-        yield f"{vehicle.text}{format_since(vehicle.since, now)}"
+        yield worst
     elif expected.valid and not vehicle.has_position:
         yield "publishes no position"
-    if unknown and not vehicle.is_silent:
+    unknown = [quantity for quantity in expected.valid if VALID[quantity] in vehicle.unknown]
+    if unknown:
         yield f"validity of {', '.join(unknown)} is unknown: the vehicle does not send it"
 
 
 def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
+    """Yield the recent bad and watch events."""
+    if expected.within is None:
+        return
     # Selected before the events of a service are merged: what is said of one vehicle does not concern another.
-    selected = [
-        replace(report, events=tuple(without_wild(report.events)))
-        for report in reports
-        if not expected.expect or report.vehicles.keys() & {*expected.expect}
-    ]
+    selected = list(reports)
+    if expected.expect:
+        required = {*expected.expect}
+        selected = [report for report in reports if report.vehicles.keys() & required]
+    sound = [replace(report, events=tuple(without_wild(report.events))) for report in selected]
     lines = []
-    for report, event in once_per_service(selected):
-        is_recent = expected.within is not None and event.time > report.now - expected.within
+    for report, event in once_per_service(sound):
+        is_recent = event.time > report.now - expected.within
         is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
         if is_recent and is_selected and event.severity != "info":
             name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
             at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
             lines.append(f"{name}: {event.text}, at {at}")
-    yield from lines[:_MAX_RECENT]
-    if (more := len(lines) - _MAX_RECENT) > 0:
+    yield from lines[: limits.SHOWN_NAMES]
+    more = len(lines) - limits.SHOWN_NAMES
+    if more > 0:
         yield f"{counted(more, 'more event')} in the last {expected.within:g} s"

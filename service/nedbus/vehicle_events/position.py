@@ -1,10 +1,12 @@
 """Event detector for the position estimate: flags, resets, origin changes and unexplained jumps."""
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
 
 from nedbus_msgs import JUMP_FIELDS, RESET_COUNTERS, Quantity, jump_of
 from nedbus_msgs.frames import GlobalPosition, MapProjection
@@ -12,22 +14,29 @@ from nedbus_msgs.frames import GlobalPosition, MapProjection
 from .detectors import ChangeDetector, Fields, Finding, detect_flags, read_fields
 from .event import ALONE, Event
 from .kinds import Severity, flagged
-from .rules import JUMP_DISTANCE, JUMP_SHARE, LARGE_CORRECTION, MAX_ALONE, SMALL_RESET
+from .rules import JUMP_DISTANCE, JUMP_SHARE, LARGE_CORRECTION, SMALL_RESET, WILD
 
 _KINDS: Final = flagged("VehicleLocalPosition")
-_COMPARED: Final = (
-    "xy_valid", *(flag for kind in _KINDS for flag in kind.flags if flag != "xy_valid"), *RESET_COUNTERS.values(),
-    "ref_timestamp",
-)  # fmt: skip
+_FLAGS: Final = tuple(flag for kind in _KINDS for flag in kind.flags if flag != "xy_valid")
+_COMPARED: Final = ("xy_valid", *_FLAGS, *RESET_COUNTERS.values(), "ref_timestamp")
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; smaller steps are never jumps
-_MAX_INTERVAL: Final = 0.5  # s between messages; longer intervals are not checked for jumps
-# By quantity with a reset counter: names of its values in the event's `numbers`, and text.
-_RESETS: Final[Mapping[Quantity, tuple[tuple[str, ...], str]]] = {
-    "xy": (("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)"),
-    "z": (("up",), "height by {up:z.1f} m"),
-    "vxy": (("v_north", "v_east"), "vxy by {size:.1f} m/s"),
-    "vz": (("v_up",), "vz by {v_up:z.1f} m/s"),
-    "heading": (("heading",), "heading by {degrees:z.0f} deg"),
+_CHECKED_INTERVAL: Final = 0.5  # s between messages; longer ones are not checked for jumps
+_SMALLEST_MOVE: Final = 0.01  # m of an origin; less is rounding
+
+
+class _Reset(NamedTuple):
+    """A quantity with a reset counter: names of its values in the event's `numbers`, and its text."""
+
+    names: tuple[str, ...]
+    text: str
+
+
+_RESETS: Final[Mapping[Quantity, _Reset]] = {
+    "xy": _Reset(("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)"),
+    "z": _Reset(("up",), "height by {up:z.1f} m"),
+    "vxy": _Reset(("v_north", "v_east"), "vxy by {size:.1f} m/s"),
+    "vz": _Reset(("v_up",), "vz by {v_up:z.1f} m/s"),
+    "heading": _Reset(("heading",), "heading by {degrees:z.0f} deg"),
 }
 _POSITION: Final[tuple[Quantity, ...]] = ("xy", "z")
 _VELOCITY: Final[tuple[Quantity, ...]] = ("vxy", "vz")
@@ -37,7 +46,37 @@ _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
 # read when a compared field changes, with their defaults
 _CONTEXT: Final = dict.fromkeys(JUMP_FIELDS, math.nan)
 
-Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
+
+class _Motion(NamedTuple):
+    """Position [m] and velocity [m/s]; NaN if unknown."""
+
+    x: float = math.nan
+    y: float = math.nan
+    vx: float = math.nan
+    vy: float = math.nan
+
+
+class _Step(NamedTuple):
+    """Motion that velocity does not explain: its begin [s], and how far it led north and east [m]."""
+
+    begin: float
+    north: float
+    east: float
+
+    @property
+    def distance(self) -> float:
+        return math.hypot(self.north, self.east)
+
+    def followed_by(self, step: _Step) -> _Step:
+        return _Step(self.begin, self.north + step.north, self.east + step.east)
+
+
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """When an origin changed [us], and the one before."""
+
+    stamp: int = 0
+    origin: tuple[Any, ...] = ()
 
 
 class PositionDetector(ChangeDetector):
@@ -46,27 +85,32 @@ class PositionDetector(ChangeDetector):
     def __init__(self) -> None:
         super().__init__(_COMPARED, [*_CONTEXT], self._detect_position)
         self._read_motion = read_fields(("x", "y", "vx", "vy"), math.nan)
-        self._motion: tuple[float, ...] = ()
-        self._motion_before: tuple[float, ...] = ()
-        self._jump: Step | None = None  # in progress
-        # time when an origin changed [us], and the one before
-        self._left: tuple[int, object] = (0, ())
+        self._motion: tuple[float, ...] = _Motion()
+        self._motion_before: tuple[float, ...] = self._motion
+        self._jump: _Step | None = None  # in progress
+        self._left = _Left()
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings in a message, None if nothing has changed."""
-        before, motion = self._motion, self._read_motion(message)
-        self._motion_before, self._motion = before, motion
-        if (found := super().add(message, missing)) is not None:
-            return found
+        before = self._motion
+        motion = self._read_motion(message)
+        self._motion_before = before
+        self._motion = motion
+        findings = super().add(message, missing)
+        if findings is not None:
+            return findings
         has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
-        step = self._unexplained_step() if has_moved and self._state[0] else None
-        return None if step is None and self._jump is None else self._track_jump(step)
+        is_valid = self._state[0]
+        step = self._unexplained_step() if has_moved and is_valid else None
+        if step is None and self._jump is None:
+            return None
+        return self._track_jump(step)
 
     @property
     def unknown(self) -> tuple[str, ...]:
         """Flags that the last message did not provide."""
-        last, absent = zip(_COMPARED, self._state, strict=False), self.missing
-        return tuple(name for name, value in last if value is None or name in absent)
+        last = dict(zip(_COMPARED, self._state, strict=False))
+        return tuple(name for name in last if last[name] is None or name in self.missing)
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
@@ -75,113 +119,148 @@ class PositionDetector(ChangeDetector):
 
     def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
         if before:
-            earlier, values = (
-                {
-                    name: _CONTEXT.get(name) if value is None else value
-                    for name, value in fields.items()
-                }
-                for fields in (before, after)
-            )
-            for found in _detect_origin(earlier, values):
-                old, new = ([each[name] for name in _ORIGIN] for each in (earlier, values))
-                is_back = (
-                    self._left == (self.earlier, new)
-                    and self.stamp - self.earlier <= 1e6 * MAX_ALONE
-                )
-                self._left = self.stamp, old
-                yield replace(found, numbers={**found.numbers, ALONE: 1}) if is_back else found
-            counts = [
-                (name, [each[RESET_COUNTERS[name]] for each in (earlier, values)])
-                for name in _RESETS
-            ]
-            quantities = [name for name, each in counts if None not in each and each[0] != each[1]]
-            if quantities:
-                yield _reset(quantities, earlier, values)
-            # NaN equals NaN
-            is_same_origin = all(str(earlier[name]) == str(values[name]) for name in _ORIGIN)
-            is_comparable = values["xy_valid"] and "xy" not in quantities and is_same_origin
-            yield from self._track_jump(self._unexplained_step() if is_comparable else None)
+            yield from self._detect_corrections(_with_context(before), _with_context(after))
         yield from detect_flags(_KINDS, before, after)
 
-    def _unexplained_step(self) -> Step | None:
+    def _detect_corrections(self, before: Fields, after: Fields) -> Iterator[Finding]:
+        yield from self._detect_origin(before, after)
+        quantities = [name for name in _RESETS if _was_reset(name, before, after)]
+        if quantities:
+            yield _reset(quantities, before, after)
+        # as text, because NaN equals NaN
+        is_same_origin = str(_origin_of(before)) == str(_origin_of(after))
+        is_comparable = after["xy_valid"] and "xy" not in quantities and is_same_origin
+        step = self._unexplained_step() if is_comparable else None
+        yield from self._track_jump(step)
+
+    def _detect_origin(self, before: Fields, after: Fields) -> Iterator[Finding]:
+        finding = _change_of_origin(before, after)
+        if finding is None:
+            return
+        returned_to = _Left(self.earlier, _origin_of(after))
+        is_back = self._left == returned_to and self.stamp - self.earlier <= 1e6 * WILD
+        self._left = _Left(self.stamp, _origin_of(before))
+        if is_back:
+            finding = replace(finding, numbers={**finding.numbers, ALONE: 1})
+        yield finding
+
+    def _unexplained_step(self) -> _Step | None:
         """Return the motion since the last message that velocity does not explain; None if below the jump limit."""
         seconds = (self.stamp - self.earlier) / 1e6
-        if not 0 < seconds <= _MAX_INTERVAL:
+        if not 0 < seconds <= _CHECKED_INTERVAL:
             return None
-        (x_before, y_before, vx_before, vy_before) = self._motion_before
-        (x, y, vx, vy) = self._motion
-        north = x - x_before - (vx + vx_before) / 2 * seconds
-        east = y - y_before - (vy + vy_before) / 2 * seconds
-        limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
-        return (
-            (self.earlier / 1e6, north, east)
-            if north * north + east * east > limit * limit
-            else None
+        before = _Motion._make(self._motion_before)
+        motion = _Motion._make(self._motion)
+        north = motion.x - before.x - (motion.vx + before.vx) / 2 * seconds
+        east = motion.y - before.y - (motion.vy + before.vy) / 2 * seconds
+        speed = math.hypot(motion.vx, motion.vy)
+        limit = JUMP_DISTANCE + JUMP_SHARE * speed * seconds
+        if north * north + east * east > limit * limit:
+            return _Step(self.earlier / 1e6, north, east)
+        return None  # also for NaN
+
+    def _track_jump(self, step: _Step | None) -> Iterator[Finding]:
+        """Add a step to the jump in progress; yield the jump when it ends."""
+        jump = self._jump
+        self._jump = step
+        if jump is None:
+            return
+        if step is not None:
+            self._jump = jump.followed_by(step)
+        elif jump.distance > JUMP_DISTANCE:  # otherwise one message was wild
+            yield self._jump_of(jump)
+
+    def _jump_of(self, jump: _Step) -> Finding:
+        distance = jump.distance
+        seconds = self.stamp / 1e6 - jump.begin
+        return Finding(
+            "jump",
+            "once",
+            f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset",
+            numbers={
+                "distance": distance,
+                "north": jump.north,
+                "east": jump.east,
+                "begin": jump.begin,
+            },
+            is_large=distance >= LARGE_CORRECTION,
         )
 
-    def _track_jump(self, step: Step | None) -> Iterator[Finding]:
-        """Add a step to the jump in progress; yield the jump when it ends."""
-        jump, self._jump = self._jump, step
-        if jump is not None and step is not None:
-            self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
-        elif jump is not None and (distance := math.hypot(*jump[1:])) > JUMP_DISTANCE:
-            # else one message was wild
-            seconds = self.stamp / 1e6 - jump[0]
-            text = f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset"
-            numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
-            yield Finding(
-                "jump", "once", text, numbers=numbers, is_large=distance >= LARGE_CORRECTION
-            )
+
+def _with_context(fields: Fields) -> Fields:
+    """Return fields with the defaults of those in `_CONTEXT` that were not provided."""
+    known = {name: value for name, value in fields.items() if value is not None}
+    return fields | _CONTEXT | known
+
+
+def _origin_of(fields: Fields) -> tuple[Any, ...]:
+    return tuple(fields[name] for name in _ORIGIN)
+
+
+def _was_reset(name: Quantity, before: Fields, after: Fields) -> bool:
+    counter = RESET_COUNTERS[name]
+    if before[counter] is None or after[counter] is None:
+        return False
+    return bool(before[counter] != after[counter])
 
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
     numbers: dict[str, float] = {}
-    known, unknown = [], []
+    known: list[str] = []
+    unknown: list[str] = []
     for name in quantities:
         size = jump_of(name, before, after)
         if size is None:
             unknown.append(f"{name} by an unknown amount")
             continue
-        up = [-value for value in size] if name in ("z", "vz") else size
-        numbers |= zip(_RESETS[name][0], up, strict=True)
+        is_down = name in ("z", "vz")
+        values = [-value for value in size] if is_down else size
+        numbers |= zip(_RESETS[name].names, values, strict=True)
         known.append(_describe(name, numbers))
     sizes = [abs(size) for name, size in numbers.items() if name != "heading"]
     is_small = not unknown and all(size < SMALL_RESET for size in sizes)
-    is_large = any(size >= LARGE_CORRECTION for size in sizes)
-    text = f"reset of {', '.join(known + unknown)}"
     severity: Severity | None = "info" if is_small else None
     return Finding(
-        "reset", "once", text, tuple(quantities), numbers, severity=severity, is_large=is_large
+        "reset",
+        "once",
+        f"reset of {', '.join(known + unknown)}",
+        tuple(quantities),
+        numbers,
+        severity=severity,
+        is_large=any(size >= LARGE_CORRECTION for size in sizes),
     )
 
 
 def _describe(name: Quantity, numbers: Mapping[str, float]) -> str:
     """Return the text for a quantity of a reset, whose `numbers` have its sizes."""
-    names, text = _RESETS[name]
-    sizes = {each: numbers[each] for each in names}
-    return text.format(
-        **sizes, size=math.hypot(*sizes.values()), degrees=math.degrees(sizes[names[0]])
-    )
+    reset = _RESETS[name]
+    sizes = {key: numbers[key] for key in reset.names}
+    degrees = math.degrees(sizes[reset.names[0]])
+    return reset.text.format(**sizes, size=math.hypot(*sizes.values()), degrees=degrees)
 
 
 def _sizes_of(reset: Event) -> dict[Quantity, float]:
     """Return the known sizes of a reset [m, m/s], without that of the heading."""
-    return {
-        name: math.hypot(*(reset.numbers[each] for each in _RESETS[name][0]))
-        for name in _RESETS
-        if name != "heading" and name in reset.names and reset.numbers.keys() >= {*_RESETS[name][0]}
-    }
+    sizes: dict[Quantity, float] = {}
+    for name in (*_POSITION, *_VELOCITY):
+        keys = _RESETS[name].names
+        is_known = reset.numbers.keys() >= set(keys)
+        if is_known and name in reset.names:
+            sizes[name] = math.hypot(*(reset.numbers[key] for key in keys))
+    return sizes
 
 
 def large_part(reset: Event) -> str:
     """Return the text of a reset, without the quantities that a large one moved little."""
     sizes = _sizes_of(reset)
-    large = [name for name, size in sizes.items() if size >= LARGE_CORRECTION]
-    return (
-        f"reset of {', '.join(_describe(name, reset.numbers) for name in large)}"
-        if large
-        else reset.text
-    )
+    large = [
+        _describe(name, reset.numbers)
+        for name in _RESETS
+        if sizes.get(name, 0.0) >= LARGE_CORRECTION
+    ]
+    if not large:
+        return reset.text
+    return f"reset of {', '.join(large)}"
 
 
 def short_text(correction: Event) -> str:
@@ -191,36 +270,43 @@ def short_text(correction: Event) -> str:
     sizes = _sizes_of(correction)
     parts = []
     for names in _POSITION, _VELOCITY:
-        name = max(names, key=lambda each: sizes.get(each, 0.0))
-        if sizes.get(name, 0.0) >= SMALL_RESET:
-            parts.append(_DIRECTIONS.sub("", _describe(name, correction.numbers)))
-    return f"reset of {', '.join(parts)}" if parts else correction.text
+        largest = max(names, key=lambda name: sizes.get(name, 0.0))
+        if sizes.get(largest, 0.0) >= SMALL_RESET:
+            text = _describe(largest, correction.numbers)
+            parts.append(_DIRECTIONS.sub("", text))
+    if not parts:
+        return correction.text
+    return f"reset of {', '.join(parts)}"
 
 
-def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield an origin that was set or moved; one that was not provided before, and `ref_timestamp`, are ignored."""
-    had, has = (
-        each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"])
-        for each in (before, after)
-    )
-    if has and not had and before["xy_global"] is not None:
-        origin = GlobalPosition.wrapped(after["ref_lat"], after["ref_lon"], math.nan)
-        text = f"origin set at {origin.latitude:.6f}, {origin.longitude:.6f}"
-        numbers = {"latitude": origin.latitude, "longitude": origin.longitude}
-        yield Finding("origin_set", "once", text, numbers=numbers)
-    elif has and had:
-        moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(
-            after["ref_lat"], after["ref_lon"]
-        )
-        distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
-        up = up if math.isfinite(up) else 0.0
-        if distance >= 0.01 or abs(up) >= 0.01:
-            text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
-            severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
-            yield Finding(
-                "origin_moved",
-                "once",
-                text,
-                numbers={"distance": distance, "up": up},
-                severity=severity,
-            )
+def _change_of_origin(before: Fields, after: Fields) -> Finding | None:
+    """Return an origin that was set or moved; one that was not provided before, and `ref_timestamp`, are ignored."""
+    if not _has_origin(after):
+        return None
+    if _has_origin(before):
+        return _move_of_origin(before, after)
+    if before["xy_global"] is None:
+        return None
+    origin = GlobalPosition.wrapped(after["ref_lat"], after["ref_lon"], math.nan)
+    text = f"origin set at {origin.latitude:.6f}, {origin.longitude:.6f}"
+    numbers = {"latitude": origin.latitude, "longitude": origin.longitude}
+    return Finding("origin_set", "once", text, numbers=numbers)
+
+
+def _has_origin(fields: Fields) -> bool:
+    return bool(fields["xy_global"]) and math.isfinite(fields["ref_lat"] + fields["ref_lon"])
+
+
+def _move_of_origin(before: Fields, after: Fields) -> Finding | None:
+    projection = MapProjection(before["ref_lat"], before["ref_lon"])
+    distance = math.hypot(*projection.project(after["ref_lat"], after["ref_lon"]))
+    up = after["ref_alt"] - before["ref_alt"]
+    if not math.isfinite(up):
+        up = 0.0
+    largest = max(distance, abs(up))
+    if largest < _SMALLEST_MOVE:
+        return None
+    severity: Severity | None = "info" if largest < SMALL_RESET else None
+    text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
+    numbers = {"distance": distance, "up": up}
+    return Finding("origin_moved", "once", text, numbers=numbers, severity=severity)

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
+from nedbus import limits
 from nedbus.timings import TIMINGS
 from nedbus_msgs import TOPICS, check_vehicle
 
-from .event import ALL, Condition, Event, Seconds
-from .event_log import KEPT, MAX_VEHICLES, EventLog
+from .event import ALL, Condition, Event, Seconds, State
+from .event_log import EventLog
 from .kinds import KINDS, OF_SERVICE, rank_vehicle
+from .vehicle import Vehicle
 
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests this report instead of the status; its value is the period [s]."""
 
-# per vehicle; those that nedbus defines come first, because verdicts depend on them
-_MAX_TOPICS: Final = 30
 _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 
@@ -62,30 +63,36 @@ class AccountReport:
     service: str
     host: str
     now: Seconds
-    vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=MAX_VEHICLES)]
-    events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
+    vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=limits.VEHICLES)]
+    events: Annotated[tuple[Event, ...], Field(max_length=limits.EVENTS)] = ()
 
     def about(self, vehicle: str) -> AccountReport:
         """Return what this report says about one vehicle; events of the link and the reader become its events."""
-        vehicles = {name: each for name, each in self.vehicles.items() if name == vehicle}
-        events = (each for each in self.events if each.vehicle in (vehicle, ALL))
-        own = tuple(
-            each if each.vehicle == vehicle else replace(each, vehicle=vehicle) for each in events
-        )
-        return replace(self, vehicles=vehicles, events=own)
+        vehicles = {}
+        if vehicle in self.vehicles:
+            vehicles[vehicle] = self.vehicles[vehicle]
+        events = []
+        for event in self.events:
+            if event.vehicle == vehicle:
+                events.append(event)
+            elif event.vehicle == ALL:
+                events.append(replace(event, vehicle=vehicle))
+        return replace(self, vehicles=vehicles, events=tuple(events))
 
     def split(self, number: int) -> list[AccountReport]:
         """Split the report into `number` parts; [] if it has at most one vehicle and one event."""
-        vehicles, events = list(self.vehicles.items()), self.events
-        many, some = -(-len(vehicles) // number), -(-len(events) // number)
-        return [
-            replace(
-                self,
-                vehicles=dict(vehicles[each * many :][:many]),
-                events=events[each * some :][:some],
-            )
-            for each in range(number if max(len(vehicles), len(events)) > 1 else 0)
-        ]
+        names = [*self.vehicles]
+        if len(names) <= 1 and len(self.events) <= 1:
+            return []
+        vehicles_each = math.ceil(len(names) / number)
+        events_each = math.ceil(len(self.events) / number)
+        parts = []
+        for part in range(number):
+            own = names[part * vehicles_each :][:vehicles_each]
+            events = self.events[part * events_each :][:events_each]
+            vehicles = {name: self.vehicles[name] for name in own}
+            parts.append(replace(self, vehicles=vehicles, events=events))
+        return parts
 
 
 @cache
@@ -95,7 +102,13 @@ def _report_type() -> TypeAdapter[AccountReport]:
 
 
 def report_of(
-    event_log: EventLog, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
+    event_log: EventLog,
+    service: str,
+    host: str,
+    now: float,
+    *,
+    within: float,
+    to_utc: float = 0.0,
 ) -> AccountReport:
     """Return a report of the events in the last `within` seconds, and the state of each vehicle.
 
@@ -106,50 +119,60 @@ def report_of(
     vehicles = {}
     for name, vehicle in list(event_log.vehicles.items()):
         state = event_log.state(name, now)
-        held = list(vehicle.conditions.items())
-        flags = {
-            flag: max(0.0, each.since + to_utc)
-            for (kind, flag), each in held
-            if KINDS[kind].validity
-        }
-        kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
-        known = [condition for _, condition in held] + [*vehicle.usual.values()]
-        bad = (condition for condition in known if condition.severity != "info")
-        unreported = tuple(
-            dict.fromkeys(each for each in bad if each.begin.identity not in reported)
-        )
-        vehicles[name] = VehicleReport(
-            state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
-            tuple(sorted(vehicle.topics, key=lambda each: (each not in TOPICS, each)))[:_MAX_TOPICS],
-            vehicle.main is not None, tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
-            max(0.0, vehicle.first + to_utc),
-        )  # fmt: skip
-    return AccountReport(
-        service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events)
+        vehicles[name] = _report_of_vehicle(vehicle, state, reported, to_utc)
+    later = tuple(event.later(to_utc) for event in events)
+    return AccountReport(service, host, now + to_utc, vehicles, later)
+
+
+def _report_of_vehicle(
+    vehicle: Vehicle, state: State, reported: Collection[object], to_utc: float
+) -> VehicleReport:
+    """Return the report of a vehicle; `reported`: the identities of the events in the report."""
+    flags: dict[str, float | None] = {}
+    for (kind, flag), condition in [*vehicle.conditions.items()]:
+        if KINDS[kind].validity:
+            flags[flag] = max(0.0, condition.since + to_utc)
+    held = [*vehicle.conditions.values(), *vehicle.usual.values()]
+    faults = [condition for condition in held if condition.severity != "info"]
+    unreported = [condition for condition in faults if condition.begin.identity not in reported]
+    kinds = [condition.kind for condition in state.conditions]
+    topics = sorted(vehicle.topics, key=lambda topic: (topic not in TOPICS, topic))
+    return VehicleReport(
+        severity=state.severity,
+        text=state.text,
+        since=None if state.since is None else max(0.0, state.since + to_utc),
+        kinds=tuple(dict.fromkeys(kinds)),
+        flags=flags,
+        topics=tuple(topics[: limits.REPORTED_TOPICS]),
+        has_position=vehicle.main is not None,
+        held=tuple(condition.later(to_utc) for condition in dict.fromkeys(unreported)),
+        unknown=vehicle.unknown,
+        first=max(0.0, vehicle.first + to_utc),
     )
 
 
 def joined(parts: Sequence[AccountReport]) -> AccountReport:
     """Join the parts of a report."""
-    vehicles = {name: vehicle for part in parts for name, vehicle in part.vehicles.items()}
-    return replace(
-        parts[0], vehicles=vehicles, events=tuple(event for part in parts for event in part.events)
-    )
+    vehicles: dict[str, VehicleReport] = {}
+    events: list[Event] = []
+    for part in parts:
+        vehicles |= part.vehicles
+        events += part.events
+    return replace(parts[0], vehicles=vehicles, events=tuple(events))
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
     """Return one report per vehicle, worst vehicle first, preferably from a service that receives the vehicle."""
-    found: dict[str, AccountReport] = {}
+    best: dict[str, AccountReport] = {}
     for report in reports:
         for name in report.vehicles:
-            if name not in found or found[name].vehicles[name].is_silent:
-                found[name] = report
-    return dict(
-        sorted(
-            found.items(),
-            key=lambda each: rank_vehicle(each[0], each[1].vehicles[each[0]].severity),
-        )
-    )
+            if name not in best or best[name].vehicles[name].is_silent:
+                best[name] = report
+
+    def order(name: str) -> tuple[int, str]:
+        return rank_vehicle(name, best[name].vehicles[name].severity)
+
+    return {name: best[name] for name in sorted(best, key=order)}
 
 
 def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountReport, Event]]:
@@ -158,24 +181,28 @@ def once_per_service(reports: Iterable[AccountReport]) -> list[tuple[AccountRepo
     A service reports events of its link and its load for each of its vehicles; they occur once, with the vehicle ALL.
     Only equal ones are merged: the report about one vehicle replaces no event in that about another.
     """
-    found: dict[object, tuple[AccountReport, Event]] = {}
+    events: list[tuple[AccountReport, Event]] = []
+    known = set[object]()
     for report in reports:
         for event in report.events:
-            if event.kind in OF_SERVICE:
-                content = (
-                    event.kind,
-                    event.change,
-                    event.severity,
-                    event.text,
-                    event.time,
-                    event.lasted,
-                )
-                found.setdefault(
-                    (report.service, report.host, content), (report, replace(event, vehicle=ALL))
-                )
-            else:
-                found[id(event)] = report, event
-    return sorted(found.values(), key=lambda each: each[1].time)
+            if event.kind not in OF_SERVICE:
+                events.append((report, event))
+                continue
+            key = (report.service, report.host, _content_of(event))
+            if key not in known:
+                known.add(key)
+                events.append((report, replace(event, vehicle=ALL)))
+
+    def time_of(reported: tuple[AccountReport, Event]) -> float:
+        _, event = reported
+        return event.time
+
+    return sorted(events, key=time_of)
+
+
+def _content_of(event: Event) -> tuple[object, ...]:
+    """Return what an event says, whatever vehicle it is reported for."""
+    return event.kind, event.change, event.severity, event.text, event.time, event.lasted
 
 
 def from_json(content: object) -> AccountReport | None:

@@ -2,9 +2,9 @@
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 from .event import LATE, WINDOW, Condition, Event, State, explain, rank, state_of, without_wild
 from .kinds import KINDS
@@ -13,10 +13,25 @@ from .times import Times
 
 TOGETHER: Final = 1.0  # s; maximum time between the starts of conditions of one story
 _INVALID: Final = " not valid"
+_TOPICS_OF_VISION: Final = {*VISION, *(topic for topic in AID_SOURCES if "_ev_" in topic)}
 # EVIDENCE that does not explain an invalid estimate
 _UNNEEDED: Final = ("barometer", "magnetometer", "battery")
 # PX4's "MAG #0 failed: STALE!", and its event for it
 _SENSOR_FAILURE: Final = re.compile(r"#\d+ fail(ed|ure):")
+
+
+class Period(NamedTuple):
+    """A period on the event log's clock [s]."""
+
+    begin: float
+    end: float
+
+
+class _Key(NamedTuple):
+    """A condition: its kind, and its flag, "" for a kind without flags."""
+
+    kind: str
+    flag: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +40,11 @@ class Span(Condition):
 
     until: float | None = None
     end: Event | None = None
+
+    @property
+    def stop(self) -> float:
+        """The time of its end; infinite while it is active."""
+        return math.inf if self.until is None else self.until
 
     @property
     def is_of_estimate(self) -> bool:
@@ -38,13 +58,13 @@ class Span(Condition):
 
     def holds(self, time: float) -> bool:
         """Return True if the condition is active at `time`, or the single event is recent."""
-        if self.until is not None and self.until == self.since:
-            return self.since <= time < self.until + RECENT
-        return self.is_active(time)
+        is_single = self.until == self.since
+        stop = self.since + RECENT if is_single else self.stop
+        return self.since <= time < stop
 
     def is_active(self, time: float) -> bool:
         """Return True if the condition is active at `time`; a single event never is."""
-        return self.since <= time and (self.until is None or time < self.until)
+        return self.since <= time < self.stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +92,14 @@ class Story:
     in_flight: bool = True
 
     @property
+    def stop(self) -> float:
+        """The time of its end; infinite while it is active."""
+        return math.inf if self.until is None else self.until
+
+    @property
     def is_bad(self) -> bool:
         """True if any of its conditions is bad."""
-        return any(each.severity == "bad" for each in self.spans)
+        return any(span.severity == "bad" for span in self.spans)
 
     @property
     def kind(self) -> str:
@@ -99,13 +124,22 @@ class Story:
 
     def when(self, times: Times, now: float) -> str:
         """Format the period of the fault; `now`: the current time, or the end of the file."""
+        until = now if self.until is None else self.until
+        return times.period(self._dated_begin(), self.end, until - self.since)
+
+    def _dated_begin(self) -> Event | None:
+        """Return the event that began the fault at the fault's own time: silence is detected later."""
         begin = self.begin
-        if begin is not None and begin.time != self.since:  # silence is detected later
-            boot = None if begin.boot is None else begin.boot - (begin.time - self.since)
-            begin = replace(begin, time=self.since, boot=boot)
-        return times.period(
-            begin, self.end, (now if self.until is None else self.until) - self.since
-        )
+        if begin is None or begin.time == self.since:
+            return begin
+        boot = begin.boot
+        if boot is not None:
+            boot -= begin.time - self.since
+        return replace(begin, time=self.since, boot=boot)
+
+    def is_in(self, periods: Sequence[Period]) -> bool:
+        """Return True if it lasted into one of these periods."""
+        return any(period.begin <= self.stop and self.since <= period.end for period in periods)
 
 
 def stories_of(
@@ -126,22 +160,31 @@ def stories_of(
     events = without_wild(events)
     spans = spans_of(events, conditions)
     faults = [_as_fault(span) for span in spans if _is_fault(span)]
-    chosen = sorted(faults, key=lambda span: rank(span, span.until))
-    flights = [*_flights(events)]
+    remaining = sorted(faults, key=lambda span: rank(span, span.until))
+    flights = _flights(events)
     stories: list[Story] = []
-    while chosen:
-        group = _together(chosen[0], chosen)
-        stories.append(_make_story(group, spans, events, topics, flights))
-        chosen = [span for span in chosen if span not in group]
+    while remaining:
+        group = _together(remaining[0], remaining)
+        story = _make_story(group, spans, events, topics)
+        if flights and not story.is_in(flights):
+            story = replace(story, in_flight=False)
+        stories.append(story)
+        remaining = [span for span in remaining if span not in group]
     if at is not None:
-        stories.sort(key=lambda story: story.since)
-        held = [
-            story
-            for story in stories
-            if story.since <= at and (story.until is None or at <= story.until)
-        ]
-        stories = held or [story for story in stories if story.since <= at][-1:] or stories[:1]
+        stories = _stories_at(at, stories)
     return sorted(_without_parts(stories), key=lambda story: story.since)
+
+
+def _stories_at(time: float, stories: Iterable[Story]) -> list[Story]:
+    """Return the stories active at a time, else the last one before, else the first."""
+    ordered = sorted(stories, key=lambda story: story.since)
+    begun = [story for story in ordered if story.since <= time]
+    active = [story for story in begun if time <= story.stop]
+    if active:
+        return active
+    if begun:
+        return begun[-1:]
+    return ordered[:1]
 
 
 def events_outside(stories: Iterable[Story], events: Iterable[Event]) -> list[Event]:
@@ -149,17 +192,17 @@ def events_outside(stories: Iterable[Story], events: Iterable[Event]) -> list[Ev
     told = set[Event]()
     for story in stories:
         told.update(story.before, story.meanwhile, story.after)
-        for span in story.spans:
-            told.add(span.begin)
-    return [
-        event for event in without_wild(events) if event.severity != "info" and event not in told
-    ]
+        told.update(span.begin for span in story.spans)
+    notable = [event for event in without_wild(events) if event.severity != "info"]
+    return [event for event in notable if event not in told]
 
 
 def is_alarm(event: Event) -> bool:
     """Return True for PX4's text about a failed sensor, or of severity critical and worse while armed."""
+    if event.kind != "text":
+        return False
     is_critical = event.severity == "bad" and "armed" in event.numbers
-    return event.kind == "text" and (is_critical or _SENSOR_FAILURE.search(event.text) is not None)
+    return is_critical or _SENSOR_FAILURE.search(event.text) is not None
 
 
 def _is_fault(span: Span) -> bool:
@@ -172,7 +215,9 @@ def _is_fault(span: Span) -> bool:
 
 def _as_fault(span: Span) -> Span:
     """Return a text as a watch condition: PX4 reports a failure, but the estimate may be sound."""
-    return replace(span, severity="watch") if span.kind == "text" else span
+    if span.kind != "text":
+        return span
+    return replace(span, severity="watch")
 
 
 def story_of(
@@ -184,9 +229,11 @@ def story_of(
 ) -> Story | None:
     """Return the story of a single event, or of the condition that an event begins or ends."""
     spans = spans_of(events, conditions)
-    ends = ((span, each) for span in spans for each in (span.begin, span.end) if each is not None)
-    span = next((span for span, each in ends if each.identity == event.identity), None)
-    return None if span is None else _make_story(_together(span, spans), spans, events, topics)
+    for span in spans:
+        ends = [span.begin] if span.end is None else [span.begin, span.end]
+        if event.identity in [end.identity for end in ends]:
+            return _make_story(_together(span, spans), spans, events, topics)
+    return None
 
 
 def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
@@ -194,51 +241,106 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
 
     `conditions`: active or initial conditions, added if their start is not among the events.
     """
-    known = {event.identity for event in events}
+    reported = {event.identity for event in events}
     unreported = [
-        Span(each.kind, each.severity, each.text, each.since, each.begin, each.initial)
-        for each in conditions
-        if each.begin.identity not in known
+        _span_of(condition) for condition in conditions if condition.begin.identity not in reported
     ]
-    spans: list[Span] = []
-    active: dict[tuple[str, str], Span] = {}  # by kind and flag
-
-    def end(keys: Iterable[tuple[str, str]], event: Event) -> None:
-        ended = dict.fromkeys([active.pop(key) for key in keys if key in active])
-        spans.extend(replace(span, until=event.time, end=event) for span in ended)
-
-    # at equal times: reboots, initial conditions, others
-    def order(step: Event | Span) -> tuple[float, bool, bool]:
-        return (
-            (step.since, True, False)
-            if isinstance(step, Span)
-            else (step.time, step.kind != "reboot", True)
-        )
-
-    steps: list[Event | Span] = [*events, *(each for each in unreported if each.initial)]
-    for step in sorted(steps, key=order):
-        event = step.begin if isinstance(step, Span) else step
-        keys = [(step.kind, flag) for flag in KINDS[step.kind].conditions(event.names)]
+    initial = [span for span in unreported if span.initial]
+    later = [span for span in unreported if not span.initial]
+    steps: list[Event | Span] = [*events, *initial]
+    history = _History()
+    for step in sorted(steps, key=_order_of_step):
         if isinstance(step, Span):
-            active |= dict.fromkeys(keys, step)
-        elif step.change == "end":
-            end(keys, step)
-        elif step.change == "once":
-            spans.append(
-                Span(step.kind, step.severity, step.text, step.time, step, until=step.time)
-            )
-            if step.kind == "reboot":
-                end([key for key in active if not KINDS[key[0]].kept_on_reboot], step)
-        elif step.kind != "duplicate" or keys[0] not in active:
-            # each service that publishes the vehicle reports it
-            end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
-            since = step.time - (
-                step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0
-            )
-            active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))
-    spans += dict.fromkeys(active.values())
-    spans += [each for each in dict.fromkeys(unreported) if not each.initial]
+            history.hold(step)
+        else:
+            history.add(step)
+    spans = [*history.ended, *history.active, *dict.fromkeys(later)]
     return sorted(spans, key=lambda span: span.since)
+
+
+def _span_of(condition: Condition) -> Span:
+    return Span(
+        condition.kind,
+        condition.severity,
+        condition.text,
+        condition.since,
+        condition.begin,
+        condition.initial,
+    )
+
+
+def _order_of_step(step: Event | Span) -> tuple[float, int]:
+    """Return a sort key: at equal times reboots, then initial conditions, then other events."""
+    if isinstance(step, Span):
+        return step.since, 1
+    if step.kind == "reboot":
+        return step.time, 0
+    return step.time, 2
+
+
+class _History:
+    """Conditions of a vehicle while its events are replayed.
+
+    `ended`: the spans that have ended, and single events.
+    """
+
+    def __init__(self) -> None:
+        self.ended: list[Span] = []
+        self._active: dict[_Key, Span] = {}
+
+    @property
+    def active(self) -> list[Span]:
+        """The active spans, each once."""
+        return [*dict.fromkeys(self._active.values())]
+
+    def hold(self, span: Span) -> None:
+        """Add a condition that is active from here on."""
+        for key in _keys_of(span.kind, span.begin.names):
+            self._active[key] = span
+
+    def add(self, event: Event) -> None:
+        """Begin, end or add what an event reports."""
+        if event.change == "end":
+            self._end(_keys_of(event.kind, event.names), event)
+        elif event.change == "once":
+            self._add_single(event)
+        else:
+            self._begin(event)
+
+    def _add_single(self, event: Event) -> None:
+        span = Span(
+            event.kind,
+            event.severity,
+            event.text,
+            event.time,
+            event,
+            until=event.time,
+        )
+        self.ended.append(span)
+        if event.kind == "reboot":
+            lost = [key for key in self._active if not KINDS[key.kind].kept_on_reboot]
+            self._end(lost, event)
+
+    def _begin(self, event: Event) -> None:
+        keys = _keys_of(event.kind, event.names)
+        if event.kind == "duplicate" and keys[0] in self._active:
+            return  # each service that publishes the vehicle reports it
+        self._end(keys, event)
+        if event.kind == "gone":
+            self._end([_Key("silent", "")], event)
+        since = event.time
+        if event.kind in ("silent", "gone"):
+            since -= event.numbers.get("age", 0.0)
+        self.hold(Span(event.kind, event.severity, event.text, since, event))
+
+    def _end(self, keys: Iterable[_Key], event: Event) -> None:
+        spans = [self._active.pop(key) for key in keys if key in self._active]
+        for span in dict.fromkeys(spans):
+            self.ended.append(replace(span, until=event.time, end=event))
+
+
+def _keys_of(kind: str, flags: tuple[str, ...]) -> list[_Key]:
+    return [_Key(kind, flag) for flag in KINDS[kind].conditions(flags)]
 
 
 def state_at(spans: Iterable[Span], time: float) -> State:
@@ -246,65 +348,80 @@ def state_at(spans: Iterable[Span], time: float) -> State:
     return state_of(span for span in spans if span.holds(time))
 
 
-def _flights(events: Iterable[Event]) -> Iterator[tuple[float, float]]:
-    """Yield begin and end of each flight: from take-off, or from arming if the data has none, to disarming or a reboot.
+def _flights(events: Iterable[Event]) -> list[Period]:
+    """Return the flights: from take-off, or from arming if the data has none, to disarming or a reboot.
 
-    A landing is no end: a failed estimate can cause a false one in the air.
+    A landing is no end: a failed estimate can cause a false one in the air. Without an arming and a disarming in the
+    data, the flight is as long as the data.
     """
-    armed = took_off = None
-    is_known = False
+    flights: list[Period] = []
+    armed: float | None = None
+    took_off: float | None = None
     for event in events:
         if event.kind == "armed":
             armed = event.time
         elif event.kind == "takeoff" and took_off is None:
             took_off = event.time
         elif event.kind == "disarmed" or (event.kind == "reboot" and armed is not None):
-            begin = took_off if took_off is not None else armed
-            yield -math.inf if begin is None else begin, event.time
-            armed = took_off = None
-            is_known = True
-    begin = took_off if took_off is not None else armed
-    if begin is not None or not is_known:
-        yield -math.inf if begin is None else begin, math.inf
+            flights.append(Period(_begin_of_flight(armed, took_off), event.time))
+            armed = None
+            took_off = None
+    is_flying = armed is not None or took_off is not None
+    if is_flying or not flights:
+        flights.append(Period(_begin_of_flight(armed, took_off), math.inf))
+    return flights
+
+
+def _begin_of_flight(armed: float | None, took_off: float | None) -> float:
+    if took_off is not None:
+        return took_off
+    if armed is not None:
+        return armed
+    return -math.inf  # before the data
 
 
 def _make_story(
-    group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str],
-    flights: Sequence[tuple[float, float]] = (),
-) -> Story:  # fmt: skip
+    group: Sequence[Span],
+    spans: Iterable[Span],
+    events: Sequence[Event],
+    topics: Collection[str],
+) -> Story:
     """Return the story of a group of conditions; start and evidence are those of the first one."""
     span = group[0]
-    until = (
-        None
-        if any(each.until is None for each in group)
-        else max(each.until or 0.0 for each in group)
-    )
-    end = next((each.end for each in group if each.end is not None and each.until == until), None)
-    used = {event for each in group for event in (each.begin, each.end) if event is not None}
-
-    def unused(found: Iterable[Event]) -> list[Event]:
-        new = [each for each in found if each not in used]
-        used.update(new)
-        return new
-
-    before = unused(_evidence(span, spans, events))
-    after = unused(explain(end, events)) if end else []
-    stop = math.inf if until is None else until
-    begun = (
-        each
-        for each in events
-        if each.change != "end" and (each.severity != "info" or each.kind == "mode")
-    )
-    notable = [each for each in begun if each not in used]
-    after += [
-        each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"
-    ]
-    meanwhile = [each for each in notable if span.since <= each.time < stop]
-    in_flight = not flights or any(begin <= stop and span.since <= end for begin, end in flights)
+    stop = max(member.stop for member in group)
+    ends = [member.end for member in group if member.end is not None]
+    last = [end for end in ends if end.time == stop]
+    end = last[0] if last else None
+    used = {*ends, *(member.begin for member in group)}
+    before = [event for event in _evidence(span, spans, events) if event not in used]
+    used.update(before)
+    after: list[Event] = []
+    if end is not None:
+        after = [event for event in explain(end, events) if event not in used]
+        used.update(after)
+    notable = [event for event in events if _is_notable(event) and event not in used]
+    for event in notable:
+        if event.change == "once" and stop <= event.time <= stop + TOGETHER:
+            after.append(event)
     return Story(
-        tuple(group), _text_of(group), span.since, until, None if span.initial else span.begin, end, tuple(before),
-        tuple(meanwhile), tuple(after), _lacking(span, topics), in_flight,
-    )  # fmt: skip
+        spans=tuple(group),
+        what=_text_of(group),
+        since=span.since,
+        until=None if math.isinf(stop) else stop,
+        begin=None if span.initial else span.begin,
+        end=end,
+        before=tuple(before),
+        meanwhile=tuple(event for event in notable if span.since <= event.time < stop),
+        after=tuple(after),
+        lacking=_lacking(span, topics),
+    )
+
+
+def _is_notable(event: Event) -> bool:
+    """Return True for a start or a single event that is not routine, and for a change of the flight mode."""
+    if event.change == "end":
+        return False
+    return event.severity != "info" or event.kind == "mode"
 
 
 def _text_of(group: Sequence[Span]) -> str:
@@ -317,49 +434,51 @@ def _text_of(group: Sequence[Span]) -> str:
 
 def _evidence(span: Span, spans: Iterable[Span], events: Sequence[Event]) -> list[Event]:
     """Return the possible causes of a condition; without any, all other starts of the ten seconds before it."""
-    held = [
-        other
-        for other in spans
-        if (other.initial or not span.initial) and other.is_active(span.since)
-    ]
+    held = [other for other in spans if other.is_active(span.since)]
     if span.initial:
-        return explain(span.begin, (), held)
-    recovered = {
-        other.begin
-        for other in spans
-        if other.end is not None and other.until is not None and other.until < span.since - TOGETHER
-    }
+        return explain(span.begin, (), [other for other in held if other.initial])
     near = [event for event in events if span.since - WINDOW <= event.time <= span.since + LATE]
     near = _without_texts_before_arming(near, span.since)
-    causes = [
-        cause
-        for cause in explain(replace(span.begin, time=span.since), near, held, late=LATE)
-        if not (cause.kind == "text" and cause.time > span.since) and cause not in recovered
-    ]
+    causes = _causes_of(span, spans, near, held)
     if span.kind == "text":
-        causes += [event for event in near if event.kind == "text" and event.severity != "info"]
-        causes = sorted(
-            (cause for cause in causes if cause.time <= span.since), key=lambda cause: cause.time
-        )
-    if causes:
-        return causes
-    others = [
-        event
-        for event in near
-        if event is not span.begin
-        and event.change != "end"
-        and event.time < span.since
-        and (event.severity != "info" or not _is_routine(event))
-    ]
-    return [event for event in others if event.severity != "info"] or others
+        causes = _with_texts(causes, near, span.since)
+    return causes or _other_starts(span, near)
+
+
+def _causes_of(
+    span: Span, spans: Iterable[Span], near: Sequence[Event], held: Sequence[Span]
+) -> list[Event]:
+    """Return the possible causes of a condition: no text of PX4 after its start, nothing that had recovered."""
+    recovered = {other.begin for other in spans if _has_recovered(other, span.since)}
+    causes = explain(replace(span.begin, time=span.since), near, held, late=LATE)
+    in_time = [cause for cause in causes if cause.kind != "text" or cause.time <= span.since]
+    return [cause for cause in in_time if cause not in recovered]
+
+
+def _with_texts(causes: Sequence[Event], near: Iterable[Event], until: float) -> list[Event]:
+    """Return the possible causes of an alarm with the texts of PX4 before it."""
+    texts = [event for event in near if event.kind == "text" and event.severity != "info"]
+    before = [event for event in (*causes, *texts) if event.time <= until]
+    return sorted(before, key=lambda event: event.time)
+
+
+def _has_recovered(span: Span, time: float) -> bool:
+    """Return whether a condition ended well before a time."""
+    return span.end is not None and span.stop < time - TOGETHER
+
+
+def _other_starts(span: Span, near: Iterable[Event]) -> list[Event]:
+    """Return the starts before a condition that no kind relates to it: the notable ones, else all but routine."""
+    starts = [event for event in near if event.change != "end" and event.time < span.since]
+    starts = [event for event in starts if event is not span.begin]
+    notable = [event for event in starts if event.severity != "info"]
+    return notable or [event for event in starts if not _is_routine(event)]
 
 
 def _without_texts_before_arming(events: Sequence[Event], time: float) -> list[Event]:
     """Leave out the texts of failed checks before the arming that precedes `time`: they no longer hold then."""
-    armed = max(
-        (event.time for event in events if event.kind == "armed" and event.time <= time),
-        default=-math.inf,
-    )
+    armings = [event.time for event in events if event.kind == "armed" and event.time <= time]
+    armed = max(armings, default=-math.inf)
     return [
         event for event in events if event.kind != "text" or event.time >= armed or is_alarm(event)
     ]
@@ -373,10 +492,14 @@ def _lacking(span: Span, topics: Collection[str]) -> tuple[str, ...]:
     """Return the topics that may explain a fault of the estimate, but are missing from the data."""
     if not span.is_of_estimate or span.severity == "info" or span.kind == "origin_contradicted":
         return ()
-    needed = {name: choices for name, choices in EVIDENCE.items() if name not in _UNNEEDED}
-    if not {*VISION, *(topic for topic in AID_SOURCES if "_ev_" in topic)}.isdisjoint(topics):
-        del needed["GPS"]  # a flight with vision needs none
-    return tuple(choices[0] for choices in needed.values() if set(choices).isdisjoint(topics))
+    lacking = []
+    for name, choices in EVIDENCE.items():
+        if name in _UNNEEDED or not set(choices).isdisjoint(topics):
+            continue
+        if name == "GPS" and not _TOPICS_OF_VISION.isdisjoint(topics):
+            continue  # a flight with vision needs none
+        lacking.append(choices[0])
+    return tuple(lacking)
 
 
 def _without_parts(stories: Sequence[Story]) -> list[Story]:
@@ -393,30 +516,44 @@ def _is_part(story: Story, worse: Story) -> bool:
 
     What corrected the estimate is a consequence only of a bad one.
     """
-    begin = story.spans[0].begin
-    is_bad_estimate = story.is_bad and story.spans[0].is_of_estimate
-    outlasts = worse.until is not None and (
-        story.until is None or (is_bad_estimate and story.until > worse.until + TOGETHER)
-    )
-    if outlasts:
+    if _outlasts(story, worse):
         return False
+    begin = story.spans[0].begin
     if begin in worse.before and story.kind in KINDS[worse.kind].causes:
         return True
-    if begin not in (*worse.meanwhile, *worse.after):
-        return False
+    is_during = begin in (*worse.meanwhile, *worse.after)
+    return is_during and _is_consequence(story, worse)
+
+
+def _is_consequence(story: Story, worse: Story) -> bool:
+    """Return True if a story that begins during a worse one is no fault beside it."""
     is_consequence = worse.kind in KINDS[story.kind].causes
     if not worse.is_bad:
         return is_consequence and not KINDS[story.kind].correction
-    is_alarm_of_sensor = story.kind == "text" and _SENSOR_FAILURE.search(begin.text) is not None
-    return is_consequence or (not is_alarm_of_sensor and (story.kind == "text" or not story.is_bad))
+    if is_consequence:
+        return True
+    if story.kind == "text":
+        return _SENSOR_FAILURE.search(story.spans[0].begin.text) is None
+    return not story.is_bad
+
+
+def _outlasts(story: Story, worse: Story) -> bool:
+    """Return True if a story lasts until now, or is a bad one of the estimate that lasts longer than another."""
+    if story.until is None:
+        return worse.until is not None
+    is_bad_estimate = story.is_bad and story.spans[0].is_of_estimate
+    return is_bad_estimate and story.until > worse.stop + TOGETHER
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
     """Return all spans of one story: `span`, and losses of validity at the same time or similar initial conditions."""
 
-    def is_part(each: Span) -> bool:
+    def is_part(other: Span) -> bool:
         if KINDS[span.kind].validity:
-            return KINDS[each.kind].validity and abs(each.since - span.since) <= TOGETHER
-        return span.initial and each.initial and each.severity == span.severity == "watch"
+            return KINDS[other.kind].validity and abs(other.since - span.since) <= TOGETHER
+        if not (span.initial and other.initial):
+            return False
+        return span.severity == "watch" and other.severity == "watch"
 
-    return [span, *(each for each in spans if each is not span and is_part(each))]
+    others = [other for other in spans if other is not span and is_part(other)]
+    return [span, *others]

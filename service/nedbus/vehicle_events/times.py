@@ -16,9 +16,11 @@ _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?
 
 # Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles.
 _CLOCKS: Final[Mapping[str, str]] = {
-    "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
-    "boot": "seconds since boot", "start": "seconds since the start of the recording",
-}  # fmt: skip
+    "host": "UTC, from the clocks of the hosts",
+    "vehicle": "UTC, from the vehicle's messages",
+    "boot": "seconds since boot",
+    "start": "seconds since the start of the recording",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +39,14 @@ class Times:
 
     def describe(self, clocks: Collection[str]) -> str:
         """Describe clocks, by the keys that `clock` returns, with the remarks on UTC."""
-        reasons = {each for name, each in self.remarks.items() if name not in self.offsets}
-        notes = {each for name, each in self.remarks.items() if name in self.offsets}
-        boot = f", because {' and '.join(sorted(reasons) or ['no message contains UTC'])}"
-        more = {"boot": boot, "vehicle": "".join(f"; {note}" for note in sorted(notes))}
-        return "; ".join(_CLOCKS[each] + more.get(each, "") for each in sorted(clocks))
+        reasons = {text for name, text in self.remarks.items() if name not in self.offsets}
+        notes = {text for name, text in self.remarks.items() if name in self.offsets}
+        why = " and ".join(sorted(reasons)) or "no message contains UTC"
+        remarks = {
+            "boot": f", because {why}",
+            "vehicle": "".join(f"; {note}" for note in sorted(notes)),
+        }
+        return "; ".join(_CLOCKS[clock] + remarks.get(clock, "") for clock in sorted(clocks))
 
     def utc(self, event: Event) -> float | None:
         """Return the Unix time of an event [s], None if unknown."""
@@ -55,8 +60,10 @@ class Times:
 
     def clock(self, event: Event) -> str:
         """Return the clock used for an event: host, vehicle, boot or start."""
-        if self.is_live or self.utc(event) is not None:
-            return "host" if self.is_live else "vehicle"
+        if self.is_live:
+            return "host"
+        if self.utc(event) is not None:
+            return "vehicle"
         return "start" if event.boot is None else "boot"
 
     @staticmethod
@@ -67,9 +74,11 @@ class Times:
     def text(self, event: Event) -> str:
         """Format the time of an event without the date, as `find` parses it: 14:05:12.3, 123.400 or +12.300."""
         utc = self.utc(event)
-        if utc is None:
-            return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
-        return format_utc(utc)
+        if utc is not None:
+            return format_utc(utc)
+        if event.boot is not None:
+            return f"{event.boot:.3f}"
+        return f"+{event.time:.3f}"
 
     def text_at(self, time: float) -> str:
         """Format a time of live data on the event log's clock [s], as UTC."""
@@ -77,17 +86,18 @@ class Times:
 
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
         """Format a period and its duration [s]; `begin` and `end` are None if they are outside the data."""
-        still = f"until {'now' if self.is_live else 'the end'}"
+        still = "until now" if self.is_live else "until the end"
+        duration = f"({format_duration(lasted)})"
         if begin is None:
-            return f"from the first message {still} ({format_duration(lasted)})"
-        since = f"{self.text(begin)} {Times.unit(self.clock(begin))}"
-        if end is None:
-            return (
-                f"at {since}"
-                if lasted == 0
-                else f"from {since}, {still} ({format_duration(lasted)})"
-            )
-        return f"from {self.text(begin)} to {self.text(end)} {Times.unit(self.clock(end))} ({format_duration(lasted)})"
+            return f"from the first message {still} {duration}"
+        start = self.text(begin)
+        if end is not None:
+            unit = Times.unit(self.clock(end))
+            return f"from {start} to {self.text(end)} {unit} {duration}"
+        unit = Times.unit(self.clock(begin))
+        if lasted == 0:
+            return f"at {start} {unit}"
+        return f"from {start} {unit}, {still} {duration}"
 
     def find(self, text: str, near: Event) -> float:
         """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the event log's time [s].
@@ -97,21 +107,9 @@ class Times:
         Raises ValueError for other text, for UTC or time since boot if no message has it, and for +12.3 in live data.
         """
         text = text.strip()
-        if found := _CLOCK.fullmatch(text):
-            utc = self.utc(near)
-            if utc is None:
-                raise ValueError(
-                    self.remarks.get(near.vehicle, "no message of this vehicle has UTC")
-                )
-            midnight = datetime.fromtimestamp(utc, UTC).replace(
-                hour=0, minute=0, second=0, microsecond=0
-            )
-            since = timedelta(
-                hours=int(found[1]), minutes=int(found[2]), seconds=float(found[3] or 0)
-            )
-            # closest, also across midnight
-            step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200
-            return near.time + step
+        clock = _CLOCK.fullmatch(text)
+        if clock is not None:
+            return self._find_utc(clock, near)
         try:
             seconds = float(text)
         except ValueError:
@@ -122,6 +120,23 @@ class Times:
             if self.is_live:
                 raise ValueError("live data has no start")
             return seconds
-        if near.boot is None and self.is_live:
+        if near.boot is not None:
+            return near.time + seconds - near.boot
+        if self.is_live:
             raise ValueError("no message of this vehicle has the time since boot")
-        return near.time + seconds - (near.time if near.boot is None else near.boot)
+        return seconds
+
+    def _find_utc(self, clock: re.Match[str], near: Event) -> float:
+        """Return the event log's time [s] of a time of day, of the day on which it is closest to an event."""
+        utc = self.utc(near)
+        if utc is None:
+            raise ValueError(self.remarks.get(near.vehicle, "no message of this vehicle has UTC"))
+        day = datetime.fromtimestamp(utc, UTC)
+        midnight = day.replace(hour=0, minute=0, second=0, microsecond=0)
+        hours, minutes, seconds = clock.groups(default="0")
+        time = timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds))
+        step = (midnight + time).timestamp() - utc
+        half_a_day = 43_200
+        # closest, also across midnight
+        closest = (step + half_a_day) % (2 * half_a_day) - half_a_day
+        return near.time + closest

@@ -1,12 +1,14 @@
 """Verdict on a vehicle in one or two sentences: usable or not, since when, for how long, and why."""
 
+from __future__ import annotations
+
 import math
 import re
 import textwrap
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Final
+from typing import Final, NamedTuple
 
 from nedbus.clock import format_duration
 
@@ -21,8 +23,8 @@ _GLOBAL: Final = "vehicle_global_position"
 _WIDTH: Final = 97  # columns next to a short vehicle name
 _LINES: Final = 3
 _MODULE: Final = re.compile(r'(?<=PX4: )"\[\w+\] ')  # the name of PX4's module before a text
-_MAX_TEXTS: Final = 2  # of PX4 in the evidence
-_MAX_CAUSES: Final = 3  # other events in the evidence
+_QUOTED: Final = 2  # texts of PX4 in the evidence
+_NAMED: Final = 3  # other events in the evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,54 +72,77 @@ class _Parts:
     is_other_urgent: bool = False
 
     def render(self, times: Times) -> str:
-        chosen: list[Event] = []
-        missing, others = "", list[str]()
-
-        def text() -> str:
-            sentences = [self.state]
-            if chosen:
-                sentences.append(f"Evidence: {_listed(chosen, times)}.")
-            elif self.none:
-                sentences.append(self.none)
-            if missing:
-                sentences.append(missing)
-            if others:
-                sentences.append(f"Also {'; '.join(others)}.")
-            return " ".join(sentences)
-
-        def fits() -> bool:
-            return len(textwrap.wrap(text(), _WIDTH)) <= _LINES
-
-        def add_evidence(events: Iterable[Event]) -> None:
-            for event in events:
-                chosen.append(event)
-                if not fits():
-                    chosen.pop()
-
-        def add_others(parts: Iterable[str]) -> None:
-            for part in parts:
-                others.append(part)
-                if not fits():
-                    others.pop()
-
-        def add_missing() -> None:
-            nonlocal missing
-            missing = self.missing
-            if not fits():
-                missing = ""
-
+        """Return the text."""
+        text = _Text(self, times)
         is_quoted_only = all(event.kind == "text" for event in self.evidence)
-        add_evidence(self.evidence[:1] if is_quoted_only else self.evidence[:2])
+        first = 1 if is_quoted_only else 2
+        text.add_evidence(self.evidence[:first])
         if self.is_other_urgent:
-            add_others(self.others[:1])
+            text.add_others(self.others[:1])
         if is_quoted_only:
-            add_missing()
-        add_evidence(event for event in self.evidence if event not in chosen)
-        add_missing()
-        add_others(part for part in self.others if part not in others)
-        return (
-            textwrap.shorten(text(), _LINES * _WIDTH, placeholder="...") if not fits() else text()
-        )
+            text.add_missing()
+        text.add_evidence(self.evidence)
+        text.add_missing()
+        text.add_others(self.others)
+        return text.shortened
+
+
+class _Text:
+    """The text of a verdict, to which parts are added as long as it fits into three lines."""
+
+    def __init__(self, parts: _Parts, times: Times) -> None:
+        self._parts = parts
+        self._times = times
+        self._evidence: list[Event] = []
+        self._missing = ""
+        self._others: list[str] = []
+
+    def add_evidence(self, events: Iterable[Event]) -> None:
+        """Add the events that fit and are not in the text."""
+        for event in events:
+            if event in self._evidence:
+                continue
+            self._evidence.append(event)
+            if not self._fits:
+                self._evidence.pop()
+
+    def add_others(self, parts: Iterable[str]) -> None:
+        """Add the parts that fit and are not in the text."""
+        for part in parts:
+            if part in self._others:
+                continue
+            self._others.append(part)
+            if not self._fits:
+                self._others.pop()
+
+    def add_missing(self) -> None:
+        """Add the topics that are not in the data, if they fit."""
+        self._missing = self._parts.missing
+        if not self._fits:
+            self._missing = ""
+
+    @property
+    def shortened(self) -> str:
+        """The text, cut if the state alone is too long."""
+        if self._fits:
+            return str(self)
+        return textwrap.shorten(str(self), _LINES * _WIDTH, placeholder="...")
+
+    @property
+    def _fits(self) -> bool:
+        return len(textwrap.wrap(str(self), _WIDTH)) <= _LINES
+
+    def __str__(self) -> str:
+        sentences = [self._parts.state]
+        if self._evidence:
+            sentences.append(f"Evidence: {_listed(self._evidence, self._times)}.")
+        elif self._parts.none:
+            sentences.append(self._parts.none)
+        if self._missing:
+            sentences.append(self._missing)
+        if self._others:
+            sentences.append(f"Also {'; '.join(self._others)}.")
+        return " ".join(sentences)
 
 
 def _describe_unknown(topics: Collection[str]) -> str:
@@ -150,50 +175,90 @@ def verdict_of(
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     held = list(held)
     stories = stories_of(events, held, topics=topics, at=at)
-    known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
+    has_validity = not set(POSITIONS).isdisjoint(topics) and "xy_valid" not in unknown
+    healthy = True if has_validity else None
     if not stories:
-        remark = "" if known else f"; {_describe_unknown(topics)}"
-        return Verdict(
-            f"{_without_faults(held, times, end, since)}{remark}", known, vehicle, times, end
-        )
-    is_now = times.is_live and at is None
-    past = [
-        story for story in stories if is_now and (story.has_ended(end) or KINDS[story.kind].of_data)
-    ]
-    ranked = sorted(
-        stories,
-        key=lambda story: (story in past, not (story.in_flight or times.is_live), story.rank),
-    )
+        text = _without_faults(held, times, end, since)
+        if not has_validity:
+            text += f"; {_describe_unknown(topics)}"
+        return Verdict(text, healthy, vehicle, times, end)
+    past: list[Story] = []
+    if times.is_live and at is None:
+        past = [story for story in stories if _is_past(story, end)]
+
+    def order(story: Story) -> tuple[bool, bool, tuple[int, int, float]]:
+        is_on_ground = not (story.in_flight or times.is_live)
+        return story in past, is_on_ground, story.rank
+
+    ranked = sorted(stories, key=order)
     worst = ranked[0]
-    is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
-    usable = False if worst.is_bad and worst not in past and is_then else known
-    valid_since = _valid_since(events, since)
-    head = _head(worst, stories, times, valid_since, is_past=worst in past, usable=usable)
-    if not is_then:
-        head = "no fault at that time; nearest: "
-    cause, ordered = _evidence(worst, stories, events)
-    none = (
-        f"No evidence in the {WINDOW:.0f} s before."
-        if worst.begin and worst.is_bad and not cause
-        else ""
-    )
-    missing = (
-        f"Not in the data: {', '.join(worst.lacking)}."
-        if worst.lacking and (worst.is_bad or not cause)
-        else ""
-    )
-    state = f"{head}{_what(worst)}{_count(worst, stories)} {worst.when(times, end)}."
-    others = _others(worst, ranked, cause, stories, times)
+    is_past = worst in past
+    is_then = at is None or _is_during(worst, at)
+    usable = healthy
+    if worst.is_bad and is_then and not is_past:
+        usable = False
+    head = "no fault at that time; nearest: "
+    if is_then:
+        valid_since = _valid_since(events, since)
+        head = _head(
+            worst,
+            stories,
+            times,
+            valid_since,
+            is_past=is_past,
+            usable=usable,
+        )
+    evidence = _evidence(worst, stories, events)
+    others = _others(worst, ranked, evidence.events, times)
     is_other_urgent = sum(story.is_bad for story in stories) > 1
     correction = _largest_correction(worst, stories)
     if correction is not None:
         after_bad_one = 1 if is_other_urgent else 0
         others.insert(after_bad_one, f"{times.text(correction)} {short_text(correction)}")
         is_other_urgent = True
-    text = _Parts(state, tuple(ordered), none, missing, tuple(others), is_other_urgent).render(
-        times
+    parts = _Parts(
+        state=f"{head}{_what(worst)}{_count(worst, stories)} {worst.when(times, end)}.",
+        evidence=tuple(evidence.shown),
+        none=_without_evidence(worst, evidence),
+        missing=_missing(worst, evidence),
+        others=tuple(others),
+        is_other_urgent=is_other_urgent,
     )
-    return Verdict(text, usable, vehicle, times, end, worst.begin, worst.end, cause, tuple(stories))
+    return Verdict(
+        text=parts.render(times),
+        usable=usable,
+        vehicle=vehicle,
+        times=times,
+        checked=end,
+        begin=worst.begin,
+        end=worst.end,
+        cause=evidence.events,
+        stories=tuple(stories),
+    )
+
+
+def _is_past(story: Story, now: float) -> bool:
+    """Return whether a story is no present fault of a vehicle."""
+    return story.has_ended(now) or KINDS[story.kind].of_data
+
+
+def _is_during(story: Story, time: float) -> bool:
+    return story.since <= time <= story.stop
+
+
+def _without_evidence(worst: Story, evidence: _Evidence) -> str:
+    """Return the sentence that there is no evidence, "" if there is some, or none is expected."""
+    if evidence.events or worst.begin is None or not worst.is_bad:
+        return ""
+    return f"No evidence in the {WINDOW:.0f} s before."
+
+
+def _missing(worst: Story, evidence: _Evidence) -> str:
+    """Return the sentence about topics that may hold evidence, "" if it is not needed."""
+    is_needed = worst.is_bad or not evidence.events
+    if not is_needed or not worst.lacking:
+        return ""
+    return f"Not in the data: {', '.join(worst.lacking)}."
 
 
 def _without_faults(
@@ -205,9 +270,10 @@ def _without_faults(
         text = "no faults in the services' history"
     else:
         text = f"no faults since {times.text_at(since)} UTC ({format_duration(end - since)})"
-    usual = dict.fromkeys(each.text for each in held if each.initial and KINDS[each.kind].usual)
+    initial = [condition for condition in held if condition.initial]
+    usual = [condition.text for condition in initial if KINDS[condition.kind].usual]
     if usual:
-        text += f"; throughout: {', '.join(usual)}"
+        text += f"; throughout: {', '.join(dict.fromkeys(usual))}"
     return text
 
 
@@ -248,10 +314,15 @@ def _when_valid(faults: Sequence[Story], times: Times, since: float | None) -> s
     return "now" if since is None else f"since {times.text_at(since)} UTC"
 
 
-def _evidence(
-    worst: Story, stories: Sequence[Story], events: Sequence[Event]
-) -> tuple[tuple[Event, ...], list[Event]]:
-    """Return all evidence for a story in chronological order, and what the text may show, most important first.
+class _Evidence(NamedTuple):
+    """All evidence for a story in chronological order, and what the text may show, most important first."""
+
+    events: tuple[Event, ...]
+    shown: list[Event]
+
+
+def _evidence(worst: Story, stories: Sequence[Story], events: Sequence[Event]) -> _Evidence:
+    """Return the evidence for a story.
 
     Texts of PX4 count until TOGETHER after the start, or all of them for a bad fault that was active in the first
     message; those that also appeared long before the first such fault do not.
@@ -259,58 +330,74 @@ def _evidence(
     first = min(story.since for story in stories if story.kind == worst.kind)
     texts = [event for event in events if event.kind == "text" and event.severity != "info"]
     usual = {text.text for text in texts if text.time < first - WINDOW}
-    late = TOGETHER
-    if worst.begin is None:
-        late = math.inf if worst.is_bad else -WINDOW
-    near = [
-        text
-        for text in texts
-        if -WINDOW <= text.time - worst.since <= late and text is not worst.begin
-    ]
-    quoted = [text for text in near if text.text not in usual]
-    until = math.inf if worst.until is None else worst.until
+    quoted = []
+    for text in texts:
+        is_near = -WINDOW <= text.time - worst.since <= _lateness(worst)
+        if is_near and text is not worst.begin and text.text not in usual:
+            quoted.append(text)
     if not quoted:
-        quoted = [
-            text for text in texts if text.severity == "bad" and worst.since <= text.time <= until
-        ][:1]
-        quoted = [text for text in quoted if text is not worst.begin]
+        quoted = _first_bad(texts, worst)
     causes = [event for event in worst.before if event.kind != "text"]
-    cause = tuple(sorted([*quoted, *causes], key=lambda event: event.time))
-    return cause, _by_importance(worst, quoted, causes)
+    ordered = sorted([*quoted, *causes], key=lambda event: event.time)
+    return _Evidence(tuple(ordered), _by_importance(worst, quoted, causes))
+
+
+def _lateness(worst: Story) -> float:
+    """Return the seconds after the start of a fault in which texts are still its evidence."""
+    if worst.begin is not None:
+        return TOGETHER
+    return math.inf if worst.is_bad else -WINDOW
+
+
+def _first_bad(texts: Iterable[Event], worst: Story) -> list[Event]:
+    """Return the first bad text during a fault, unless it is the fault."""
+    for text in texts:
+        if text.severity == "bad" and _is_during(worst, text.time):
+            return [] if text is worst.begin else [text]
+    return []
 
 
 def _by_importance(worst: Story, texts: Sequence[Event], causes: Sequence[Event]) -> list[Event]:
     """Order evidence: what precedes the fault, nearest in kind and then in time; causes of the sensors first."""
+    quoted = _ordered_texts(worst, texts, causes)
+    named = _ordered_causes(worst, causes, quoted)
+    return [*quoted[:1], *named, *quoted[1:]]
+
+
+def _ordered_texts(worst: Story, texts: Sequence[Event], causes: Sequence[Event]) -> list[Event]:
+    """Return the texts that an evidence quotes, most important first, without those that say the same."""
     subjects = _subjects(worst.what)
     for event in causes:
         subjects |= _subjects(event.text)
 
-    def order(text: Event) -> tuple[bool, bool, float, float]:
+    def order(text: Event) -> tuple[bool, bool, float, float, int]:
         distance = round(abs(text.time - worst.since), 1)
+        length = len(text.text)
         if text.time >= worst.since or worst.begin is None:
-            return True, False, text.numbers.get("level", 0.0), distance
-        return False, subjects.isdisjoint(_subjects(text.text)), text.severity != "bad", distance
+            return True, False, text.numbers.get("level", 0.0), distance, length
+        is_of_other = subjects.isdisjoint(_subjects(text.text))
+        return False, is_of_other, text.severity != "bad", distance, length
 
-    said: list[Event] = []
-    for text in sorted(texts, key=lambda text: (order(text), len(text.text))):
-        if not any(_is_same(text, other) for other in said):
-            said.append(text)
-    said = said[:_MAX_TEXTS]
-    shown = [
-        event for event in causes if not any(_repeats(other, event) for other in (*said, *causes))
-    ]
-    of_worst = _subjects(worst.what)
-    shown.sort(
-        key=lambda event: (
-            of_worst.isdisjoint(_subjects(event.text)),
-            importance(event.kind),
-            -event.time,
-        )
-    )
-    shown = shown[:_MAX_CAUSES]
+    quoted: list[Event] = []
+    for text in sorted(texts, key=order):
+        if not any(_is_same(text, other) for other in quoted):
+            quoted.append(text)
+    return quoted[:_QUOTED]
+
+
+def _ordered_causes(worst: Story, causes: Sequence[Event], quoted: Sequence[Event]) -> list[Event]:
+    """Return the causes that an evidence names, those of the sensors first, without those that others repeat."""
+    subjects = _subjects(worst.what)
+
+    def order(event: Event) -> tuple[bool, int, float]:
+        is_of_other = subjects.isdisjoint(_subjects(event.text))
+        return is_of_other, importance(event.kind), -event.time
+
+    others = [*quoted, *causes]
+    named = [event for event in causes if not _is_repeated(event, others)]
+    named = sorted(named, key=order)[:_NAMED]
     # effects after causes
-    shown.sort(key=lambda event: KINDS[event.kind].message == "VehicleLocalPosition")
-    return [*said[:1], *shown, *said[1:]]
+    return sorted(named, key=lambda event: KINDS[event.kind].message == "VehicleLocalPosition")
 
 
 def _subjects(text: str) -> set[str]:
@@ -322,7 +409,11 @@ def _is_same(text: Event, other: Event) -> bool:
     """Return whether two texts of PX4 say the same: one contains the other, or both report an injected failure."""
     if text.text in other.text or other.text in text.text:
         return True
-    return all(re.search("inject", each.text, re.IGNORECASE) for each in (text, other))
+    return "inject" in text.text.lower() and "inject" in other.text.lower()
+
+
+def _is_repeated(event: Event, others: Iterable[Event]) -> bool:
+    return any(_repeats(other, event) for other in others)
 
 
 def _repeats(other: Event, event: Event) -> bool:
@@ -331,58 +422,45 @@ def _repeats(other: Event, event: Event) -> bool:
         return False
     if event.kind == "ekf_changed":
         return other.kind == "text" and "primary EKF changed" in other.text
-    return (
-        event.kind == "few_satellites"
-        and other.kind == "gps_fix_lost"
-        and "satellites" in other.text
-    )
+    if event.kind == "few_satellites":
+        return other.kind == "gps_fix_lost" and "satellites" in other.text
+    return False
 
 
 def _largest_correction(worst: Story, stories: Sequence[Story]) -> Event | None:
     """Return the largest reset or jump of at least LARGE_CORRECTION during a fault or at its end, no story itself."""
     begins = [story.begin for story in stories]
-    corrections = [
-        event
-        for event in (*worst.meanwhile, *worst.after)
-        if event.kind in ("reset", "jump")
-        and event not in begins
-        and _size(event) >= LARGE_CORRECTION
-    ]
-    return max(corrections, key=_size, default=None)
+    meanwhile = [event for event in (*worst.meanwhile, *worst.after) if event not in begins]
+    corrections = [event for event in meanwhile if event.kind in ("reset", "jump")]
+    large = [event for event in corrections if _size(event) >= LARGE_CORRECTION]
+    return max(large, key=_size, default=None)
 
 
 def _size(correction: Event) -> float:
     """Return the largest part of a reset or jump [m or m/s]; that of the heading and times do not count."""
-    sizes = [
-        abs(size) for name, size in correction.numbers.items() if name not in ("heading", "begin")
-    ]
+    numbers = correction.numbers
+    sizes = [abs(numbers[name]) for name in numbers if name not in ("heading", "begin")]
     return max(sizes, default=0.0)
 
 
 def _others(
-    worst: Story,
-    ranked: Sequence[Story],
-    cause: Sequence[Event],
-    stories: Sequence[Story],
-    times: Times,
+    worst: Story, ranked: Sequence[Story], cause: Sequence[Event], times: Times
 ) -> list[str]:
-    """Return the worst other fault of each kind, worst first."""
+    """Return the worst other fault of each kind, worst first; `ranked`: all stories, worst first."""
     largest: dict[str, Story] = {}
     for story in ranked:
         key = story.what if story.kind == "text" else story.kind
         largest.setdefault(key, story)
     parts = []
     for story in largest.values():
-        if (
-            story is worst
-            or story.kind == worst.kind != "text"
-            or story.begin is None
-            or story.begin in cause
-        ):
+        if story is worst or story.begin is None or story.begin in cause:
             continue
-        if story.kind != worst.kind or is_alarm(story.begin):
-            what = short_text(story.begin) if KINDS[story.kind].correction else _what(story)
-            parts.append(f"{times.text(story.begin)} {what}{_count(story, stories)}")
+        if story.kind == worst.kind and not is_alarm(story.begin):
+            continue  # the text of the worst one counts them
+        what = _what(story)
+        if KINDS[story.kind].correction:
+            what = short_text(story.begin)
+        parts.append(f"{times.text(story.begin)} {what}{_count(story, ranked)}")
     return parts
 
 
@@ -404,5 +482,5 @@ def _what(story: Story) -> str:
 
 
 def _count(story: Story, stories: Iterable[Story]) -> str:
-    number = sum(each.kind == story.kind for each in stories)
+    number = sum(other.kind == story.kind for other in stories)
     return f" (one of {number})" if number > 1 else ""

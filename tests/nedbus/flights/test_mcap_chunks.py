@@ -26,6 +26,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 import nedbus
+from nedbus import limits
 from nedbus.flights.readers.mcap_chunks import ChunkFile, records_of
 from tests.flights.replays import open_recording
 from tests.peers.processes import Start
@@ -40,8 +41,9 @@ import sys
 from pathlib import Path
 import nedbus
 from pathlib import Path
-from nedbus.flights.readers import ReadOptions, mcap, mcap_chunks
-mcap_chunks._MAX_BLOCK = mcap._SCHEMA_BUDGET = LIMIT
+from nedbus import limits
+from nedbus.flights.readers import ReadOptions, mcap
+limits.BLOCK_BYTES = mcap._SCHEMA_BUDGET = LIMIT
 peak = lambda: int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])  # [KiB]
 before = peak()
 try:
@@ -164,8 +166,8 @@ def test_chunks_that_together_unpack_too_far_are_skipped(
         return count, file.damaged, file.warnings
 
     assert read() == (20, False, [])
-    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_BLOCK", 16_000)
-    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_RATIO", 1)
+    monkeypatch.setattr(limits, "BLOCK_BYTES", 16_000)
+    monkeypatch.setattr(limits, "COMPRESSION", 1)
     count, damaged, warnings = read()
     assert 0 < count < 20
     assert damaged

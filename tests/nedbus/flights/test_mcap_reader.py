@@ -17,6 +17,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 import nedbus
+from nedbus import limits
 from nedbus.errors import SourceError
 from nedbus.flights import RecordingWriter
 from nedbus.flights.readers import ReadOptions
@@ -414,7 +415,7 @@ def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
         nedbus.read(path)
-    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_BLOCK", 2**20)
+    monkeypatch.setattr(limits, "BLOCK_BYTES", 2**20)
     path.write_bytes(zstandard.compress(bytes(2**21)))
     with pytest.raises(
         SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"

@@ -19,7 +19,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import nedbus
-from nedbus import Batch
+from nedbus import Batch, limits
 from nedbus.cli.follow import write_notice
 from nedbus.cli.recorder import Recorder
 from nedbus.client import Subscription
@@ -115,8 +115,8 @@ def test_channels_of_a_vehicle_are_limited(
 
     Its further messages are left out, counted, and logged once; those of its known channels are recorded.
     """
-    monkeypatch.setattr("nedbus.flights.writer._MAX_CHANNELS", 2)
-    monkeypatch.setattr("nedbus.flights.writer._MAX_ALL_CHANNELS", 3)
+    monkeypatch.setattr(limits, "CHANNELS_OF_VEHICLE", 2)
+    monkeypatch.setattr(limits, "CHANNELS", 3)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         for vehicle, source in (

@@ -34,6 +34,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 import nedbus
+from nedbus import limits
 from nedbus.errors import SourceError
 from nedbus.flights import RecordingWriter
 from nedbus.flights.readers.mcap import McapReader
@@ -357,7 +358,7 @@ def test_oversized_chunk_is_skipped(
 
     A smaller one is decompressed: zeros are not a record, so the rest of that chunk is skipped.
     """
-    monkeypatch.setattr("nedbus.flights.readers.mcap_chunks._MAX_BLOCK", 2**20)
+    monkeypatch.setattr(limits, "BLOCK_BYTES", 2**20)
     path = write_recording(tmp_path / "a.mcap", finish=False)
     original = payloads_of(path)[0]
     add_chunk(path, bytes(size), size=declared, compression=compression, in_index=in_index)

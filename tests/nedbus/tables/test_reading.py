@@ -104,7 +104,7 @@ def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
 def test_ambiguous_selection_names_the_missing_argument(tmp_path: Path) -> None:
     """The error for a selection names the argument that is missing or wrong: vehicle, topic or instance."""
     path = tmp_path / "a.mcap"
-    addresses = [Address(str(vehicle), VLP) for vehicle in range(1, 14)]
+    addresses = [Address(str(vehicle), VLP) for vehicle in range(1, 24)]
     addresses += [Address("99", "estimator_local_position", instance) for instance in (0, 1)]
     with RecordingWriter(path) as writer:
         rows = to_array([message(1)] * len(addresses))

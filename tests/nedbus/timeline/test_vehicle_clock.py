@@ -3,7 +3,8 @@
 import pytest
 from hypothesis import given, strategies as st
 
-from nedbus.timeline import TimeKind, VehicleClock, is_boot_possible
+from nedbus import limits
+from nedbus.timeline import RecentTimes, TimeKind, VehicleClock, is_boot_possible
 
 MODULUS = 1000 << 32  # us until `time_boot_ms` is 0 again
 UNIX = 1_760_000_000_000_000
@@ -118,3 +119,17 @@ def test_any_flight_keeps_its_order_and_durations(
             for stream in "ab":
                 reading = clock.add(stream, time % MODULUS, now)
         assert (clock.newest, clock.boot, reading.time) == (time, boots, time)
+
+
+def test_known_times_are_bounded_per_stream_and_in_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A copy is found among the last times of a stream; older times, and streams beyond the limit, are not kept."""
+    monkeypatch.setattr(limits, "KNOWN_TIMES", 3)
+    monkeypatch.setattr(limits, "VEHICLE_STREAMS", 2)
+    times = RecentTimes()
+    for stream in "abc":
+        for time in range(1, 5):
+            times.add(stream, time)
+    known = {
+        stream: [time for time in range(1, 5) if times.contains(stream, time)] for stream in "abc"
+    }
+    assert known == {"a": [2, 3, 4], "b": [2, 3, 4], "c": []}

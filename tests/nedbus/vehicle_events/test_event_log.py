@@ -12,18 +12,16 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import example, given
 
+from nedbus import limits
 from nedbus.timings import TIMINGS
 from nedbus.vehicle_events import (
     ALL,
-    KEPT,
     KINDS,
-    MAX_VEHICLES,
     RECENT,
     WINDOW,
     Event,
     EventLog,
 )
-from nedbus.vehicle_events.event_log import MAX_GONE
 from nedbus.vehicle_events.rules import KIND_CHANGES, PAUSE
 from nedbus_msgs import RESET_COUNTERS, Address
 from tests.flights.messages import VALID, message
@@ -794,10 +792,10 @@ def test_number_of_vehicles_streams_and_events_is_bounded() -> None:
     known = flight.event_log.vehicles["v1"]
     assert len(known._detectors) <= 1000
     assert len(known.topics) <= 1000
-    for number in range(KEPT + 100):
+    for number in range(limits.EVENTS + 100):
         flight.wait(0.1).status(DISARMED, vehicle="v2", nav_state=number % 20)
     new, reported = flight.event_log.events_since(0)
-    assert (len(new), reported) == (KEPT, KEPT + 99)
+    assert (len(new), reported) == (limits.EVENTS, limits.EVENTS + 99)
     assert flight.event_log.events_since(reported - 1) == ([new[-1]], reported)
 
 
@@ -812,13 +810,17 @@ def test_vehicle_beyond_limit_replaces_longest_gone_one(
 ) -> None:
     """A vehicle beyond the limit is logged once, and has no events until it replaces the longest gone vehicle."""
     flight = Flight()
-    for number in range(MAX_VEHICLES):
+    for number in range(limits.VEHICLES):
         flight.send(vehicle=f"v{number}")
     for _ in range(3):
         flight.send(vehicle="more")
     event_log = flight.event_log
     assert event_log.state("more", flight.now).text == "no events: more than 1000 vehicles"
-    assert (event_log.refused, len(event_log.vehicles), len(caplog.records)) == (3, MAX_VEHICLES, 1)
+    assert (event_log.refused, len(event_log.vehicles), len(caplog.records)) == (
+        3,
+        limits.VEHICLES,
+        1,
+    )
     flight.wait(RECENT + 1).send(vehicle="v0")
     flight.send(vehicle="more")
     assert {"v0", "more"} <= event_log.vehicles.keys()
@@ -852,7 +854,7 @@ def test_last_fifty_gone_vehicles_are_remembered() -> None:
     for number in range(3000):
         flight.wait(2.0).send(vehicle=f"v{number}")
         known = update(flight.event_log, flight.now, f"v{number}")
-    assert known == {f"v{number}" for number in range(3000 - MAX_GONE - 31, 3000)}
+    assert known == {f"v{number}" for number in range(3000 - limits.GONE_VEHICLES - 31, 3000)}
     assert len(flight.event_log.counts) <= 3 * len(known)
 
 
@@ -871,7 +873,7 @@ def test_rejection_reasons_are_not_kept(flight: Flight) -> None:
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
         flight.wait(6.0).update()
-    assert len(flight.event_log.vehicles["1"]._changes) < 5
+    assert len(flight.event_log.vehicles["1"]._frequency._events) < 5
 
 
 def test_active_condition_precedes_single_events(flight: Flight) -> None:

@@ -7,7 +7,7 @@ from typing import Final, cast
 
 import pytest
 
-from nedbus import Bus, Counts, Sample, Selection
+from nedbus import Bus, Counts, Sample, Selection, limits
 from nedbus.client import PublisherRegistry, Publishers
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
@@ -15,7 +15,6 @@ from nedbus.monitoring import Observer
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
 from nedbus.timings import TIMINGS
-from nedbus.vehicle_events.event_log import MAX_GONE
 from nedbus.web.fleet import Fleet
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VALID, VLP, message
@@ -101,7 +100,7 @@ def test_state_of_vehicles_that_come_and_go_is_bounded(monkeypatch: pytest.Monke
         world.poll(*there)
         sizes.append(world.sizes())
     assert sizes[140:240:10] == [sizes[-1]] * 10
-    most = AT_A_TIME + MAX_GONE + 31
+    most = AT_A_TIME + limits.GONE_VEHICLES + 31
     assert all(number <= most for name, number in sizes[-1].items() if name != "counts")
     assert sizes[-1]["counts"] <= 3 * most
     world.now += TIMINGS.forgotten

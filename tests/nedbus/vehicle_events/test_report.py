@@ -17,8 +17,6 @@ from nedbus.monitoring.pages import vehicles_page
 from nedbus.timings import TIMINGS
 from nedbus.vehicle_events import (
     ALL,
-    KEPT,
-    MAX_VEHICLES,
     AccountReport,
     Event,
     Expectation,
@@ -138,7 +136,7 @@ def test_large_report_is_sent_in_parts() -> None:
         {"xy_valid": False, "z_valid": False, "v_xy_valid": False},
     ]
     for faults in steps:
-        for number in range(MAX_VEHICLES):
+        for number in range(limits.VEHICLES):
             flight.send(vehicle=f"vehicle-{number}", **faults)
     sent = report(flight)
     parts = list(reply_parts(sent))
@@ -209,14 +207,17 @@ def test_reply_beyond_limits_returns_none() -> None:
     """Parsing a reply with more events or vehicles than a service sends returns None."""
     event = asdict(Event("1", "jump", "once", "info", "", 0.0))
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
-    assert from_json(content | {"events": [event] * (KEPT + 1)}) is None
+    assert from_json(content | {"events": [event] * (limits.EVENTS + 1)}) is None
     vehicle = {"severity": "info", "text": "ok"}
     assert (
         from_json(content | {"vehicles": {str(number): vehicle for number in range(1001)}}) is None
     )
     read = from_json(
         content
-        | {"events": [event] * KEPT, "vehicles": {str(number): vehicle for number in range(1000)}}
+        | {
+            "events": [event] * limits.EVENTS,
+            "vehicles": {str(number): vehicle for number in range(1000)},
+        }
     )
     assert read is not None
 

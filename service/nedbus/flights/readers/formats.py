@@ -36,28 +36,32 @@ _FORMATS: Final[Mapping[str, _Format]] = {
     "mcap": _Format(".mcap", (b"\x89MCAP0\r\n",), "mcap", "McapReader", "mcap"),
     "tlog": _Format(".tlog", (), "tlog", "TlogReader", "mavlink"),
 }
-SUFFIXES: Final[Mapping[str, str]] = {each.suffix: name for name, each in _FORMATS.items()}
+SUFFIXES: Final[Mapping[str, str]] = {known.suffix: name for name, known in _FORMATS.items()}
 """The format of a file, and so the kind of source that replays it, by suffix."""
 
 
 def find_format(path: str | PurePath) -> str | None:
     """Return the format of a flight file by its suffix, "ulog", "mcap" or "tlog", or None; a folder is an MCAP bag."""
     suffix = PurePath(str(path).lower().removesuffix(".zstd")).suffix
-    return SUFFIXES.get(suffix) or ("mcap" if Path(path).expanduser().is_dir() else None)
+    if suffix in SUFFIXES:
+        return SUFFIXES[suffix]
+    return "mcap" if Path(path).expanduser().is_dir() else None
 
 
 def format_of(path: str | PurePath) -> str:
     """Return the format of a flight file by its content, else by its suffix; raise ConfigError for other files."""
     head = _head_of(Path(path).expanduser())
-    known = (name for name, each in _FORMATS.items() if each.magic and head.startswith(each.magic))
-    found = next(known, None) or find_format(path)
-    if found is None and (reason := _why_unreadable(head)):
+    for name, known in _FORMATS.items():
+        if known.magic and head.startswith(known.magic):
+            return name
+    by_suffix = find_format(path)
+    if by_suffix is not None:
+        return by_suffix
+    reason = _why_unreadable(head)
+    if reason:
         raise SourceError(str(path), reason)
-    if found is None:
-        raise ConfigError(
-            str(path), f"not a flight file; its name must end with {' or '.join(SUFFIXES)}"
-        )
-    return found
+    suffixes = " or ".join(SUFFIXES)
+    raise ConfigError(str(path), f"not a flight file; its name must end with {suffixes}")
 
 
 def open_reader(path: Path, options: ReadOptions = ReadOptions()) -> FlightReader:  # noqa: B008 - immutable
@@ -67,39 +71,41 @@ def open_reader(path: Path, options: ReadOptions = ReadOptions()) -> FlightReade
     reads it is not installed, ArgumentError for a layout= that the format does not need.
     """
     kind = _FORMATS[format_of(path)]
-    if options.layout is not None and kind.extra != "mcap":
-        raise ArgumentError(
-            "layout", options.layout, f"none, because a {kind.suffix} file defines its own layouts"
-        )
-    if options.layout not in (known := (None, *RELEASES, *DEFAULT.layouts)):
-        raise ArgumentError(
-            "layout", options.layout, f"one of {', '.join(dict.fromkeys(map(str, known[1:])))}"
-        )
+    if options.layout is not None:
+        _check_layout(options.layout, kind)
     module = import_optional(kind.extra, f"{__package__}.{kind.module}")
     reader: FlightReader = getattr(module, kind.reader)(path, options)
     return reader
 
 
+def _check_layout(layout: str, kind: _Format) -> None:
+    if kind.extra != "mcap":
+        expected = f"none, because a {kind.suffix} file defines its own layouts"
+        raise ArgumentError("layout", layout, expected)
+    known = [str(name) for name in (*RELEASES, *DEFAULT.layouts)]
+    if layout not in known:
+        raise ArgumentError("layout", layout, f"one of {', '.join(dict.fromkeys(known))}")
+
+
 def check_recording(path: Path) -> None:
     """Raise ConfigError unless the name of a recording ends with .mcap."""
     if SUFFIXES.get(path.suffix.lower()) != "mcap":
-        raise ConfigError(
-            str(path),
-            "its name must end with .mcap; for CSV, see nedbus.read in docs/recordings.md",
-        )
+        problem = "its name must end with .mcap; for CSV, see nedbus.read in docs/recordings.md"
+        raise ConfigError(str(path), problem)
 
 
 def open_file(path: Path) -> BinaryIO:
     """Open a file for reading; raise SourceError if that fails, or for a pipe, which cannot be read twice."""
     try:
+        problem = ""
         if path.is_dir():
-            raise SourceError(
-                str(path), "not a regular file, but a folder; only a bag of MCAP files can be read"
-            )
-        if path.exists() and not path.is_file():
-            raise SourceError(str(path), "not a regular file; save the data to a file first")
-        if path.is_file() and (reason := _why_unreadable(_head_of(path))):
-            raise SourceError(str(path), reason)
+            problem = "not a regular file, but a folder; only a bag of MCAP files can be read"
+        elif path.is_file():
+            problem = _why_unreadable(_head_of(path))
+        elif path.exists():
+            problem = "not a regular file; save the data to a file first"
+        if problem:
+            raise SourceError(str(path), problem)
         return path.open("rb")
     except OSError as exc:
         raise SourceError(str(path.absolute()), (exc.strerror or str(exc)).lower()) from exc
@@ -109,22 +115,30 @@ def recording_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return the MCAP files of a recording or bag in order, and the missing ones; raise SourceError if it has none."""
     if not path.is_dir():
         return [path], []
-    found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
-    if not found:
-        reason = next(
-            filter(None, (_why_unreadable(_head_of(each)) for each in sorted(path.glob("*.db3")))),
-            "",
-        )
-        raise SourceError(str(path), reason or "no .mcap file in this folder")
-    found.sort(
-        key=lambda each: [
-            int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", each.name)
-        ]
-    )
+    files = [file for file in path.iterdir() if file.is_file() and find_format(file) == "mcap"]
+    if not files:
+        raise SourceError(str(path), _why_no_recording(path))
+    files.sort(key=_natural_order)
     metadata = path / "metadata.yaml"
     text = metadata.read_text(errors="replace") if metadata.exists() else ""
     listed = re.findall(r"^\s*- (?:\S*/)?([^\s/]+\.mcap)\b", text, re.MULTILINE)
-    return found, sorted({*listed} - {each.name.removesuffix(".zstd") for each in found})
+    present = {file.name.removesuffix(".zstd") for file in files}
+    return files, sorted({*listed} - present)
+
+
+def _why_no_recording(folder: Path) -> str:
+    """Return why a folder has no MCAP file."""
+    for bag in sorted(folder.glob("*.db3")):
+        reason = _why_unreadable(_head_of(bag))
+        if reason:
+            return reason
+    return "no .mcap file in this folder"
+
+
+def _natural_order(path: Path) -> list[int | str]:
+    """Return a sort key that puts flight_2 before flight_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if part.isdecimal() else part for part in parts]
 
 
 def _head_of(path: Path) -> bytes:
@@ -140,9 +154,9 @@ def _head_of(path: Path) -> bytes:
 
 def _why_unreadable(head: bytes) -> str:
     """Return why a file with these first bytes is not a flight file, and the remedy; "" if it may be one."""
-    known = (
-        text
-        for first, text in _UNREADABLE.items()
-        if head.startswith(first) and bool(head) == bool(first)
-    )
-    return next(known, "")
+    if not head:
+        return _UNREADABLE[b""]
+    for first, text in _UNREADABLE.items():
+        if first and head.startswith(first):
+            return text
+    return ""

@@ -4,6 +4,8 @@ The summary, which has its own CRC, lists the chunks; without it the records are
 uses bounded memory. The readers of the `mcap` package have no limit and stop at the first damage.
 """
 
+from __future__ import annotations
+
 import os
 import struct
 from array import array
@@ -23,6 +25,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
+from nedbus import limits
 from nedbus.errors import SourceError
 from nedbus.timeline import utc_text
 
@@ -50,16 +53,11 @@ _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 _FOOTER: Final = struct.Struct("<BQQQI8s")
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
-    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
-}  # fmt: skip
-# bytes of a chunk, also uncompressed, and of a summary; ROS 2 and nedbus write up to 8 MiB
-_MAX_BLOCK: Final = 2**26
-# bytes of a record in _DESCRIPTIONS; statistics of all possible channels have 655 kB
-_MAX_DESCRIPTION: Final = 2**20
-# compression ratio of files above _MAX_BLOCK, and of all chunks of a file together
-_MAX_RATIO: Final = 100
-_MAX_WARNINGS: Final = 100
-_MAX_WARNING: Final = 1000  # characters
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.STATISTICS: Statistics,
+}
 
 
 class _IndexedChunk(NamedTuple):
@@ -68,6 +66,14 @@ class _IndexedChunk(NamedTuple):
     start: int
     end: int
     channels: Collection[int]
+
+
+class _Place(NamedTuple):
+    """A record in the file."""
+
+    opcode: int
+    begin: int
+    end: int
 
 
 def _place_of(index: ChunkIndex) -> _IndexedChunk:
@@ -87,7 +93,8 @@ class ChunkFile:
 
     def __init__(self, path: Path) -> None:
         self.warnings: list[str] = []
-        self.damaged, self.position = False, 0
+        self.damaged = False
+        self.position = 0
         self._file = open_file(path)
         if self._read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
             self._file = self._decompress(self._file)
@@ -109,31 +116,38 @@ class ChunkFile:
 
         `only`: channels of interest; chunks without any of them may be skipped.
         """
-        unpacked, limit = 0, max(_MAX_BLOCK, _MAX_RATIO * self.size)
-        for opcode, offset, end in (
-            self._listed(only) if self._chunks else self._scan(len(MCAP0_MAGIC), self.size)
-        ):
-            self.position = end
-            if end - offset > _MAX_BLOCK:
-                text = f"skipped {end - offset} bytes from byte {offset}, above the limit of {_MAX_BLOCK} for a chunk"
+        unpacked = 0
+        limit = max(limits.BLOCK_BYTES, limits.COMPRESSION * self.size)
+        places = self._listed(only) if self._chunks else self._scan(len(MCAP0_MAGIC), self.size)
+        for place in places:
+            self.position = place.end
+            size = place.end - place.begin
+            if size > limits.BLOCK_BYTES:
+                text = (
+                    f"skipped {size} bytes from byte {place.begin},"
+                    f" above the limit of {limits.BLOCK_BYTES} for a chunk"
+                )
                 self.warn(text, lost=True)
                 continue
-            record = self._read(offset, end - offset)
-            if opcode == Opcode.CHUNK:
-                unpacked += _claimed_size(record)
-                if unpacked > limit:
-                    text = f"skipped the chunks from byte {offset}: all chunks together claim more than {limit} bytes"
-                    self.warn(text, lost=True)
-                    return
-            try:
-                yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
-            except READ_ERRORS:
-                self.warn(
-                    f"the chunk {_describe(record, offset)} is damaged; its messages are skipped",
-                    lost=True,
+            record = self._read(place.begin, size)
+            if place.opcode != Opcode.CHUNK:
+                yield record
+                continue
+            unpacked += _claimed_size(record)
+            if unpacked > limit:
+                text = (
+                    f"skipped the chunks from byte {place.begin}:"
+                    f" all chunks together claim more than {limit} bytes"
                 )
+                self.warn(text, lost=True)
+                return
+            try:
+                yield _unpack_chunk(record)
+            except READ_ERRORS:
+                where = _describe(record, place.begin)
+                self.warn(f"the chunk {where} is damaged; its messages are skipped", lost=True)
 
-    def _listed(self, only: Collection[int] | None) -> Iterator[tuple[int, int, int]]:
+    def _listed(self, only: Collection[int] | None) -> Iterator[_Place]:
         """Yield opcode, begin and end of the chunks in the index, and of what lies between and behind them."""
         begin = len(MCAP0_MAGIC)
         for start, end, channels in self._chunks:
@@ -141,24 +155,26 @@ class ChunkFile:
             begin = end
             # A chunk that lists no channels may contain any.
             if only is None or not channels or not set(channels).isdisjoint(only):
-                yield Opcode.CHUNK, start, end
+                yield _Place(Opcode.CHUNK, start, end)
         yield from self._scan(begin, self._end, is_listed=True)
 
     def warn(self, warning: str, *, lost: bool = False) -> None:
         """Add a warning unless it is a duplicate; `lost`: the damage cost messages."""
-        self.damaged |= lost
-        warning = warning[:_MAX_WARNING]
-        if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
-            self.warnings.append(
-                warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed"
-            )
+        if lost:
+            self.damaged = True
+        text = warning[: limits.WARNING_TEXT]
+        if text in self.warnings or len(self.warnings) > limits.FILE_WARNINGS:
+            return
+        if len(self.warnings) == limits.FILE_WARNINGS:
+            text = "further damage is not listed"
+        self.warnings.append(text)
 
     def _decompress(self, packed: BinaryIO) -> BinaryIO:
         """Return a temporary file with the decompressed contents, up to the first damage."""
         packed.seek(0)
         with packed, ExitStack() as on_error:
             unpacked = on_error.enter_context(TemporaryFile())
-            limit = max(_MAX_BLOCK, _MAX_RATIO * os.fstat(packed.fileno()).st_size)
+            limit = max(limits.BLOCK_BYTES, limits.COMPRESSION * os.fstat(packed.fileno()).st_size)
             try:
                 for part in ZstdDecompressor().read_to_iter(packed):
                     unpacked.write(part)
@@ -179,70 +195,82 @@ class ChunkFile:
         if end < len(MCAP0_MAGIC):
             return
         opcode, length, start, _, checksum, magic = _FOOTER.unpack(self._read(end, _FOOTER.size))
-        if (opcode, length, magic) != (
-            Opcode.FOOTER,
-            _LENGTHS[Opcode.FOOTER],
-            MCAP0_MAGIC,
-        ) or not start:
+        is_footer = opcode == Opcode.FOOTER and length == _LENGTHS[Opcode.FOOTER]
+        if not is_footer or magic != MCAP0_MAGIC or not start:
             return
         if not len(MCAP0_MAGIC) <= start <= end:
             raise ValueError(start)
-        if end - start > _MAX_BLOCK:
-            self.warn(f"the index is larger than {_MAX_BLOCK} bytes; reading without it")
+        if end - start > limits.BLOCK_BYTES:
+            self.warn(f"the index is larger than {limits.BLOCK_BYTES} bytes; reading without it")
             return
         summary = self._read(start, end - start)
         footer = self._read(end, _FOOTER.size - len(MCAP0_MAGIC) - 4)
         if checksum and crc32(footer, crc32(summary)) != checksum:
             raise ValueError(checksum)
-        chunks = sorted(
-            _place_of(each) for each in records_of(summary) if isinstance(each, ChunkIndex)
-        )
+        indexes = [record for record in records_of(summary) if isinstance(record, ChunkIndex)]
+        chunks = sorted(map(_place_of, indexes))
         previous = len(MCAP0_MAGIC)
-        for begin, stop, _ in (*chunks, (start, start, ())):
-            if begin < previous:
-                raise ValueError(begin)
-            previous = stop
+        for chunk in chunks:
+            if chunk.start < previous:
+                raise ValueError(chunk.start)
+            previous = chunk.end
+        if start < previous:
+            raise ValueError(start)
         self._chunks = chunks
         self._end = start
         self.summary = summary
 
-    def _scan(
-        self, offset: int, stop: int, *, is_listed: bool = False
-    ) -> Iterator[tuple[int, int, int]]:
+    def _scan(self, offset: int, stop: int, *, is_listed: bool = False) -> Iterator[_Place]:
         """Scan a range; yield opcode, begin and end of chunks, and of schemas, channels and messages between them.
 
         `is_listed`: the range is between chunks of the index, where damage usually costs only copies of the index.
         """
         after_chunk = is_listed and offset > len(MCAP0_MAGIC)
         while not is_listed or offset < stop:
-            begin = self._read(offset, _RECORD_HEAD.size + 64)
-            opcode, length = (
-                _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
-            )
-            end = offset + _RECORD_HEAD.size + length
-            surplus = length - _expected_length(opcode, begin[_RECORD_HEAD.size :], length)
-            if opcode == 0 or end > stop or surplus not in _SURPLUS:
-                if is_listed:
-                    return
-                self.warn(
-                    f"skipped truncated or damaged data from byte {offset} of {self.size} to the end",
-                    lost=True,
-                )
+            record = self._head_at(offset)
+            if record is None or record.end > stop:
+                if not is_listed:
+                    text = f"skipped truncated or damaged data from byte {offset} of {self.size} to the end"
+                    self.warn(text, lost=True)
                 return
+            opcode = record.opcode
             if opcode in _LENGTHS:
                 return
             # The message index after a chunk has no CRC: one flipped bit turns its opcode into that of a message.
-            is_index = length == _expected_length(
-                Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length
-            )
-            if after_chunk and opcode == Opcode.MESSAGE and is_index:
+            if after_chunk and opcode == Opcode.MESSAGE and record.may_be_index:
                 opcode = Opcode.MESSAGE_INDEX
-            if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
-                self.warn(f"skipped a damaged chunk before byte {offset}", lost=True)
-            after_chunk = opcode == Opcode.CHUNK or (after_chunk and opcode == Opcode.MESSAGE_INDEX)
+            if opcode == Opcode.MESSAGE_INDEX:
+                if not after_chunk:
+                    self.warn(f"skipped a damaged chunk before byte {offset}", lost=True)
+            else:
+                after_chunk = opcode == Opcode.CHUNK
             if opcode in {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}:
-                yield opcode, offset, end
-            offset = end
+                yield _Place(opcode, offset, record.end)
+            offset = record.end
+
+    def _head_at(self, offset: int) -> _Head | None:
+        """Return the head of the record at this byte; None if it is damaged."""
+        data = self._read(offset, _RECORD_HEAD.size + 64)
+        if len(data) < _RECORD_HEAD.size:
+            return None
+        opcode, length = _RECORD_HEAD.unpack_from(data)
+        body = data[_RECORD_HEAD.size :]
+        surplus = length - _expected_length(opcode, body, length)
+        if opcode == 0 or surplus not in _SURPLUS:
+            return None
+        return _Head(
+            opcode,
+            end=offset + _RECORD_HEAD.size + length,
+            may_be_index=length == _expected_length(Opcode.MESSAGE_INDEX, body, length),
+        )
+
+
+class _Head(NamedTuple):
+    """The head of a record; `may_be_index`: its length is that of a message index."""
+
+    opcode: int
+    end: int
+    may_be_index: bool
 
 
 def _expected_length(opcode: int, body: bytes, length: int) -> int:
@@ -250,9 +278,8 @@ def _expected_length(opcode: int, body: bytes, length: int) -> int:
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:
-        before = _CHUNK_HEAD.size + int.from_bytes(
-            body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size], "little"
-        )
+        name_length = body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size]
+        before = _CHUNK_HEAD.size + int.from_bytes(name_length, "little")
         return before + 8 + int.from_bytes(body[before : before + 8], "little")
     return _LENGTHS.get(opcode, length)
 
@@ -273,11 +300,10 @@ def records_of(block: bytes, *opcodes: int) -> Iterator[McapRecord]:
             continue
         if opcode == Opcode.MESSAGE:
             channel, sequence, logged, published = _MESSAGE_HEAD.unpack_from(block, start)
-            yield Message(
-                channel, logged, block[start + _MESSAGE_HEAD.size : offset], published, sequence
-            )
+            payload = block[start + _MESSAGE_HEAD.size : offset]
+            yield Message(channel, logged, payload, published, sequence)
         elif opcode in _DESCRIPTIONS:
-            if length > _MAX_DESCRIPTION:
+            if length > limits.DESCRIPTION_BYTES:
                 raise ValueError(length)
             yield _DESCRIPTIONS[opcode].read(ReadDataStream(BytesIO(block[start:offset])))
 
@@ -287,7 +313,7 @@ def _claimed_size(chunk: bytes) -> int:
     if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
         return 0
     size: int = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)[2]
-    return size if size <= _MAX_BLOCK else 0
+    return size if size <= limits.BLOCK_BYTES else 0
 
 
 def _unpack_chunk(record: bytes) -> bytes:
@@ -298,8 +324,9 @@ def _unpack_chunk(record: bytes) -> bytes:
     # zeros would parse as an empty chunk
     if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:
         raise ValueError(len(record))
-    size, packed = chunk.uncompressed_size, chunk.data
-    if size > _MAX_BLOCK:
+    size = chunk.uncompressed_size
+    packed = chunk.data
+    if size > limits.BLOCK_BYTES:
         raise ValueError(size)
     records: bytes = packed
     if chunk.compression == "zstd":
@@ -308,9 +335,8 @@ def _unpack_chunk(record: bytes) -> bytes:
         records = ZstdDecompressor().decompress(packed, max_output_size=size)
     elif chunk.compression == "lz4":
         records = LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-    if len(records) != size or (
-        chunk.uncompressed_crc and crc32(records) != chunk.uncompressed_crc
-    ):
+    has_checksum = bool(chunk.uncompressed_crc)
+    if len(records) != size or (has_checksum and crc32(records) != chunk.uncompressed_crc):
         raise ValueError(size)
     return records
 

@@ -95,11 +95,16 @@ class FlightReader(ABC):
     has_log_times = True
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
-        self.path, self.options = path, options
+        self.path = path
+        self.options = options
         self.definitions: dict[Address, Definition[Any]] = {}
         self.starts: dict[str, int] = {}
-        self.start = self.boot_utc = self.position = self.total = 0
-        self.damaged, self._dropout = False, 0.0  # s lost by the logger before the next message
+        self.start = 0
+        self.boot_utc = 0
+        self.position = 0
+        self.total = 0
+        self.damaged = False
+        self._dropout = 0.0  # s lost by the logger before the next message
         self.order = Order[SourceMessage]()
         self.ahead: list[SourceMessage] = []
         self._messages: Iterator[SourceMessage] = iter(())
@@ -119,19 +124,22 @@ class FlightReader(ABC):
     def runs(self) -> Iterator[Run]:
         """Yield the records of `records`, even rejected ones, stream by stream in parts of the file."""
         records = self.records()
-        while part := sorted(islice(records, _PART), key=lambda each: hash(each.stream.address)):
-            for stream, own in groupby(part, attrgetter("stream")):
-                _, payloads, times, _ = zip(*own, strict=True)
-                yield Run(stream, list(payloads), [time for time in times if time is not None])
+        while part := [*islice(records, _PART)]:
+            part.sort(key=lambda record: hash(record.stream.address))
+            for stream, group in groupby(part, attrgetter("stream")):
+                own = [*group]
+                payloads = [record.payload for record in own]
+                times = [record.time for record in own if record.time is not None]
+                yield Run(stream, payloads, times)
 
     @property
     def remarks(self) -> list[str]:
         """What is unusual about the times of the messages so far."""
-        found = []
+        remarks = []
         for address, count in self.order.unordered.items():
-            if address.topic != LOG_MESSAGE.name and count:  # PX4 queues log messages
-                found.append(f"timestamps of {address} are out of order ({count})")
-        return found + self.order.remarks
+            if address.topic != LOG_MESSAGE.name:  # PX4 queues log messages
+                remarks.append(f"timestamps of {address} are out of order ({count})")
+        return remarks + self.order.remarks
 
     def begin(
         self,
@@ -168,11 +176,16 @@ class FlightReader(ABC):
         """Return a record as a message, which is decoded when it is used."""
         stream, payload, time, error = record
         error = error or stream.check(payload)
-        given = {} if error else stream.decode(payload) if stream.converted else None
+        given = None
+        if error:
+            given = {}
+        elif stream.converted:
+            given = stream.decode(payload)
         if time is None:
             time = stream.timestamp(payload)[0] or 0
-        dropout, self._dropout = self._dropout, 0.0
-        definition, kind = stream.definition, self.kind
+        dropout = self._dropout
+        self._dropout = 0.0
+        # By position, because keywords take a third longer for each message of a file.
         return SourceMessage(
             0.0,
             stream.address,
@@ -180,8 +193,8 @@ class FlightReader(ABC):
             0,
             False,
             error,
-            definition,
-            kind,
+            stream.definition,
+            self.kind,
             dropout,
             stream,
             payload,
@@ -190,12 +203,10 @@ class FlightReader(ABC):
 
     def shrinkage(self) -> list[str]:
         """Return a list of at most one warning at the end of a file: it has fewer bytes than when it was opened."""
-        self.damaged |= (is_shorter := self.position < self.total)
-        return (
-            [f"the file has shrunk from {self.total} to {self.position} bytes"]
-            if is_shorter
-            else []
-        )
+        if self.position >= self.total:
+            return []
+        self.damaged = True
+        return [f"the file has shrunk from {self.total} to {self.position} bytes"]
 
     def start_of(self, vehicle: str) -> int:
         """Return when the recording of a vehicle began, on the clock of its timestamps [us]; 0 if unknown."""
@@ -204,8 +215,8 @@ class FlightReader(ABC):
     def close(self) -> None:
         """Close the file, and discard the messages that were read ahead; a second call does nothing."""
         self._messages = iter(())
-        for each in self._resources:
-            each.close()
+        for resource in self._resources:
+            resource.close()
 
     def __del__(self) -> None:
         self.close()  # a replay may be discarded before its end
@@ -227,9 +238,8 @@ class FlightReader(ABC):
         self._vehicles.add(own)
         if len(self._vehicles) > 1:
             known = ", ".join(sorted(self._vehicles))
-            raise ConfigError(
-                "vehicle", f"{self.path} has several vehicles ({known}); remove this option"
-            )
+            problem = f"{self.path} has several vehicles ({known}); remove this option"
+            raise ConfigError("vehicle", problem)
         return self.options.vehicle
 
     def reads(self, topic: str) -> bool:

@@ -4,6 +4,7 @@ import os
 import re
 import struct
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -11,7 +12,7 @@ from typing import Any, BinaryIO, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.mavlink import SequenceCounter, Vehicle, new_parser, parse
+from nedbus.mavlink import Received, SequenceCounter, Vehicle, new_parser, parse
 from nedbus.samples import Rejection, SourceMessage
 from nedbus.timeline import arrivals
 from nedbus_msgs import BY_TOPIC, Address, Encoded
@@ -20,7 +21,7 @@ from .formats import open_file
 from .reader import FlightReader, ReadOptions, Record
 
 _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
-_MAX_RECORD: Final = _HEAD.size + 290  # bytes of a record
+_LONGEST_RECORD: Final = _HEAD.size + 290  # bytes
 # bytes of a frame without payload
 _OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}
 _SIGNATURE: Final = 13  # bytes
@@ -32,12 +33,14 @@ class _ConvertedStream:
     """A stream of messages that were converted from MAVLink; their payloads are fields by name."""
 
     dtype = None
-    head, strict_bools = b"", frozenset[str]()
+    head = b""
+    strict_bools = frozenset[str]()
     lacking: frozenset[str] = frozenset()
     converted: Mapping[str, Any] = {"timestamp": None}  # decoded at once
 
     def __init__(self, address: Address) -> None:
-        self.address, self.definition = address, BY_TOPIC[address.topic]
+        self.address = address
+        self.definition = BY_TOPIC[address.topic]
 
     def check(self, _: Any) -> str | None:
         """Return None: the fields were checked when they were converted."""
@@ -56,6 +59,15 @@ class _ConvertedStream:
         return None
 
 
+@dataclass(slots=True)
+class _Sender:
+    """An autopilot; `has_booted`: the time of its boot is known."""
+
+    vehicle: Vehicle
+    sequence: SequenceCounter
+    has_booted: bool = False
+
+
 class TlogReader(FlightReader):
     """Read the messages of all autopilots in a .tlog."""
 
@@ -63,18 +75,19 @@ class TlogReader(FlightReader):
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)
-        self._file, self.total = open_file(path), path.stat().st_size
+        self._file = open_file(path)
+        self.total = path.stat().st_size
         self._resources.append(self._file)
         self._boots: set[int] = set()  # Unix times [us]
-        # bytes that are not MAVLink; messages lost before the next one
-        self._foreign = self._lost = 0
+        self._foreign = 0  # bytes that are not MAVLink
+        self._lost = 0  # messages before the next one
         self._end = self.total  # the rest of the file is zeros
         self._is_cut = False  # the file ends within a record, or in zeros
         self._rebooted = False
         self._source = self.kind  # of the next message
         self._streams: dict[Address, _ConvertedStream] = {}
         self._shrinkage: list[str] = []
-        self._senders: dict[int, tuple[Vehicle, SequenceCounter]] = {}  # by system id
+        self._senders: dict[int, _Sender] = {}  # by system id
 
     @property
     def warnings(self) -> list[str]:
@@ -87,49 +100,57 @@ class TlogReader(FlightReader):
             warnings.append(f"truncated (the last {zeros} B are zeros, as after a power cut)")
         elif self._is_cut:
             warnings.append("truncated (the file ends within a message)")
-        copies = sum(vehicle.copies for vehicle, _ in self._senders.values())
+        copies = sum(sender.vehicle.copies for sender in self._senders.values())
         if copies:
-            warnings.append(
-                f"{copies} {'copy' if copies == 1 else 'copies'} from a second link left out"
-            )
+            noun = "copy" if copies == 1 else "copies"
+            warnings.append(f"{copies} {noun} from a second link left out")
         return warnings
 
     def records(self) -> Iterator[Record]:
         """Yield the converted messages with the host's time; raise SourceError if there are none."""
-        vehicles = self._senders
-        parser, booted = new_parser(), set[int]()
+        parser = new_parser()
+        path = str(self.path)
         for arrived, (stamp, frame) in arrivals(self._frames(), itemgetter(0)):
-            for item in parse(parser, frame, str(self.path), None, arrived):
-                if isinstance(item, Rejection):
-                    if self.position > self._end:
-                        self._is_cut = True  # a record whose end was not written
-                    elif item.where == str(self.path):
-                        self._skip(len(frame))
-                    continue
-                if item.system not in vehicles:
-                    name = str(item.system)
-                    vehicles[item.system] = Vehicle(name, self.options.topics), SequenceCounter()
-                vehicle, sequence = vehicles[item.system]
-                lost = sequence.add(item.sequence, item.time)
-                vehicle.count_lost(lost, item.time, link=sequence.link)
-                for found in vehicle.handle_all(item.message, item.time):
-                    if found.address is None:
-                        continue
-                    stream = self._stream(found.address)
-                    if isinstance(found, Rejection):
-                        yield Record(stream, {}, stamp, found.reason)
-                        continue
-                    if found.rebooted or item.system not in booted:
-                        # The message may have the time of an old sample.
-                        booted.add(item.system)
-                        self._boots.add(stamp - (vehicle.clock.newest or found.timestamp))
-                        self.boot_utc = next(iter(self._boots)) if len(self._boots) == 1 else 0
-                    self._lost, self._rebooted = found.lost, found.rebooted
-                    self._source = found.source or self.kind
-                    yield Record(stream, found.fields, stamp)
+            for item in parse(parser, frame, path, None, arrived):
+                if not isinstance(item, Rejection):
+                    yield from self._records_of(item, stamp)
+                elif self.position > self._end:
+                    self._is_cut = True  # a record whose end was not written
+                elif item.where == path:
+                    self._skip(len(frame))
         if not self.definitions:
             reason = "this file has no autopilot messages for these topics"
-            raise SourceError(str(self.path), "; ".join([reason, *self.warnings]))
+            raise SourceError(path, "; ".join([reason, *self.warnings]))
+
+    def _records_of(self, frame: Received, stamp: int) -> Iterator[Record]:
+        """Yield the messages that the autopilot's frame completes; `stamp`: the host's time [us]."""
+        sender = self._senders.get(frame.system)
+        if sender is None:
+            sender = _Sender(Vehicle(str(frame.system), self.options.topics), SequenceCounter())
+            self._senders[frame.system] = sender
+        vehicle = sender.vehicle
+        lost = sender.sequence.add(frame.sequence, frame.time)
+        vehicle.count_lost(lost, frame.time, link=sender.sequence.link)
+        for message in vehicle.handle_all(frame.message, frame.time):
+            if message.address is None:
+                continue
+            stream = self._stream(message.address)
+            if isinstance(message, Rejection):
+                yield Record(stream, {}, stamp, message.reason)
+                continue
+            if message.rebooted or not sender.has_booted:
+                sender.has_booted = True
+                # The message may have the time of an old sample.
+                self._add_boot(stamp - (vehicle.clock.newest or message.timestamp))
+            self._lost = message.lost
+            self._rebooted = message.rebooted
+            self._source = message.source or self.kind
+            yield Record(stream, message.fields, stamp)
+
+    def _add_boot(self, utc: int) -> None:
+        """Note the Unix time of a boot [us]; only that of a single one is known."""
+        self._boots.add(utc)
+        self.boot_utc = utc if len(self._boots) == 1 else 0
 
     def message_of(self, record: Record) -> SourceMessage:
         """Return a record as a message, with its author, and the losses and the reboot before it."""
@@ -160,8 +181,9 @@ class TlogReader(FlightReader):
             at = 0
             is_synchronised = True
             while True:
-                if len(data) - at < 2 * _MAX_RECORD:
-                    data, at = data[at:] + file.read(_BLOCK), 0
+                if len(data) - at < 2 * _LONGEST_RECORD:
+                    data = data[at:] + file.read(_BLOCK)
+                    at = 0
                 if at == len(data):
                     break
                 length = _record_length(data, at)
@@ -169,27 +191,29 @@ class TlogReader(FlightReader):
                 if is_record and (is_synchronised or _is_next(data, at + length)):
                     is_synchronised = True
                     self.position += length
-                    yield _HEAD.unpack_from(data, at)[0], data[at + 8 : at + length]
+                    time, _ = _HEAD.unpack_from(data, at)
+                    yield time, data[at + 8 : at + length]
                     at += length
-                elif self.position >= self._end or (
-                    is_synchronised and _is_cut(data[at:], self._end - self.position)
-                ):
+                    continue
+                content = self._end - self.position
+                if content <= 0 or (is_synchronised and _is_cut(data[at:], content)):
                     self._is_cut = True
-                    self.position = (
-                        self.total if self._end < self.total else self.position + len(data) - at
-                    )
+                    self.position += len(data) - at
+                    if self._end < self.total:
+                        self.position = self.total
                     break
-                else:
-                    is_synchronised = False
-                    skipped = _next_candidate(data, at) - at
-                    self._skip(skipped)
-                    self.position, at = self.position + skipped, at + skipped
+                is_synchronised = False
+                skipped = _next_candidate(data, at) - at
+                self._skip(skipped)
+                self.position += skipped
+                at += skipped
             self._shrinkage = self.shrinkage()
 
 
 def _end_of_content(file: BinaryIO, size: int) -> int:
     """Return the position behind the last byte of a file that is not zero; do not move in the file."""
-    begin, end = file.tell(), size
+    begin = file.tell()
+    end = size
     while end > begin:
         start = max(begin, end - _BLOCK)
         file.seek(start)
@@ -207,12 +231,12 @@ def _record_length(data: bytes, at: int) -> int:
     if len(data) - at < _HEAD.size + 1:
         return 0
     marker, payload, flags = data[at + 8 : at + 11]
-    signature = (
-        _SIGNATURE
-        if marker == dialect.PROTOCOL_MARKER_V2 and flags & dialect.MAVLINK_IFLAG_SIGNED
-        else 0
-    )
-    return 8 + _OVERHEAD[marker] + payload + signature if marker in _OVERHEAD else 0
+    if marker not in _OVERHEAD:
+        return 0
+    length = 8 + _OVERHEAD[marker] + payload
+    if marker == dialect.PROTOCOL_MARKER_V2 and flags & dialect.MAVLINK_IFLAG_SIGNED:
+        length += _SIGNATURE
+    return length
 
 
 def _is_next(data: bytes, at: int) -> bool:
@@ -222,14 +246,16 @@ def _is_next(data: bytes, at: int) -> bool:
 
 def _is_cut(rest: bytes, content: int) -> bool:
     """Return whether the rest of a file is the beginning of a record; `content`: its size without zeros at the end."""
-    if content >= _MAX_RECORD:
+    if content >= _LONGEST_RECORD:
         return False
     return min(content, len(rest)) <= 8 or rest[8] in _OVERHEAD
 
 
 def _next_candidate(data: bytes, at: int) -> int:
     """Return the next position at which a record may begin; the end of the data if there is none."""
-    found = _MARKERS.search(data, at + 9)
-    if found is not None:
-        return found.start() - 8
-    return max(at + 1, len(data) - 8) if len(data) - at > 8 else len(data)
+    marker = _MARKERS.search(data, at + 9)
+    if marker is not None:
+        return marker.start() - 8
+    if len(data) - at <= 8:
+        return len(data)
+    return max(at + 1, len(data) - 8)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from nedbus import ulog
+from nedbus import limits, ulog
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import ALL, TOPICS, Address, Definition
 
@@ -13,9 +13,7 @@ from .formats import open_file
 from .reader import FlightReader, ReadOptions, Record, Run
 
 _CHUNK: Final = 2**17  # bytes read at a time
-_MAX_NAMED: Final = 5  # damaged locations listed in the warnings
-_MAX_TOPICS: Final = 10  # topics listed in an error
-_MAX_RECENT: Final = 1000  # messages of a topic among which duplicates are searched
+_LISTED_DAMAGES: Final = 5  # the others are counted
 
 
 class UlogReader(FlightReader):
@@ -26,13 +24,15 @@ class UlogReader(FlightReader):
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)
-        self._file, self.total = open_file(path), path.stat().st_size
+        self._file = open_file(path)
+        self.total = path.stat().st_size
         self._resources.append(self._file)
         self._system_id = options.default_vehicle
         self._texts = ulog.LogMessageBuilder()
         needed = None if options.topics is None else {*options.topics, *self._texts.TOPICS}
         self._parser = ulog.UlogParser(verify=True, topics=needed)
-        self._damages, self._is_read = 0, False
+        self._damages = 0
+        self._is_read = False
         self._unset_bools: Counter[str] = Counter()  # by topic
         self._warnings: list[str] = []
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
@@ -48,33 +48,39 @@ class UlogReader(FlightReader):
     @property
     def warnings(self) -> list[str]:
         """Damage found, and parts and fields skipped so far; counts are listed once the log has been read."""
-        streams = [each for each in self._streams.values() if each is not None]
-        warnings = self._warnings + [
-            reason for stream in streams for reason in stream.omitted.values()
-        ]
-        counts = {
-            "further damaged locations": self._damages - _MAX_NAMED,
-            "skipped messages without a definition": self._parser.undecodable,
-            "left out log messages above 100 per second": self._texts.limit.omitted,
-            **{ulog.UNSET_BOOLS.format(topic): count for topic, count in self._unset_bools.items()},
-        }
-        warnings += [
-            f"{text} ({count})" for text, count in counts.items() if count > 0 and self._is_read
-        ]
-        warnings += [text for each in set(self._repeated.values()) for text in each.warnings]
+        warnings = [*self._warnings]
+        for stream in self._streams.values():
+            if stream is not None:
+                warnings += stream.omitted.values()
+        if self._is_read:
+            warnings += self._counted_warnings()
+        for repetitions in set(self._repeated.values()):
+            warnings += repetitions.warnings
         for stream in self._firsts.values():
             unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
             if unknown and _is_newer(stream):
-                warnings.append(
-                    f"left out unknown fields of {stream.address} ({', '.join(unknown)}); update nedbus"
-                )
-        return [*warnings, *filter(None, [self._texts.problem])]
+                fields = ", ".join(unknown)
+                text = f"left out unknown fields of {stream.address} ({fields}); update nedbus"
+                warnings.append(text)
+        if self._texts.problem:
+            warnings.append(self._texts.problem)
+        return warnings
+
+    def _counted_warnings(self) -> list[str]:
+        counts = {
+            "further damaged locations": self._damages - _LISTED_DAMAGES,
+            "skipped messages without a definition": self._parser.undecodable,
+            "left out log messages above 100 per second": self._texts.limit.omitted,
+        }
+        for topic, count in self._unset_bools.items():
+            counts[ulog.UNSET_BOOLS.format(topic)] = count
+        return [f"{text} ({count})" for text, count in counts.items() if count > 0]
 
     def records(self) -> Iterator[Record]:
         """Yield the data messages; raise SourceError if the file is not a ULog file, or has none of the topics."""
         plain = self._plain
         data = ulog.Data
-        make = tuple.__new__
+        make = tuple.__new__  # half the time of the constructor
         for records in self._read():
             for record in records:
                 if isinstance(record, data) and record[0] in plain:
@@ -85,28 +91,35 @@ class UlogReader(FlightReader):
 
     def runs(self) -> Iterator[Run]:
         """Yield the messages stream by stream in parts of the file; messages that need further checks one by one."""
-        found = dict[ulog.Subscription, Run]()
+        open_runs = dict[ulog.Subscription, Run]()
         for records in self._read():
             for record in records:
-                if isinstance(record, ulog.Data) and record.subscription in found:
-                    found[record.subscription].payloads.append(record.payload)
+                if isinstance(record, ulog.Data) and record.subscription in open_runs:
+                    open_runs[record.subscription].payloads.append(record.payload)
                     continue
-                selected = [Run(each.stream, [each.payload], []) for each in self._select(record)]
+                selected = [*self._select(record)]
                 # the messages of a stream that needs checks now come first
-                if len(self._plain) != len(found):
-                    yield from self._take_runs(found)
-                    found = {
-                        each: found.get(each) or Run(stream, self._parser.collect(each), [])
-                        for each, stream in self._plain.items()
-                    }
-                yield from selected
-            yield from self._take_runs(found)
+                if len(self._plain) != len(open_runs):
+                    yield from self._take_runs(open_runs)
+                    open_runs = self._open_runs(open_runs)
+                for message in selected:
+                    yield Run(message.stream, [message.payload], [])
+            yield from self._take_runs(open_runs)
+
+    def _open_runs(self, known: Mapping[ulog.Subscription, Run]) -> dict[ulog.Subscription, Run]:
+        """Return a run for each stream without further checks; the parser collects its payloads."""
+        runs = dict[ulog.Subscription, Run]()
+        for subscription, stream in self._plain.items():
+            run = known.get(subscription)
+            if run is None:
+                run = Run(stream, self._parser.collect(subscription), [])
+            runs[subscription] = run
+        return runs
 
     def layouts(self, definition: Definition[Any]) -> set[str]:
         """Return the names of the layouts of a definition so far."""
-        return {
-            _layout_name(each) for each in self._firsts.values() if each.definition is definition
-        }
+        streams = [stream for stream in self._firsts.values() if stream.definition is definition]
+        return {_layout_name(stream) for stream in streams}
 
     def _read(self) -> Iterator[list[ulog.Record]]:
         try:
@@ -117,29 +130,37 @@ class UlogReader(FlightReader):
             self._warnings += self.shrinkage()
             yield self._parser.close()
             self._is_read = True
-            self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
-            self.damaged |= any(each.warnings and each.is_loss for each in self._repeated.values())
+            self._check_losses()
         except ulog.UlogError as exc:
             raise SourceError(str(self.path), f"not a readable ULog file ({exc})") from exc
         except OSError as exc:
             raise SourceError(str(self.path), (exc.strerror or str(exc)).lower()) from exc
         if not self.definitions:
-            topics = self.options.topics
-            what = (
-                "any topic"
-                if topics is None
-                else "these topics"
-                if len(topics) < len(TOPICS)
-                else "built-in topics"
-            )
-            reason = f"this log has no message of {what}"
-            if topics is not None and self._subscribed:
-                names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
-                reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
-            raise SourceError(str(self.path), "; ".join([reason, *self.warnings[:3]]))
+            raise SourceError(str(self.path), "; ".join([self._absence, *self.warnings[:3]]))
 
-    def _take_runs(self, found: Mapping[ulog.Subscription, Run]) -> Iterator[Run]:
-        for subscription, (stream, payloads, _) in found.items():
+    def _check_losses(self) -> None:
+        """Note whether messages were lost, at the end of the log."""
+        if self._parser.undecodable or self._texts.problem:
+            self.damaged = True
+        for repetitions in self._repeated.values():
+            if repetitions.warnings and repetitions.is_loss:
+                self.damaged = True
+
+    @property
+    def _absence(self) -> str:
+        """Why the log has no messages."""
+        topics = self.options.topics
+        if topics is None:
+            return "this log has no message of any topic"
+        wanted = "these topics" if len(topics) < len(TOPICS) else "built-in topics"
+        reason = f"this log has no message of {wanted}"
+        if not self._subscribed:
+            return reason
+        names = ", ".join(sorted(self._subscribed)[: limits.SHOWN_NAMES])
+        return f"{reason}, but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
+
+    def _take_runs(self, runs: Mapping[ulog.Subscription, Run]) -> Iterator[Run]:
+        for subscription, (stream, payloads, _) in runs.items():
             if payloads:
                 self._count_unset_bools(subscription, payloads)
                 yield Run(stream, payloads.copy(), [])
@@ -147,11 +168,13 @@ class UlogReader(FlightReader):
 
     def _select(self, record: ulog.Record) -> Iterator[Record]:
         """Yield the message of a record, and the log message after it, if they are selected; process other records."""
-        for each in self._texts.merge((record,)):
-            if not isinstance(each, ulog.Data):
-                self._process(each)
-            elif (stream := self._accept(each)) is not None:
-                yield Record(stream, each.payload, None)
+        for merged in self._texts.merge((record,)):
+            if not isinstance(merged, ulog.Data):
+                self._process(merged)
+                continue
+            stream = self._accept(merged)
+            if stream is not None:
+                yield Record(stream, merged.payload, None)
 
     def _accept(self, record: ulog.Data) -> ulog.LoggedStream | None:
         """Return the stream of a data message, None if the message is not selected or a duplicate."""
@@ -159,26 +182,28 @@ class UlogReader(FlightReader):
         if subscription not in self._streams:
             self._streams[subscription] = self._open(subscription)
         stream = self._streams[subscription]
-        if stream is None or (
-            stream in self._repeated and self._repeated[stream].add(stream, payload)
-        ):
+        if stream is None:
+            return None
+        repetitions = self._repeated.get(stream)
+        if repetitions is not None and repetitions.add(stream, payload):
             return None
         self._count_unset_bools(subscription, (payload,))
-        if stream not in self._repeated and subscription.name not in (
-            *self._texts.TOPICS,
-            ulog.LOG_MESSAGE.name,
-        ):
+        is_text = subscription.name in (*self._texts.TOPICS, ulog.LOG_MESSAGE.name)
+        if repetitions is None and not is_text:
             self._plain[subscription] = stream
         return stream
 
     def _count_unset_bools(
         self, subscription: ulog.Subscription, payloads: Iterable[bytes]
     ) -> None:
-        layout, to_int = subscription.layout, int.from_bytes
-        if mask := layout.bool_mask:
-            for payload in payloads:
-                if to_int(payload, "little") & mask:
-                    self._unset_bools[subscription.name] += layout.count_unset_bools(payload)
+        layout = subscription.layout
+        mask = layout.bool_mask
+        if not mask:
+            return
+        to_int = int.from_bytes
+        for payload in payloads:
+            if to_int(payload, "little") & mask:
+                self._unset_bools[subscription.name] += layout.count_unset_bools(payload)
 
     def _process(self, record: ulog.Record) -> None:
         if isinstance(record, ulog.Header):
@@ -186,29 +211,33 @@ class UlogReader(FlightReader):
         elif isinstance(record, ulog.Information):
             if record.key == "boot_time_utc_us" and isinstance(record.value, int):
                 self.boot_utc = record.value
+        elif isinstance(record, ulog.Parameter):
+            if record.key == "MAV_SYS_ID" and record.value in range(1, 256):
+                self._system_id = str(record.value)
         elif isinstance(record, ulog.Dropout):
             self._dropout += record.duration / 1e3
-        elif (
-            isinstance(record, ulog.Parameter)
-            and record.key == "MAV_SYS_ID"
-            and record.value in range(1, 256)
-        ):
-            self._system_id = str(record.value)
         elif isinstance(record, ulog.Subscription):
-            self._subscribed[record.name] += 1
-            self._subscribers[_instance_of(record)] += 1
-            for first in [
-                each for each in self._plain if _instance_of(each) == _instance_of(record)
-            ]:
+            self._subscribe(record)
+        elif isinstance(record, ulog.Damage):
+            self._note_damage(record)
+
+    def _subscribe(self, subscription: ulog.Subscription) -> None:
+        self._subscribed[subscription.name] += 1
+        instance = _instance_of(subscription)
+        self._subscribers[instance] += 1
+        for first in [*self._plain]:
+            if _instance_of(first) == instance:
                 stream = self._plain.pop(first)
                 self._repeated[stream] = _Repetitions(stream)
-        elif isinstance(record, ulog.Damage):
-            self._damages += not record.is_end
-            self.damaged |= not record.is_end
-            if self._damages <= _MAX_NAMED:
-                self._warnings.append(
-                    f"{'truncated' if record.is_end else 'damaged'} ({record.reason})"
-                )
+
+    def _note_damage(self, damage: ulog.Damage) -> None:
+        kind = "truncated"
+        if not damage.is_end:
+            kind = "damaged"
+            self._damages += 1
+            self.damaged = True
+        if self._damages <= _LISTED_DAMAGES:
+            self._warnings.append(f"{kind} ({damage.reason})")
 
     def _open(self, subscription: ulog.Subscription) -> ulog.LoggedStream | None:
         """Return the stream of a subscription at its first message, None if it is not selected or not usable."""
@@ -221,10 +250,10 @@ class UlogReader(FlightReader):
             self._warnings.append(f"skipped {topic} ({exc})")
             self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
             return None
-        if lacking := ", ".join(sorted(stream.definition.always.difference(stream.names))):
-            self._warnings.append(
-                f"the definition of {lacking} in {topic} [{subscription.multi_id}] is damaged"
-            )
+        lacking = sorted(stream.definition.always.difference(stream.names))
+        if lacking:
+            where = f"{topic} [{subscription.multi_id}]"
+            self._warnings.append(f"the definition of {', '.join(lacking)} in {where} is damaged")
             self.damaged = True
         if "timestamp" not in stream.names:
             return None
@@ -250,34 +279,39 @@ class _Repetitions:
 
     def add(self, stream: ulog.LoggedStream, payload: bytes) -> bool:
         """Return whether another subscription had this message, or is another instance with the same address."""
-        subscription, recent = stream.subscription, self._recent
-        known = recent.get(payload, subscription)
-        if known is subscription:
-            if len(recent) >= _MAX_RECENT:
-                del recent[next(iter(recent))]
-            recent[payload] = subscription
-        if known is not subscription:
+        subscription = stream.subscription
+        recent = self._recent
+        if recent.get(payload, subscription) is not subscription:
             return True
+        if len(recent) >= limits.KNOWN_TIMES:
+            oldest = next(iter(recent))
+            del recent[oldest]
+        recent[payload] = subscription
         if subscription.multi_id == self._first.subscription.multi_id:
             return False
         if subscription not in self._others:
             self._others.add(subscription)
-            number, topic = subscription.multi_id, stream.address.topic
-            self.warnings.append(f"skipped a duplicate {topic} [{number}] with different messages")
-            self.is_loss |= stream.address.instance is not None or number == 0
+            number = subscription.multi_id
+            where = f"{stream.address.topic} [{number}]"
+            self.warnings.append(f"skipped a duplicate {where} with different messages")
+            if stream.address.instance is not None or number == 0:
+                self.is_loss = True
         return True
 
 
 def _instance_of(subscription: ulog.Subscription) -> tuple[str, int]:
     """Return topic and instance; all instances of a topic that has none in PX4 share one address."""
     topic = subscription.name
-    return topic, subscription.multi_id if topic not in TOPICS or TOPICS[topic].instances else 0
+    has_instances = topic not in TOPICS or TOPICS[topic].instances
+    return topic, subscription.multi_id if has_instances else 0
 
 
 def _layout_name(stream: ulog.LoggedStream) -> str:
     """Return the name of the layout of a logged stream of a built-in message."""
     layout = stream.definition.find_layout(stream.names)
-    return layout.name if layout else "newer than 1.16" if _is_newer(stream) else "1.12 or older"
+    if layout:
+        return layout.name
+    return "newer than 1.16" if _is_newer(stream) else "1.12 or older"
 
 
 def _is_newer(stream: ulog.LoggedStream) -> bool:

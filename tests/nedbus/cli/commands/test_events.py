@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import nedbus
-from nedbus import Address
+from nedbus import Address, limits
 from nedbus.flights import format_of, read_file_events
 from nedbus.transport import Session
 from nedbus.vehicle_events import KINDS
@@ -269,7 +269,7 @@ def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
 
 def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Above the limit only the most recent events are shown, and stderr states the total."""
-    monkeypatch.setattr("nedbus.flights.events.MAX_FILE_EVENTS", 2000)
+    monkeypatch.setattr(limits, "FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
     for second in range(2200):
