@@ -39,6 +39,9 @@ BATCH_MESSAGES: Final = 4096
 
 # --- Files ---
 
+ALIGNED_ROWS: Final = 10_000_000
+"""Rows of `align` at a given rate, as a damaged timestamp must not exhaust memory. More raise ArgumentError."""
+
 # --- ULog ---
 
 # --- Time ---
