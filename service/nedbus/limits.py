@@ -52,6 +52,39 @@ ALIGNED_ROWS: Final = 10_000_000
 
 # --- Page ---
 
+PAGES: Final = 32
+"""Pages open at the same time, each of which takes a share of the CPU. Further ones show that the limit is reached."""
+
+WAITING_PAGES: Final = 128
+"""Pages without a WebSocket yet, as a client may request many and open none. At it, further pages are refused."""
+
+PAGE_CONNECTIONS: Final = 512
+"""Connections of the page, or half of RLIMIT_NOFILE, if that is less. Further ones are closed before `accept` fails."""
+
+PAGE_REQUEST_BYTES: Final = 2**16
+"""Body of a request, which Tornado buffers before the Host header is checked. A larger one is refused."""
+
+PAGE_MESSAGE_BYTES: Final = 2**20
+"""WebSocket message from a browser, which is buffered as a whole. A larger one closes the page's connection."""
+
+PAGE_STREAMS: Final = 1000
+"""Streams on a page, as each takes memory. Of more, positions are shown first, and the others are counted."""
+
+PAGE_STORY_EVENTS: Final = 500
+"""Latest events of a vehicle in which the page finds faults, twice a second. Earlier ones are not used."""
+
+PAGE_STORIES: Final = 2000
+"""Faults and reasons kept until the next event, more than an event log has vehicles. The oldest are dropped."""
+
+PAGE_MARKS: Final = 2000
+"""Events marked in the plots, which a browser can draw. Of more, the latest bad and watch events are marked."""
+
+PAGE_TRACK_POINTS: Final = 6000
+"""Points of all tracks on the map, which a browser can draw ten times a second. Of more, some are left out evenly."""
+
+MAP_PIXELS: Final = 50_000_000
+"""Pixels of an image file for the map, each of which takes up to 4 bytes. A larger image is refused unread."""
+
 # --- Doctor ---
 
 # --- Monitoring ---
