@@ -50,6 +50,27 @@ ALIGNED_ROWS: Final = 10_000_000
 
 # --- Commands ---
 
+LINE_TEXT: Final = 1000
+"""Characters of a line of an error, a log or a report, parts of which peers write. A longer line is cut."""
+
+LIST_TEXT: Final = 2000
+"""Characters of a list of vehicles or topics that `nedbus info` prints. A longer list is cut."""
+
+CELL_TEXT: Final = 120
+"""Characters of a peer's value in a table, which must stay readable. A longer value is cut."""
+
+TABLE_ROWS: Final = 200
+"""Rows of a table, and services in `nedbus info`, as any peer may claim to be one. The others are counted."""
+
+LIVE_ROWS: Final = 50
+"""Rows of a table that is printed each second, as nobody reads more. The others are counted."""
+
+LOG_KINDS: Final = 1000
+"""Kinds of log lines with an own rate limit; nedbus itself has about 40. Further kinds share one."""
+
+TRACEBACK_TEXT: Final = 20_000
+"""Characters of a traceback in the log, which recursion makes long. Its beginning is cut: the end names the error."""
+
 # --- Page ---
 
 PAGES: Final = 32

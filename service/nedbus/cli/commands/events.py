@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 import nedbus
+from nedbus import limits
 from nedbus.cli.options import (
     CsvOption,
     DurationOption,
@@ -36,7 +37,6 @@ _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
     "author",
 )  # fmt: skip
-_MAX_TEXT: Final = 400  # characters of a peer's text
 _WITHIN: Final = "First show the events of the last SECONDS"
 _ORIGIN: Final = "PX4's own log messages, or events derived by nedbus"
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
@@ -170,7 +170,7 @@ def why(
             write(json.dumps({"vehicle": name} | _verdict_fields(verdict)))
             continue
         faults += len(verdict.stories)
-        texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
+        texts.append(fold(f"{name}: ", to_text(verdict.text, limits.LINE_TEXT)))
         if details:
             texts += ["\n".join(_describe(verdict, story, advice)) for story in verdict.stories]
             if verdict.others:
@@ -210,7 +210,7 @@ def _require_history(
 def _name_unreported(bus: "Bus", vehicles: Sequence[str]) -> None:
     """Name vehicles that are published, but about which no service reports, and older services."""
     if vehicles:
-        names = to_text(", ".join(vehicles), _MAX_TEXT)
+        names = to_text(", ".join(vehicles), limits.LINE_TEXT)
         write_stderr(
             f"no verdict on {names}: published, but no nedbus service keeps the event history"
         )
@@ -226,10 +226,13 @@ def _name_outdated(bus: "Bus") -> None:
 
 def _describe(verdict: Verdict, story: Story, advice: str) -> Iterator[str]:
     times = verdict.times
-    yield fold(f"{verdict.vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {verdict.period(story)}")
+    yield fold(
+        f"{verdict.vehicle}: ", f"{to_text(story.what, limits.LINE_TEXT)} {verdict.period(story)}"
+    )
     sections = {"evidence": story.before, "meanwhile": story.meanwhile}
     if story.end is not None:
-        sections[f"ended at {times.text(story.end)}{' with' * bool(story.after)}"] = story.after
+        with_events = " with" if story.after else ""
+        sections[f"ended at {times.text(story.end)}{with_events}"] = story.after
     for title, shown in sections.items():
         if shown or title.startswith("ended"):
             yield f"  {title}"
@@ -265,7 +268,7 @@ def to_line(event: Event, times: Times) -> str:
 
 
 def _shown(event: Event) -> str:
-    return to_text(event.words, _MAX_TEXT)
+    return to_text(event.words, limits.LINE_TEXT)
 
 
 def _timed(event: Event, times: Times, since: float | None = None) -> str:
@@ -370,7 +373,7 @@ def _require_vehicles(where: object, names: Collection[str], vehicles: Collectio
         if vehicle in names:
             continue
         check_vehicle(vehicle)
-        known = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT)
+        known = to_text(", ".join(sorted(names)[:20]), limits.LINE_TEXT)
         raise ConfigError(
             "--vehicle", f"no vehicle {vehicle} in {where}{known and f': choose one of {known}'}"
         )
