@@ -258,7 +258,7 @@ _ADVICE: Final = {
 
 def to_line(event: Event, times: Times) -> str:
     """Format an event as one line: time, vehicle, severity, text and evidence."""
-    evidence = ", ".join(_before(each, event.time) for each in event.evidence)
+    evidence = ", ".join(_before(cause, event.time) for cause in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
     return fold(
@@ -325,9 +325,9 @@ def _to_fields(event: Event, times: Times) -> dict[str, object]:
         None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
     )
     evidence = [
-        {"kind": each.kind, "change": each.change, "text": each.text, "topic": each.topic,
-         "before": round(event.time - each.time, 3)}
-        for each in event.evidence
+        {"kind": cause.kind, "change": cause.change, "text": cause.text, "topic": cause.topic,
+         "before": round(event.time - cause.time, 3)}
+        for cause in event.evidence
     ]  # fmt: skip
     return (
         {"time": time, "clock": times.clock(event)}
@@ -339,7 +339,7 @@ def _to_fields(event: Event, times: Times) -> dict[str, object]:
 def _to_csv(event: Event, times: Times) -> str:
     fields = _to_fields(event, times)
     fields["evidence"] = "; ".join(
-        f"{each.kind} {event.time - each.time:.1f} s" for each in event.evidence
+        f"{cause.kind} {event.time - cause.time:.1f} s" for cause in event.evidence
     )
     fields["numbers"] = json.dumps(dict(event.numbers)) if event.numbers else ""
     return csv_line([fields[name] for name in _HEAD])
@@ -351,11 +351,11 @@ def _verdict_fields(verdict: Verdict) -> dict[str, object]:
 
     faults = [
         {
-            "what": each.what, "begin": fields([each.begin])[0], "end": fields([each.end])[0],
-            "lasted": None if each.until is None else each.until - each.since, "before": fields(each.before),
-            "meanwhile": fields(each.meanwhile), "after": fields(each.after), "lacking": each.lacking,
+            "what": story.what, "begin": fields([story.begin])[0], "end": fields([story.end])[0],
+            "lasted": None if story.until is None else story.until - story.since, "before": fields(story.before),
+            "meanwhile": fields(story.meanwhile), "after": fields(story.after), "lacking": story.lacking,
         }
-        for each in verdict.stories
+        for story in verdict.stories
     ]  # fmt: skip
     begin, end = fields([verdict.begin, verdict.end])
     head = {
