@@ -3,16 +3,14 @@
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from nedbus import Bus
+from nedbus import Bus, limits
 from nedbus.health import ServiceStatus, SourceStatus
 from nedbus_msgs.text import counted
 
 from .output.streams import to_text
 
 _TIMEOUT: Final = 1.0  # s for the router to list the tokens of other prefixes
-_MAX_NAMED: Final = 20  # vehicles or addresses in a hint
-_MAX_REASONS: Final = 5  # sources or prefixes in a hint
-_MAX_REASON: Final = 300  # characters of the error of a source
+_REASONS: Final = 5  # sources or prefixes in a hint; more would hide the remedy
 
 
 class Absence(NamedTuple):
@@ -27,21 +25,22 @@ def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] 
     services = bus.services()
     reasons = [reason for service in services for reason in _source_reasons(service, wanted)]
     if reasons:
-        hidden = len(reasons) - _MAX_REASONS
+        hidden = len(reasons) - _REASONS
         more = f"; and {hidden} more" if hidden > 0 else ""
-        return Absence(f"{'; '.join(reasons[:_MAX_REASONS])}{more}", is_fault=True)
+        return Absence(f"{'; '.join(reasons[:_REASONS])}{more}", is_fault=True)
     if published:
         return Absence(
-            f"choose one of {to_text(', '.join(sorted(published)[:_MAX_NAMED]))}", is_fault=False
+            f"choose one of {to_text(', '.join(sorted(published)[: limits.SHOWN_NAMES]))}",
+            is_fault=False,
         )
     if services:
         advice = "see 'nedbus info' and the access rules for it and this client (docs/security.md)"
         outdated = [service.service for service in services if service.is_outdated]
         if outdated:
-            names = to_text(", ".join(outdated[:_MAX_NAMED]))
+            names = to_text(", ".join(outdated[: limits.SHOWN_NAMES]))
             advice = f"{advice}; update nedbus on the host of {names}, which is older"
         return Absence(f"a service answers: {advice}", is_fault=False)
-    if prefixes := bus.other_prefixes(timeout=_TIMEOUT)[:_MAX_REASONS]:
+    if prefixes := bus.other_prefixes(timeout=_TIMEOUT)[:_REASONS]:
         names = " and ".join(f"{to_text(prefix)}/" for prefix in prefixes)
         advice = f"use --prefix {to_text(prefixes[0])}"
         reason = (
@@ -55,13 +54,13 @@ def describe_outdated(services: Sequence[ServiceStatus]) -> list[str]:
     """Return a line for each of the first older services, whose reports are not used, and one for the others."""
     outdated = [service for service in services if service.is_outdated]
     lines: list[str] = []
-    for service in outdated[:_MAX_NAMED]:
+    for service in outdated[: limits.SHOWN_NAMES]:
         where = f"service {to_text(service.service, 64)} on {to_text(service.host or 'an unknown host', 64)}"
         version = f"nedbus {to_text(service.version or 'of an unknown version', 20)}"
         lines.append(
             f"{where} runs {version}, whose status does not name its vehicle, and is not used: update it"
         )
-    more = len(outdated) - _MAX_NAMED
+    more = len(outdated) - limits.SHOWN_NAMES
     if more > 0:
         lines.append(f"{counted(more, 'more older service')}, which any vehicle can invent")
     return lines
@@ -70,13 +69,14 @@ def describe_outdated(services: Sequence[ServiceStatus]) -> list[str]:
 def _source_reasons(service: ServiceStatus, wanted: Sequence[str]) -> Iterator[str]:
     where = f"of service {to_text(service.service)} on {to_text(service.host or 'an unknown host')}"
     for source in service.sources:
-        if reason := _source_reason(source, wanted):
+        reason = _source_reason(source, wanted)
+        if reason:
             yield f"source {to_text(source.source)} {where} {reason}"
 
 
 def _source_reason(source: SourceStatus, wanted: Sequence[str]) -> str:
     """Return the state of a source that publishes none of the wanted vehicles, "" if it works."""
-    error = to_text(source.error or "unknown reason", _MAX_REASON)
+    error = to_text(source.error or "unknown reason", limits.PEER_TEXT)
     if source.state == "failed":
         return f"has failed: {error}"
     if source.state == "retrying":
@@ -85,7 +85,7 @@ def _source_reason(source: SourceStatus, wanted: Sequence[str]) -> str:
         address for address in source.stale if not wanted or address.partition("/")[0] in wanted
     ]
     if stale:
-        names = to_text(", ".join(stale[:_MAX_NAMED]))
+        names = to_text(", ".join(stale[: limits.SHOWN_NAMES]))
         return (
             f"receives no more messages of {names}: check that the vehicle is on and its link is up"
         )

@@ -2,7 +2,6 @@
 
 import functools
 import inspect
-import itertools
 import logging
 import re
 import signal
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 
+from nedbus import limits
 from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
@@ -28,7 +28,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.frames import derived_from
 
-from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
+from .output.streams import discard_stdout, is_log_structured, to_text, write_stderr
 
 if TYPE_CHECKING:
     from nedbus import Bus
@@ -108,24 +108,27 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     parameters = inspect.signature(function, eval_str=True).parameters
     factories = {name: factory for name, factory in _FACTORIES.items() if name in parameters}
     expanded = {name: _options_of(factory) for name, factory in factories.items()}
-    direct = [each for name, each in parameters.items() if name not in factories]
+    options = [parameter for name, parameter in parameters.items() if name not in factories]
+    for parameters_of_factory in expanded.values():
+        options += parameters_of_factory
+    options.sort(key=lambda option: option.kind)
 
     @functools.wraps(function)
     def run(**values: Any) -> None:
         with exit_on_errors(), ExitStack() as stack:
             for name, factory in factories.items():
-                make = functools.partial(
-                    factory, **{each.name: values.pop(each.name) for each in expanded[name]}
-                )
+                own = {option.name: values.pop(option.name) for option in expanded[name]}
+                make = functools.partial(factory, **own)
                 if name == "selection":
                     values[name] = make(default=parameters[name].default.topics)
+                elif name == "bus":
+                    values[name] = stack.enter_context(make())
                 else:
-                    values[name] = stack.enter_context(make()) if name == "bus" else make
+                    values[name] = make
             function(**values)
 
-    options = sorted([*direct, *itertools.chain(*expanded.values())], key=lambda each: each.kind)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined] # Typer reads both
-    run.__annotations__ = {each.name: each.annotation for each in options}
+    run.__annotations__ = {option.name: option.annotation for option in options}
     # because rich keeps line breaks
     run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")
     return run
@@ -134,12 +137,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 def _options_of(factory: Callable[..., object]) -> list[inspect.Parameter]:
     """Return a factory's parameters that have defaults; `**settings_options` expands to those of `_read_settings`."""
     parameters = [*inspect.signature(factory, eval_str=True).parameters.values()]
-    options = [each for each in parameters if each.default is not each.empty]
-    return (
-        [*_options_of(_read_settings), *options]
-        if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD
-        else options
-    )
+    options = [option for option in parameters if option.default is not option.empty]
+    if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD:
+        return [*_options_of(_read_settings), *options]
+    return options
 
 
 @contextmanager
@@ -273,17 +274,18 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
     topics = selection.topics
-    known = (
-        list(MESSAGES.values()) if topics == (ANY,) else [BY_TOPIC.get(topic) for topic in topics]
-    )
+    if topics == (ANY,):
+        messages: list[Definition[Any]] = list(MESSAGES.values())
+    elif all(topic in BY_TOPIC for topic in topics):
+        messages = [BY_TOPIC[topic] for topic in topics]
+    else:
+        return names  # the fields of a message that is not built in are not known yet
+    known = set[str]()
+    for definition in messages:
+        known.update(_columns_of(definition))
     for name in names:
-        first = known[0]
-        if (
-            first is not None
-            and None not in known
-            and not any(each and name in _columns_of(each) for each in known)
-        ):
-            raise ConfigError("--field", first.explain_unknown_field(name))
+        if name not in known:
+            raise ConfigError("--field", messages[0].explain_unknown_field(name))
     return names
 
 
@@ -294,5 +296,5 @@ def _exit_with(error: NedbusError, code: int) -> typer.Exit:
     if is_log_structured():
         _log.error("%s", error, extra=about("error"))
     else:
-        write_stderr(to_text(f"nedbus: {error}", MAX_TEXT))
+        write_stderr(to_text(f"nedbus: {error}", limits.LINE_TEXT))
     return typer.Exit(code)

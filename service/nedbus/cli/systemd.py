@@ -10,13 +10,14 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Final, Self
 
+from nedbus import limits
 from nedbus.daemon import Daemon
 from nedbus.log_event import UnexpectedErrors
 from nedbus.monitoring import why_not_ready
 from nedbus.timings import TIMINGS
 from nedbus_msgs.text import counted
 
-from .output.streams import MAX_TEXT, to_text
+from .output.streams import to_text
 
 _log = logging.getLogger("nedbus")
 
@@ -151,7 +152,8 @@ class Notifier:
             f"{float(f'{rate:.2g}'):g} messages/s, {counted(daemon.sessions, 'session')}"
         )
         return to_text(
-            "; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])), MAX_TEXT
+            "; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])),
+            limits.LINE_TEXT,
         )
 
 

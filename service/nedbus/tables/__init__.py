@@ -10,7 +10,7 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .alignment import align
     from .arrays import addresses_of, array_of, array_warnings, missing_of, open_arrays
-    from .plot import MAX_STREAMS, draw, draw_fields
+    from .plot import STREAM_COLORS, draw, draw_fields
     from .reading import read, read_plotted
 else:
     # No submodule may share the name of an export: importing it would replace the export.
@@ -18,13 +18,13 @@ else:
         ("", "alignment"): "align",
         ("", "arrays"): "addresses_of array_of array_warnings missing_of open_arrays",
         ("", "reading"): "read read_plotted",
-        ("plot", "plot"): "MAX_STREAMS draw draw_fields",
+        ("plot", "plot"): "STREAM_COLORS draw draw_fields",
     }
     __getattr__ = lazy_exports(
         __name__, {name: place for place, names in _NAMES.items() for name in names.split()}
     )
 
 __all__ = [
-    "MAX_STREAMS", "addresses_of", "align", "array_of", "array_warnings", "draw", "draw_fields", "missing_of", "read",
+    "STREAM_COLORS", "addresses_of", "align", "array_of", "array_warnings", "draw", "draw_fields", "missing_of", "read",
     "read_plotted",
 ]  # fmt: skip

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overload
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 
-from nedbus import UtcOffset, utc_of
+from nedbus import UtcOffset, limits, utc_of
 from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.flights import utc_offset_of
 from nedbus.timeline import to_datetime64
@@ -20,6 +21,7 @@ from .arrays import (
     Library,
     Pandas,
     Polars,
+    StreamArray,
     Streams,
     missing_of,
     recording_start,
@@ -33,15 +35,17 @@ if TYPE_CHECKING:
 
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
-_MAX_ROWS: Final = 10_000_000  # rows at a given rate; a damaged timestamp must not exhaust memory
 # us; a first message that is older when recording starts was sent before the start
 _STALE: Final = 1_000_000
 # fraction of messages that may be out of order; a larger one indicates several boots
 _STRAY: Final = 0.01
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
+_NO_TIME: Final = 2**62  # us; larger timestamps are damaged
+_ABSENT: Final = -1  # row of a message that does not exist
 
 _Floats = npt.NDArray[np.float64]
 _Ints = npt.NDArray[np.int64]
+_Mask = npt.NDArray[np.bool_]
 _Flights = FlightPath | Sequence[FlightPath] | Mapping[str, MessageArray]
 
 
@@ -102,67 +106,108 @@ def align(
     """
     if method not in _METHODS:
         raise ArgumentError("method", method, f"one of {', '.join(_METHODS)}")
-    reference = [on] if isinstance(on, str) else []
-    topics = [topics] if isinstance(topics, str) else topics
-    names = [*reference, *(topics or ())]
-    found: ReadStreams | None = None
+    if isinstance(topics, str):
+        topics = [topics]
+    names = list(topics or ())
+    if isinstance(on, str):
+        names.insert(0, on)
+    opened: ReadStreams | None = None
     if isinstance(flight, Mapping):
         streams = _choose_streams(flight, topics, names)
     else:
-        found = read_streams(
-            flight, names if topics else None, vehicle=vehicle, layout=layout, utc=utc
-        )
-        streams = found.streams
-    if isinstance(on, str):
-        # not a topic known to nedbus
-        if not _streams_named(on, streams) and not isinstance(flight, Mapping):
+        selected = names if topics else None
+        opened = read_streams(flight, selected, vehicle=vehicle, layout=layout, utc=utc)
+        streams = opened.streams
+        if isinstance(on, str) and not _streams_named(on, streams):
+            # not a topic known to nedbus
             streams |= read_streams(flight, [on], vehicle=vehicle, layout=layout).streams
-        on = _first_named(on, streams)
-        reference = [on]
-    streams = {name: streams[name] for name in [*reference, *streams]}
-    stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
-    times = stamps[on] if isinstance(on, str) else _times(on, stamps, _start_of(found))
-    columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
+    own = ""
+    if isinstance(on, str):
+        own = _first_named(on, streams)
+        streams = {own: streams[own], **streams}
+    stamps = {name: _stamps(name, stream.messages) for name, stream in streams.items()}
+    times = stamps[own] if isinstance(on, str) else _times(on, stamps, _start_of(opened))
+    table = _Table({"timestamp": times.astype(np.uint64)}, {})
     if utc:
-        columns["utc"] = _to_utc(times, _offset_of(found, streams))
-    absent: dict[str, npt.NDArray[np.bool_]] = {}
+        table.columns["utc"] = _to_utc(times, _offset_of(opened, streams))
     requested = {field.rpartition(".")[2] for field in fields or ()}
-    for name, (messages, lacking) in streams.items():
-        rows, following, weight = _look_up(
-            stamps[name], times, "own" if [name] == reference else method
-        )
-        values, is_absent = _pick(messages, rows), rows < 0
-        if method == "linear":
-            _interpolate(name, values, _pick(messages, following), weight)
-        columns[f"{name}.age"] = (
-            np.where(is_absent, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
-        )
-        for field in messages.dtype.names or ():
-            columns[f"{name}.{field}"] = values[field]
-            absent[f"{name}.{field}"] = (
-                np.append(lacking[field], True)[rows] if field in lacking else is_absent
-            )
-        for field in requested.intersection(derived_from(messages.dtype.names or ())):
-            columns[f"{name}.{field}"] = derive_column(values, field)  # from interpolated values
-            absent[f"{name}.{field}"] = is_absent
-    columns = columns if fields is None else _choose(columns, fields)
-    lacked = {
-        f"{name}.{field}"
-        for name, (messages, _) in streams.items()
-        for field in missing_of(messages)
-    }
-    missing = tuple(each for each in columns if each in lacked)
-    types = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
-    table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
-    for name, column in columns.items():
-        table[name] = column
-    return to_dataframe(
-        table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe
-    )
+    for name, stream in streams.items():
+        if name == own:
+            match = _match_own(len(times))
+        else:
+            match = _match(stamps[name], times, nearest=method == "nearest")
+        table.add(name, stream, match, requested, is_linear=method == "linear")
+    if fields is not None:
+        table.columns = _choose(table.columns, fields)
+    return to_dataframe(table.to_array(_missing(streams)), table.incomplete(), dataframe)
+
+
+class _Match(NamedTuple):
+    """The messages of a stream that belong to the rows of the table.
+
+    `rows`: the index of each row's message, or _ABSENT; `following`: the index of the next message.
+    `weight`: the position of the row's time between the two, from 0 at the first to 1. `age`: of the message [s].
+    """
+
+    rows: _Ints
+    following: _Ints
+    weight: _Floats
+    age: _Floats
+
+
+@dataclass
+class _Table:
+    """The columns of the table by name, and the masks of the rows in which they have no value."""
+
+    columns: dict[str, npt.NDArray[Any]]
+    absent: dict[str, _Mask]
+
+    def add(
+        self, name: str, stream: StreamArray, match: _Match, requested: set[str], *, is_linear: bool
+    ) -> None:
+        """Add the age and the fields of a stream, and the requested quantities that follow from them."""
+        values = _pick(stream.messages, match.rows)
+        if is_linear:
+            _interpolate(name, values, _pick(stream.messages, match.following), match.weight)
+        fields = values.dtype.names or ()
+        is_absent = match.rows == _ABSENT
+        self.columns[f"{name}.age"] = match.age
+        for field in fields:
+            self.columns[f"{name}.{field}"] = values[field]
+            self.absent[f"{name}.{field}"] = is_absent
+        for field, mask in stream.absent.items():
+            # Row _ABSENT, the last one, is the appended element.
+            self.absent[f"{name}.{field}"] = np.append(mask, True)[match.rows]
+        for field in requested.intersection(derived_from(fields)):
+            self.columns[f"{name}.{field}"] = derive_column(values, field)  # interpolated
+            self.absent[f"{name}.{field}"] = is_absent
+
+    def to_array(self, missing: set[str]) -> MessageArray:
+        """Return the columns as a structured array whose dtype names those in `missing`."""
+        names = tuple(name for name in self.columns if name in missing)
+        types = [(name, column.dtype, column.shape[1:]) for name, column in self.columns.items()]
+        rows = len(self.columns["timestamp"])
+        array = np.zeros(rows, np.dtype(types, metadata={"missing": names}))
+        for name, column in self.columns.items():
+            array[name] = column
+        return array
+
+    def incomplete(self) -> dict[str, _Mask]:
+        """Return the masks of the columns that lack values."""
+        return {name: mask for name, mask in self.absent.items() if mask.any()}
+
+
+def _missing(streams: Streams) -> set[str]:
+    """Return the columns of the fields that messages lack."""
+    missing = set()
+    for name, stream in streams.items():
+        for field in missing_of(stream.messages):
+            missing.add(f"{name}.{field}")
+    return missing
 
 
 def _streams_named(name: str, streams: Streams) -> list[str]:
-    return [each for each in streams if f"/{each}".endswith(f"/{name}")]
+    return [stream for stream in streams if f"/{stream}".endswith(f"/{name}")]
 
 
 def _first_named(name: str, streams: Streams) -> str:
@@ -177,77 +222,90 @@ def _first_named(name: str, streams: Streams) -> str:
 def _choose_streams(
     arrays: Mapping[str, MessageArray], topics: Sequence[str] | None, names: Sequence[str]
 ) -> Streams:
-    if unknown := [name for name in topics or () if name not in (ANY, *arrays)]:
-        raise AddressError(
-            "topic", unknown[0], f"one of {', '.join(arrays)}", problem="is not among these arrays"
-        )
-    return {
-        name: (array, {})
-        for name, array in arrays.items()
-        if not topics or ANY in topics or name in names
-    }
+    for topic in topics or ():
+        if topic != ANY and topic not in arrays:
+            known = f"one of {', '.join(arrays)}"
+            raise AddressError("topic", topic, known, problem="is not among these arrays")
+    is_all = not topics or ANY in topics
+    chosen = arrays if is_all else [name for name in arrays if name in names]
+    return {name: StreamArray(arrays[name], {}) for name in chosen}
 
 
-def _start_of(found: ReadStreams | None) -> int:
+def _start_of(opened: ReadStreams | None) -> int:
     """Return when recording began, on the clock of the timestamps [us]; 0 if it is unknown."""
-    if found is None:
+    if opened is None:
         return 0
-    return recording_start(found.flight, found.addresses, unix_times=found.unix_times)
+    return recording_start(opened.flight, opened.addresses, unix_times=opened.unix_times)
 
 
-def _offset_of(found: ReadStreams | None, streams: Streams) -> UtcOffset | None:
+def _offset_of(opened: ReadStreams | None, streams: Streams) -> UtcOffset | None:
     """Return the UTC offset of the streams; None if it is unknown."""
-    if found is None or found.unix_times:
-        return utc_of({name: messages for name, (messages, _) in streams.items()})
-    return utc_offset_of(found.flight, found.addresses[0].vehicle)
+    if opened is None or opened.unix_times:
+        return utc_of({name: stream.messages for name, stream in streams.items()})
+    return utc_offset_of(opened.flight, opened.addresses[0].vehicle)
 
 
 def _to_utc(times: _Ints, offset: UtcOffset | None) -> npt.NDArray[np.datetime64]:
-    return to_datetime64(offset.unix_us(times) if offset else 0 * times)
+    if offset is None:
+        return to_datetime64(np.zeros_like(times))  # NaT
+    return to_datetime64(offset.unix_us(times))
 
 
 def _choose(
     columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]
 ) -> dict[str, npt.NDArray[Any]]:
     """Return the time columns and those that `fields` selects; raise ArgumentError for an unknown field."""
-    known = {name: {name, name.rpartition(".")[2]} for name in columns}
-    if unknown := set(fields).difference(*known.values()):
-        raise ArgumentError(
-            "fields",
-            sorted(unknown),
-            f"any of {', '.join([*columns, *DERIVED])}",
-            problem="are in no stream",
-        )
-    return {
-        name: column
-        for name, column in columns.items()
-        if name in {"timestamp", "utc"} or known[name] & {*fields}
-    }
+    names = {column: {column, column.rpartition(".")[2]} for column in columns}
+    unknown = set(fields).difference(*names.values())
+    if unknown:
+        known = f"any of {', '.join([*columns, *DERIVED])}"
+        raise ArgumentError("fields", sorted(unknown), known, problem="are in no stream")
+    chosen = {}
+    for name, column in columns.items():
+        if name in {"timestamp", "utc"} or not names[name].isdisjoint(fields):
+            chosen[name] = column
+    return chosen
 
 
-def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
-    """Return for each time the row of its message (-1: none), the row of the next message, and its weight."""
-    if method == "own" or not len(stamps):  # by index, because messages may share a timestamp
-        rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
-        return rows, rows, np.zeros(len(times))
+def _match_own(count: int) -> _Match:
+    """Match the messages of the stream that gives the times: by index, because messages may share a timestamp."""
+    rows = np.arange(count)
+    zeros = np.zeros(count)
+    return _Match(rows, rows, weight=zeros, age=zeros)
+
+
+def _match(stamps: _Ints, times: _Ints, *, nearest: bool) -> _Match:
+    """Match each time with the last message of a stream before it, or with the nearest one."""
+    if not len(stamps):
+        none = np.full(len(times), _ABSENT)
+        return _Match(none, none, weight=np.zeros(len(times)), age=np.full(len(times), np.nan))
     order = np.argsort(stamps, kind="stable")
-    stamps = stamps[order]
-    before = np.searchsorted(stamps, times, side="right") - 1
-    after = np.minimum(before + 1, len(stamps) - 1)
-    since, gap = times - stamps[before], stamps[after] - stamps[before]
-    weight = np.where((before >= 0) & (gap > 0), since / np.maximum(gap, 1), 0.0)
-    if method == "nearest":
-        before = np.where((before < 0) | (stamps[after] - times < since), after, before)
-    return np.where(before < 0, -1, order[before]), order[after], weight
+    ordered = stamps[order]
+    before = np.searchsorted(ordered, times, side="right") - 1
+    after = np.minimum(before + 1, len(ordered) - 1)
+    since = times - ordered[before]
+    gap = ordered[after] - ordered[before]
+    is_between = (before >= 0) & (gap > 0)
+    weight = np.where(is_between, since / np.maximum(gap, 1), 0.0)
+    if nearest:
+        is_next_nearer = ordered[after] - times < since
+        before = np.where((before < 0) | is_next_nearer, after, before)
+    is_absent = before < 0
+    rows = np.where(is_absent, _ABSENT, order[before])
+    age = np.where(is_absent, np.nan, times - ordered[before]) / 1e6
+    return _Match(rows, order[after], weight, age)
 
 
 def _pick(messages: MessageArray, rows: _Ints) -> MessageArray:
-    """Return a copy of the messages in these rows; without one, in row -1, floats are NaN and other values 0."""
-    values = (messages if len(messages) else np.zeros(1, messages.dtype))[rows]
-    if (is_absent := rows < 0).any():
+    """Return a copy of the messages in these rows; in row _ABSENT, floats are NaN and other values 0."""
+    if not len(messages):
+        messages = np.zeros(1, messages.dtype)
+    values = messages[rows]
+    is_absent = rows == _ABSENT
+    if is_absent.any():
         for field in values.dtype.names or ():
-            kind = values.dtype[field].base
-            values[field][is_absent] = np.nan if kind.kind == "f" else kind.type()
+            base = values.dtype[field].base
+            values[field][is_absent] = np.nan if base.kind == "f" else base.type()
     return values
 
 
@@ -255,11 +313,12 @@ def _interpolate(
     stream: str, values: MessageArray, following: MessageArray, weight: _Floats
 ) -> None:
     """Interpolate the floats of `values` towards `following`, in place."""
-    definition = next((BY_TOPIC[part] for part in stream.split("/") if part in BY_TOPIC), None)
-    rules = definition.rules if definition else ()
-    quaternions = {
-        name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields
-    }
+    topics = [part for part in stream.split("/") if part in BY_TOPIC]
+    definition = BY_TOPIC[topics[0]] if topics else None
+    quaternions: set[str] = set()
+    for rule in definition.rules if definition else ():
+        if isinstance(rule, UnitQuaternion):
+            quaternions.update(rule.fields)
     names = values.dtype.names or ()
     for name in names:
         if name.endswith("reset_counter"):
@@ -268,87 +327,109 @@ def _interpolate(
     for name in names:
         if values.dtype[name].base.kind != "f":
             continue
-        first, second = values[name][between].astype(float), following[name][between].astype(float)
-        parts = weight[between].reshape(-1, *[1] * (first.ndim - 1))
-        unit = definition.meaning(name) if definition else ""
-        period = next((each for text, each in _PERIODS.items() if text in unit), np.inf)
-        find = _slerp if name in quaternions else _linear
+        first = values[name][between].astype(float)
+        second = following[name][between].astype(float)
+        elements = [1] * (first.ndim - 1)
+        parts = weight[between].reshape(-1, *elements)
         is_same = first == second
-        if name in quaternions:  # one equal element does not keep its value on the arc
-            is_same = is_same.all(axis=1, keepdims=True)
-        values[name][between] = np.where(is_same, first, find(first, second, parts, period))
+        if name in quaternions:
+            is_same = is_same.all(axis=1, keepdims=True)  # an equal element changes on the arc
+            middle = _slerp(first, second, parts)
+        else:
+            unit = definition.meaning(name) if definition else ""
+            middle = _linear(first, second, parts, _period(unit))
+        values[name][between] = np.where(is_same, first, middle)
+
+
+def _period(meaning: str) -> float:
+    """Return the period of a field, infinite if its meaning names no unit of an angle."""
+    for unit, period in _PERIODS.items():
+        if unit in meaning:
+            return period
+    return np.inf
 
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
     """Interpolate linearly, angles on the shorter arc, to a range from -period/2 if either is negative, else from 0."""
     with np.errstate(invalid="ignore"):  # for infinity minus infinity, and for an infinite period
         step = second - first
+        straight = first + weight * step
         turned = first + weight * (step - np.sign(step) * period)
         start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
-        return np.where(
-            np.abs(step) > period / 2, start + np.mod(turned - start, period), first + weight * step
-        )
+        wrapped = start + np.mod(turned - start, period)
+        return np.where(np.abs(step) > period / 2, wrapped, straight)
 
 
-def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Floats:
+def _slerp(first: _Floats, second: _Floats, weight: _Floats) -> _Floats:
     """Interpolate unit quaternions of shape (n, 4) along the shorter arc."""
     cosine = np.sum(first * second, axis=1, keepdims=True)
     angle = np.arccos(np.minimum(np.abs(cosine), _PARALLEL))
-    near = np.where(cosine < 0, -1, 1) * second
-    found: _Floats = np.sin((1 - weight) * angle) * first + np.sin(weight * angle) * near
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
-    return found
+    near = np.where(cosine < 0, -second, second)  # both signs are the same attitude
+    begin = np.sin((1 - weight) * angle) * first
+    end = np.sin(weight * angle) * near
+    middle: _Floats = begin + end
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    return middle
 
 
 def _stamps(stream: str, messages: MessageArray) -> _Ints:
     """Return the timestamps [us]; raise ConfigError if they restart, for example after a reboot."""
-    stamps: _Ints = np.minimum(messages["timestamp"], 2**62).astype(np.int64)
-    late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
-    early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])
+    stamps: _Ints = np.minimum(messages["timestamp"], _NO_TIME).astype(np.int64)
+    latest_before = np.maximum.accumulate(stamps)
+    earliest_after = np.minimum.accumulate(stamps[::-1])[::-1]
+    late = np.count_nonzero(stamps < latest_before)
+    early = np.count_nonzero(stamps > earliest_after)
+    # A few wild timestamps make many others late, or many others early, but not both.
     if min(late, early) > max(1, _STRAY * len(stamps)):
-        raise ConfigError(
-            stream,
-            "timestamps restart; align the messages of each boot separately, as slices of `read`",
-        )
+        remedy = "align the messages of each boot separately, as slices of `read`"
+        raise ConfigError(stream, f"timestamps restart; {remedy}")
     return stamps
 
 
 def _without_wild(times: _Ints) -> _Ints:
     low, high = np.quantile(times, [0.25, 0.75])
     margin = _STALE + 10 * (high - low)
-    near: _Ints = times[(times >= low - margin) & (times <= high + margin)]
+    is_near = (times >= low - margin) & (times <= high + margin)
+    near: _Ints = times[is_near]
     return near
 
 
 def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start: int) -> _Ints:
-    """Return the given times, or times at the given rate from the first to the last message [us].
+    """Return the given times, or times at the given rate from the first to the last message [us]."""
+    given = np.asarray(on)
+    is_number = given.dtype.kind in "iuf"
+    if is_number and given.ndim == 0 and given > 0:
+        return _times_at_rate(float(given), stamps, start)
+    if is_number and given.ndim == 1 and np.all(given >= 0):
+        return given.astype(np.int64)
+    raise ArgumentError("on", on, "a stream, a rate above 0 [Hz], or times [us]")
+
+
+def _times_at_rate(rate: float, stamps: Mapping[str, _Ints], start: int) -> _Ints:
+    """Return times at a rate, from the first to the last message [us].
 
     At `start`, PX4 also logs the last message of slow topics, which may be much older: then begin at `start`.
     """
-    given = np.asarray(on)
-    if (
-        given.dtype.kind not in "iuf"
-        or given.ndim > 1
-        or not np.all((given > 0) if given.ndim == 0 else (given >= 0))
-    ):
-        raise ArgumentError("on", on, "a stream, a rate above 0 [Hz], or times [us]")
-    if given.ndim:
-        return given.astype(np.int64)
-    # A timestamp of 0 is unset, and a few wild ones do not determine the period.
-    valid = {name: _without_wild(times[times > 0]) for name, times in stamps.items() if times.any()}
-    firsts, lasts = (
-        {name: int(end(each)) for name, each in valid.items()} for end in (np.min, np.max)
-    )
-    rate = float(given)
-    first = min(firsts.values(), default=2**62)
+    firsts: dict[str, int] = {}
+    lasts: dict[str, int] = {}
+    for name, times in stamps.items():
+        if times.any():
+            # A timestamp of 0 is unset, and a few wild ones do not determine the period.
+            valid = _without_wild(times[times > 0])
+            firsts[name] = int(valid.min())
+            lasts[name] = int(valid.max())
+    first = min(firsts.values(), default=_NO_TIME)
     last = max(lasts.values(), default=0)
-    first = start if first + _STALE < start <= last else first
-    count = max(0.0, (last - first) / 1e6 * rate + 1)
-    if count > _MAX_ROWS:
-        earliest, latest = min(firsts, key=firsts.__getitem__), max(lasts, key=lasts.__getitem__)
+    if first + _STALE < start <= last:
+        first = start
+    seconds = (last - first) / 1e6
+    count = max(0.0, seconds * rate + 1)
+    if count > limits.ALIGNED_ROWS:
+        earliest = min(firsts, key=firsts.__getitem__)
+        latest = max(lasts, key=lasts.__getitem__)
         ends = f"{earliest} begins at {first / 1e6:.0f} s, {latest} ends at {last / 1e6:.0f} s"
         problem = f"Hz results in too many rows ({ends})"
-        raise ArgumentError(
-            "on", rate, "topics on one clock, a lower rate, or times", problem=problem
-        )
-    return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)
+        remedy = "topics on one clock, a lower rate, or times"
+        raise ArgumentError("on", rate, remedy, problem=problem)
+    offsets = np.round(np.arange(int(count)) * (1e6 / rate))
+    return first + offsets.astype(np.int64)

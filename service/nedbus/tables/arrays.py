@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,16 @@ from nedbus_msgs import Address, decode_text
 from nedbus_msgs.arrays import MessageArray
 
 Absent = Mapping[str, npt.NDArray[np.bool_]]  # masks of the messages that lack a field, by field
-Streams = dict[str, tuple[MessageArray, Absent]]  # by topic or topic/instance
+
+
+class StreamArray(NamedTuple):
+    """The messages of a stream as an array, and which of them lack a field, by field."""
+
+    messages: MessageArray
+    absent: Absent
+
+
+Streams = dict[str, StreamArray]  # by topic or topic/instance
 
 Pandas = Literal["pandas"]
 Polars = Literal["polars"]
@@ -38,9 +47,8 @@ def addresses_of(path: str | Path) -> list[Address]:
 
     It includes messages that only the file defines.
     """
-    with open_arrays(
-        [Path(path).expanduser()], ReadOptions(topics=None), lambda _: False
-    ) as flight:
+    paths = [Path(path).expanduser()]
+    with open_arrays(paths, ReadOptions(topics=None), lambda _: False) as flight:
         return flight.addresses
 
 
@@ -56,9 +64,7 @@ def open_arrays(
     return flight
 
 
-def array_of(
-    flight: Flight, address: Address, *, unix_times: bool = False
-) -> tuple[MessageArray, Absent]:
+def array_of(flight: Flight, address: Address, *, unix_times: bool = False) -> StreamArray:
     """Return the valid messages of an address, with a mask of the messages that lack a field, by field.
 
     The dtype has the names of these fields. `unix_times`: their timestamps become Unix times [us].
@@ -66,7 +72,8 @@ def array_of(
     Raises SourceError if all messages have another layout than the file says, or if UTC is required, but unknown.
     """
     number, own = flight._find(address)
-    reader, columns = flight._readers[number], flight._columns[number][own]
+    reader = flight._readers[number]
+    columns = flight._columns[number][own]
     definition = reader.definitions[own]
     messages, valid, absent = columns.decode(definition)
     if not valid.all():
@@ -75,7 +82,8 @@ def array_of(
             raise SourceError(str(reader.path), f"no message of {own.stream} can be read: {reason}")
         skipped = f"skipped {np.sum(~valid)} of {len(valid)} messages of {own.stream} as invalid"
         columns.skipped = f"{skipped} ({reason})" if reason else skipped
-        messages, absent = messages[valid], absent[valid]
+        messages = messages[valid]
+        absent = absent[valid]
     masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
     if masks:
         types = [(name, messages.dtype[name]) for name in definition.names]
@@ -83,16 +91,16 @@ def array_of(
     if unix_times:
         utc = require_utc(flight, address.vehicle)
         messages["timestamp"] = utc.unix_us(messages["timestamp"].astype(np.int64))
-    return messages, masks
+    return StreamArray(messages, masks)
 
 
 def array_warnings(flight: Flight) -> list[tuple[Path, str]]:
     """Return damage and skipped messages so far, each with its file."""
-    found = []
-    for reader, columns in zip(flight._readers, flight._columns, strict=True):
-        found += [(reader.path, text) for text in reader.warnings]
-        found += [(reader.path, own.skipped) for own in columns.values() if own.skipped]
-    return found
+    remarks = []
+    for reader, streams in zip(flight._readers, flight._columns, strict=True):
+        texts = [*reader.warnings, *(columns.skipped for columns in streams.values())]
+        remarks += [(reader.path, text) for text in texts if text]
+    return remarks
 
 
 def recording_start(
@@ -102,9 +110,12 @@ def recording_start(
 
     `unix_times`: as in `array_of`.
     """
+    by_vehicle: dict[str, list[Address]] = {}
+    for address in addresses:
+        by_vehicle.setdefault(address.vehicle, []).append(address)
     starts = []
-    for vehicle in {address.vehicle for address in addresses}:
-        start = _start_of_vehicle(flight, [each for each in addresses if each.vehicle == vehicle])
+    for vehicle, streams in by_vehicle.items():
+        start = _start_of_vehicle(flight, streams)
         if start and unix_times:
             start = int(require_utc(flight, vehicle).unix_us(start))
         starts.append(start)
@@ -112,19 +123,24 @@ def recording_start(
 
 
 def _start_of_vehicle(flight: Flight, addresses: Sequence[Address]) -> int:
+    """Return the start of a vehicle's file, or its first message, on the vehicle's clock; 0 without messages."""
     number, _ = flight._find(addresses[0])
     reader = flight._readers[number]
     if reader.start:
         return reader.start
-    firsts, ages = list[int](), list[npt.NDArray[np.float64]]()
+    firsts: list[int] = []
+    offsets: list[npt.NDArray[np.float64]] = []  # of the clock of the file to that of the vehicle
     for address in addresses:
         _, own = flight._find(address)
         columns = flight._columns[number][own]
         if columns.times:
             stamps = columns.decode(reader.definitions[own]).messages["timestamp"]
             firsts.append(min(columns.times))
-            ages.append(np.array(columns.times, float) - stamps.astype(float))
-    return max(0, min(firsts) - round(np.median(np.concatenate(ages)))) if ages else 0
+            offsets.append(np.array(columns.times, float) - stamps.astype(float))
+    if not offsets:
+        return 0
+    offset = round(np.median(np.concatenate(offsets)))
+    return max(0, min(firsts) - offset)
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
@@ -137,33 +153,52 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
     if library not in ("pandas", "polars"):
         raise ArgumentError("dataframe", library, "pandas or polars")
     package = import_optional(library, library)
+    convert = _pandas_column if library == "pandas" else _polars_column
     columns: dict[str, Any] = {}
     for name in messages.dtype.names or ():
         values = messages[name]
-        parts = (
-            [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
-        )
-        for part, each in zip(parts, values.reshape(len(values), len(parts)).T, strict=True):
-            if each.dtype.kind == "S":
-                column = package.Series(list(map(decode_text, each.tolist())))
-            else:
-                column = package.Series(np.ascontiguousarray(_to_signed(each)))
-            if each.dtype.kind == "M":
-                zoned = (
-                    column.dt.tz_localize if library == "pandas" else column.dt.replace_time_zone
-                )
-                column = zoned("UTC")
-            elif name in absent and library == "polars":
-                column = column.scatter(np.flatnonzero(absent[name]), None)
-            elif name in absent:
-                # floats use NaN
-                nullable = column if each.dtype.kind == "f" else column.convert_dtypes()
-                column = nullable.mask(absent[name])
-            columns[part] = column
+        if values.ndim == 1:
+            columns[name] = convert(package.Series, values, absent.get(name))
+            continue
+        for index in range(values.shape[1]):
+            columns[f"{name}[{index}]"] = convert(
+                package.Series, values[:, index], absent.get(name)
+            )
     data = package.DataFrame(columns)
     if library == "pandas":
         data.attrs["missing"] = sorted(missing_of(messages))
     return data
+
+
+def _pandas_column(
+    series: Any, values: npt.NDArray[Any], absent: npt.NDArray[np.bool_] | None
+) -> Any:
+    column = series(_plain_values(values))
+    if values.dtype.kind == "M":
+        return column.dt.tz_localize("UTC")
+    if absent is None:
+        return column
+    if values.dtype.kind != "f":  # floats use NaN
+        column = column.convert_dtypes()
+    return column.mask(absent)
+
+
+def _polars_column(
+    series: Any, values: npt.NDArray[Any], absent: npt.NDArray[np.bool_] | None
+) -> Any:
+    column = series(_plain_values(values))
+    if values.dtype.kind == "M":
+        return column.dt.replace_time_zone("UTC")
+    if absent is None:
+        return column
+    return column.scatter(np.flatnonzero(absent), None)
+
+
+def _plain_values(values: npt.NDArray[Any]) -> Any:
+    """Return values that both libraries accept: texts as str, numbers in one block of memory."""
+    if values.dtype.kind == "S":
+        return [decode_text(text) for text in values.tolist()]
+    return np.ascontiguousarray(_to_signed(values))
 
 
 def _to_signed(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_UTC_TOPICS: Final = {name for name, each in BY_TOPIC.items() if provides_utc(each)}
+_UTC_TOPICS: Final = {name for name, message in BY_TOPIC.items() if provides_utc(message)}
 
 FlightPath = str | Path
 Files = FlightPath | Sequence[FlightPath]
@@ -104,16 +104,14 @@ def read(
     Raises SourceError if a file cannot be read, or is one of several and has no UTC; AddressError if no stream or
     several streams match topic, vehicle and instance; ConfigError if the package that reads the file is not installed.
     """
-    found = read_streams(path, topic, vehicle=vehicle, instance=instance, layout=layout)
-    tables = {
-        name: to_dataframe(messages, absent, dataframe)
-        for name, (messages, absent) in found.streams.items()
-    }
-    return (
-        next(iter(tables.values()))
-        if isinstance(topic, str) and isinstance(path, FlightPath)
-        else tables
-    )
+    opened = read_streams(path, topic, vehicle=vehicle, instance=instance, layout=layout)
+    tables = {}
+    for name, (messages, absent) in opened.streams.items():
+        tables[name] = to_dataframe(messages, absent, dataframe)
+    if isinstance(topic, str) and isinstance(path, FlightPath):
+        (table,) = tables.values()
+        return table
+    return tables
 
 
 class ReadStreams(NamedTuple):
@@ -141,24 +139,24 @@ def read_streams(
 
     `topics`: None selects the streams of all topics known to nedbus. `utc`: also read what provides UTC.
     """
-    names, vehicle = [topics] if isinstance(topics, str) else topics, vehicle_name(vehicle)
-    is_one_file = isinstance(path, FlightPath)
+    names = [topics] if isinstance(topics, str) else topics
+    vehicle = vehicle_name(vehicle)
     if isinstance(path, FlightPath):
         select = single_match if isinstance(topics, str) else matching
         selections = [_selection(name, vehicle, instance) for name in names or [ANY]]
         options = _options(names, layout, utc=utc)
         flight, chosen = _choose_in_one(Path(path).expanduser(), options, selections, select)
     else:
-        flight, chosen = _choose_in_several(
-            [Path(each).expanduser() for each in path], names, vehicle, layout
-        )
+        paths = [Path(file).expanduser() for file in path]
+        flight, chosen = _choose_in_several(paths, names, vehicle, layout)
+    is_several = not isinstance(path, FlightPath)
     streams = Streams()
     for address in chosen:
-        name = address.stream if is_one_file else f"{address.vehicle}/{address.stream}"
-        streams[name] = array_of(flight, address, unix_times=not is_one_file)
+        name = f"{address.vehicle}/{address.stream}" if is_several else address.stream
+        streams[name] = array_of(flight, address, unix_times=is_several)
     for file, text in array_warnings(flight):
         _log.warning("%s: %s", file, text, extra=about("damaged", source=str(file), reason=text))
-    return ReadStreams(streams, flight, chosen, unix_times=not is_one_file)
+    return ReadStreams(streams, flight, chosen, unix_times=is_several)
 
 
 def read_plotted(
@@ -173,8 +171,8 @@ def read_plotted(
     # a vehicle may have another name here
     selects = Selection(selection.topics, instance=selection.instance).matches
     flight = open_arrays(paths, options, selects)
-    found = matching(paths[0], flight.addresses, selection)
-    return flight, [address for address in found if address.topic in topics]
+    chosen = matching(paths[0], flight.addresses, selection)
+    return flight, [address for address in chosen if address.topic in topics]
 
 
 def _options(names: Sequence[str] | None, layout: str | None, *, utc: bool) -> ReadOptions:
@@ -188,13 +186,15 @@ def _choose_in_one(
     path: Path, options: ReadOptions, selections: Sequence[Selection], select: _Select
 ) -> tuple[Flight, list[Address]]:
     """Read a file; return the addresses of one vehicle that are selected."""
+
+    def is_selected(address: Address) -> bool:
+        return any(selection.matches(address) for selection in selections)
+
+    chosen: dict[Address, None] = {}  # in order, each once
     try:
-        flight = open_arrays(
-            [path], options, lambda address: any(one.matches(address) for one in selections)
-        )
-        chosen = dict.fromkeys(
-            each for one in selections for each in select(path, flight.addresses, one)
-        )
+        flight = open_arrays([path], options, is_selected)
+        for selection in selections:
+            chosen |= dict.fromkeys(select(path, flight.addresses, selection))
     except (AddressError, SourceError) as exc:
         raise _explain_absent(path, options, selections, select) or exc from None
     require_one_vehicle(path, chosen, selections[0].vehicles[0])
@@ -202,44 +202,46 @@ def _choose_in_one(
 
 
 def _choose_in_several(
-    paths: Sequence[Path], topics: Sequence[str] | None, vehicle: str, layout: str | None
+    paths: Sequence[Path], names: Sequence[str] | None, vehicle: str, layout: str | None
 ) -> tuple[Flight, list[Address]]:
     """Read several files; return the selected addresses, vehicle by vehicle."""
-    wanted = _topics(topics)
-    for topic in wanted or ():
+    topics = _topics(names)
+    for topic in topics or ():
         Selection(topic)  # raises AddressError for a name that no topic can have
-    options = _options(topics, layout, utc=True)
+
+    def is_selected(address: Address) -> bool:
+        return topics is None or address.topic in topics
+
+    options = _options(names, layout, utc=True)
     try:
-        flight = open_arrays(
-            paths, options, lambda address: wanted is None or address.topic in wanted
-        )
+        flight = open_arrays(paths, options, is_selected)
     except SourceError as exc:
-        selections = [Selection(topic) for topic in sorted(wanted or ())]
+        selections = [Selection(topic) for topic in sorted(topics or ())]
         raise _explain_absent(Path(exc.source), options, selections, matching) or exc from None
     vehicles = vehicles_of(flight)
     if vehicle not in (ANY, *vehicles):
         raise AddressError("vehicle", vehicle, f"one of {', '.join(sorted(vehicles))}")
+    available = [address for address in flight.addresses if not topics or is_selected(address)]
     chosen: list[Address] = []
-    for name in vehicles:
-        others = {*vehicles} - {name}
-        own = [
-            each.removeprefix(f"{name}/")
-            for each in topics or [ANY]
-            if each.partition("/")[0] not in others
-        ]
-        if vehicle not in (ANY, name) or not own:
-            continue
-        available = [
-            each
-            for each in flight.addresses
-            if each.vehicle == name and (not wanted or each.topic in wanted)
-        ]
-        selections = [_selection(each, name, None) for each in own]
-        path = path_of(flight, name)
-        chosen += dict.fromkeys(
-            each for one in selections for each in matching(path, available, one)
-        )
+    for owner in vehicles:
+        if vehicle in (ANY, owner):
+            others = {*vehicles} - {owner}
+            chosen += _choose_of_vehicle(flight, available, names or [ANY], owner, others)
     return flight, chosen
+
+
+def _choose_of_vehicle(
+    flight: Flight, available: list[Address], names: Sequence[str], vehicle: str, others: Set[str]
+) -> Iterable[Address]:
+    """Return the addresses of a vehicle that names such as sensor_gps, sensor_gps/1 or 7/sensor_gps select."""
+    path = path_of(flight, vehicle)
+    own = [address for address in available if address.vehicle == vehicle]
+    chosen: dict[Address, None] = {}  # in order, each once
+    for name in names:
+        if name.partition("/")[0] not in others:
+            selection = _selection(name.removeprefix(f"{vehicle}/"), vehicle, None)
+            chosen |= dict.fromkeys(matching(path, own, selection))
+    return chosen
 
 
 def _explain_absent(
@@ -248,12 +250,11 @@ def _explain_absent(
     """Return an error with the streams of a file if it lacks a selected one; None if that was not the fault."""
     if options.topics is None or TOPICS.keys() <= {*options.topics}:
         return None
-    flight = open_arrays(
-        [path], replace(options, topics={*options.topics, *TOPICS}), lambda _: False
-    )
-    for one in selections:
+    all_topics = replace(options, topics={*options.topics, *TOPICS})
+    flight = open_arrays([path], all_topics, lambda _: False)
+    for selection in selections:
         try:
-            select(path, flight.addresses, one)
+            select(path, flight.addresses, selection)
         except AddressError as exc:
             return exc
     return None
@@ -262,16 +263,17 @@ def _explain_absent(
 def _selection(name: str, vehicle: str, instance: int | None) -> Selection:
     """Return the selection of a topic, or of a stream such as sensor_gps/1."""
     topic, _, number = name.rpartition("/")
-    return (
-        Selection(topic, vehicle, int(number))
-        if number.isdecimal()
-        else Selection(name, vehicle, instance)
-    )
+    if number.isdecimal():
+        return Selection(topic, vehicle, int(number))
+    return Selection(name, vehicle, instance)
 
 
 def _topics(names: Sequence[str] | None) -> Set[str] | None:
     """Return the topics of streams such as vehicle_attitude, sensor_gps/1 or 7/sensor_gps/1; None for all."""
     if names is None:
         return TOPICS.keys()
-    parts = [[part for part in name.split("/") if not part.isdecimal()] or [name] for name in names]
-    return None if any(part[-1] == ANY for part in parts) else {part[-1] for part in parts}
+    topics = set()
+    for name in names:
+        parts = [part for part in name.split("/") if not part.isdecimal()]
+        topics.add(parts[-1] if parts else name)
+    return None if ANY in topics else topics

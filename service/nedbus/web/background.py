@@ -5,12 +5,13 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from bokeh.models import ColumnDataSource
 from bokeh.plotting import figure
 
+from nedbus import limits
 from nedbus.errors import ConfigError
 from nedbus_msgs.frames import MapProjection
 
@@ -24,15 +25,22 @@ _WORLD_FILES: Final = {
     ".tif": ".tfw",
     ".tiff": ".tfw",
 }
-_MAX_SIDE: Final = 2000  # pixels; larger images are scaled down
-_MAX_PIXELS: Final = 50_000_000  # of an image file; decoded, each takes up to 4 bytes
+_SIDE: Final = 2000  # pixels; larger images are scaled down to it
 _PARTS: Final = {
     "FeatureCollection": "features",
     "GeometryCollection": "geometries",
     "Feature": "geometry",
 }
 
-Ring = list[tuple[float, float]]
+
+class Point(NamedTuple):
+    """A position [deg]."""
+
+    longitude: float
+    latitude: float
+
+
+Ring = list[Point]
 
 
 class Background:
@@ -42,9 +50,9 @@ class Background:
     """
 
     def __init__(self, path: Path) -> None:
-        self.rings: list[Ring] = []  # longitude, latitude [deg]
+        self.rings: list[Ring] = []
         self.pixels: Any = None
-        self._corners: Ring = []
+        self._corners: Ring = []  # south-west and north-east
         try:
             if path.suffix.lower() in _WORLD_FILES:
                 self._read_image(path)
@@ -61,55 +69,45 @@ class Background:
 
     def draw(self, plot: figure, style: Style, projection: MapProjection) -> None:
         """Draw the background on a map whose axes are metres from the origin of `projection`."""
+        colour = style.colours["quiet"]
 
-        def project(longitude: float, latitude: float) -> tuple[float, float]:
-            north, east = projection.project(latitude, longitude)
+        def project(point: Point) -> tuple[float, float]:
+            north, east = projection.project(point.latitude, point.longitude)
             return east, north
 
         if self.pixels is not None:
-            (west, south), (east, north) = (project(*corner) for corner in self._corners)
+            west, south = project(self._corners[0])
+            east, north = project(self._corners[1])
             plot.image_rgba(
                 [self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image"
             )
-        lines = [
-            list(zip(*(project(*point) for point in ring), strict=True)) for ring in self.rings
-        ]
-        source = ColumnDataSource(
-            {"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]}
-        )
+        easts = []
+        norths = []
+        points = []
+        for ring in self.rings:
+            line = [project(point) for point in ring]
+            easts.append([east for east, _ in line])
+            norths.append([north for _, north in line])
+            if len(line) == 1:
+                points.append(line[0])
+        source = ColumnDataSource({"east": easts, "north": norths})
         plot.multi_line(
-            "east",
-            "north",
-            source=source,
-            color=style.colours["quiet"],
-            line_width=1.5,
+            "east", "north", source=source, color=colour, line_width=1.5, level="underlay"
+        )
+        plot.scatter(
+            [east for east, _ in points],
+            [north for _, north in points],
+            marker="cross",
+            color=colour,
             level="underlay",
         )
-        points = [line for line in lines if len(line[0]) == 1]
-        easts, norths = [east[0] for east, _ in points], [north[0] for _, north in points]
-        plot.scatter(easts, norths, marker="cross", color=style.colours["quiet"], level="underlay")
 
     def _read_image(self, path: Path) -> None:
         from PIL import Image
 
-        # GDAL writes .wld
-        worlds = [path.with_suffix(each) for each in (_WORLD_FILES[path.suffix.lower()], ".wld")]
-        world = next((each for each in worlds if each.exists()), None)
-        if world is None:
-            raise ValueError(
-                f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES"
-            )
-        width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
-        if (
-            skew
-            or other_skew
-            or not (width > 0 > height)
-            or not (abs(west) <= 180 and abs(north) <= 90)
-        ):
-            raise ValueError(
-                "the image is not north up in degrees: convert it with gdalwarp -t_srs EPSG:4326"
-            )
-        too_large = f"more than {_MAX_PIXELS:,} pixels: reduce it with gdal_translate -outsize {_MAX_SIDE} 0"
+        left, top, width, height = _read_world_file(path)
+        remedy = f"reduce it with gdal_translate -outsize {_SIDE} 0"
+        too_large = f"more than {limits.MAP_PIXELS:,} pixels: {remedy}"
         warned = Image.DecompressionBombWarning
         try:
             with (
@@ -117,16 +115,39 @@ class Background:
                 Image.open(path) as image,
             ):
                 columns, rows = image.size
-                if columns * rows > _MAX_PIXELS:  # before it is decoded
+                if columns * rows > limits.MAP_PIXELS:  # before it is decoded
                     raise ValueError(too_large)
-                image.thumbnail((_MAX_SIDE, _MAX_SIDE))
-                pixels = np.asarray(image.convert("RGBA"))[::-1]
+                image.thumbnail((_SIDE, _SIDE))
+                rgba = np.asarray(image.convert("RGBA"))
         except (Image.DecompressionBombError, warned) as exc:
             raise ValueError(too_large) from exc
-        self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
-        # the world file has the centre of the first pixel
-        left, top = west - width / 2, north - height / 2
-        self._corners = [(left, top + rows * height), (left + columns * width, top)]
+        pixels = np.ascontiguousarray(rgba[::-1])  # Bokeh draws the first row at the bottom
+        self.pixels = pixels.view(np.uint32).reshape(pixels.shape[:2])
+        south_west = Point(left, top - rows * height)
+        north_east = Point(left + columns * width, top)
+        self._corners = [south_west, north_east]
+
+
+def _read_world_file(path: Path) -> tuple[float, float, float, float]:
+    """Return the west and north border of an image, and the width and height of a pixel [deg]."""
+    suffix = _WORLD_FILES[path.suffix.lower()]
+    world = path.with_suffix(suffix)
+    if not world.exists():
+        world = path.with_suffix(".wld")  # as GDAL writes
+    if not world.exists():
+        name = path.with_suffix(suffix).name
+        raise ValueError(
+            f"world file {name} not found: create it with gdal_translate -co WORLDFILE=YES"
+        )
+    width, skew, other_skew, step, west, north = map(float, world.read_text().split()[:6])
+    is_north_up = not skew and not other_skew and width > 0 > step
+    is_in_degrees = abs(west) <= 180 and abs(north) <= 90
+    if not is_north_up or not is_in_degrees:
+        raise ValueError(
+            "the image is not north up in degrees: convert it with gdalwarp -t_srs EPSG:4326"
+        )
+    # the world file has the centre of the first pixel
+    return west - width / 2, north - step / 2, width, -step
 
 
 def _rings(shape: Any) -> Iterator[Ring]:
@@ -138,14 +159,15 @@ def _rings(shape: Any) -> Iterator[Ring]:
     elif isinstance(shape[0], int | float):
         yield [_point_of(shape)]
     elif isinstance(shape[0], list) and isinstance(shape[0][0], int | float):
-        yield [_point_of(each) for each in shape]
+        yield [_point_of(point) for point in shape]
     else:
-        for each in shape:
-            yield from _rings(each)
+        for part in shape:
+            yield from _rings(part)
 
 
-def _point_of(point: Sequence[Any]) -> tuple[float, float]:
-    longitude, latitude = float(point[0]), float(point[1])
+def _point_of(point: Sequence[Any]) -> Point:
+    longitude = float(point[0])
+    latitude = float(point[1])
     if not (math.isfinite(longitude) and abs(latitude) <= 90 and abs(longitude) <= 180):
         raise ValueError(f"{point} is not a longitude and latitude in degrees")
-    return longitude, latitude
+    return Point(longitude, latitude)

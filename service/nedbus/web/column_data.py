@@ -2,27 +2,31 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from bokeh.models import ColumnDataSource
 
+from nedbus import limits
 from nedbus_msgs import Address
 
 from .fleet import TRUTH
 from .stream import COLUMNS, History
 from .style import PALETTE
 
-# points of all tracks together, which a browser can draw ten times a second
-_MAX_POINTS: Final = 6_000
-_MIN_TRACK_POINTS: Final = 60
+_LEAST_POINTS: Final = 60  # of a track, however many there are
 _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
 _DOUBTFUL_LINE, _TRUTH_LINE = "doubtful", "truth"
 LINE_TYPES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBTFUL_LINE, _TRUTH_LINE)
 """Line types of tracks: valid positions in each vehicle colour, doubtful positions, and ground truth."""
 _COLUMNS: Final = ("east", *LINE_TYPES)
 
-Track = tuple[History, int]  # points, and colour number
+
+class Track(NamedTuple):
+    """A track on the map: its points, and the number of its colour."""
+
+    history: History
+    number: int
 
 
 def table(*names: str) -> ColumnDataSource:
@@ -36,15 +40,14 @@ def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None
     new = {name: [row[name] for row in rows] for name in old}
     if any(len(column) != len(rows) for column in old.values()):
         source.data = new
-    else:  # repr, because NaN is not equal to itself
-        cells = slice(len(rows))
-        changed = {
-            name: [(cells, values)]
-            for name, values in new.items()
-            if repr(values) != repr(old[name])
-        }
-        if changed:
-            source.patch(changed)
+        return
+    all_rows = slice(len(rows))
+    changed = {}
+    for name, values in new.items():
+        if repr(values) != repr(old[name]):  # repr, because NaN is not equal to itself
+            changed[name] = [(all_rows, values)]
+    if changed:
+        source.patch(changed)
 
 
 class Tracks:
@@ -58,62 +61,74 @@ class Tracks:
         self.source = table(*_COLUMNS)
         self._tracks: Mapping[Address, Track] = {}
         self._seen: list[int] = []  # number of points of each history in the data source
-        self._step = self._slots = 1
+        self._step = 1  # points per slot
+        self._slots = 1  # per track
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
         """Add the new points of these tracks."""
         if tracks != self._tracks:  # a new vehicle, or a seek, which creates new histories
-            # Choose the number of slots, and the number of points per slot.
-            self._tracks, self._seen = dict(tracks), [0] * len(tracks)
-            longest = max((history.size for history, _ in tracks.values()), default=1)
-            points = max(_MIN_TRACK_POINTS, min(longest, _MAX_POINTS // max(1, len(tracks))))
-            written = max(
-                (min(history.written, history.size) for history, _ in tracks.values()), default=1
-            )
-            self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
-            self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
-            self.source.data = {
-                name: np.full((self._slots + 2) * len(tracks), math.nan) for name in _COLUMNS
-            }
+            self._resize(tracks)
         cells: dict[str, dict[int, float]] = {name: {} for name in _COLUMNS}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
         if cells["east"]:
-            self.source.patch(
-                {name: list(changed.items()) for name, changed in cells.items() if changed}
-            )
+            changed = {name: [*values.items()] for name, values in cells.items() if values}
+            self.source.patch(changed)
+
+    def _resize(self, tracks: Mapping[Address, Track]) -> None:
+        """Choose the number of slots, and of points per slot, for these tracks; clear all lines."""
+        self._tracks = dict(tracks)
+        self._seen = [0 for _ in tracks]
+        sizes = [track.history.size for track in tracks.values()]
+        written = [min(track.history.written, track.history.size) for track in tracks.values()]
+        longest = max(sizes, default=1)
+        share = limits.PAGE_TRACK_POINTS // max(1, len(tracks))
+        slots = max(_LEAST_POINTS, min(longest, share))
+        # A history that has just begun need not be drawn as coarsely as a full one.
+        expected = max(2 * max(written, default=1), limits.PAGE_TRACK_POINTS)
+        self._step = math.ceil(min(longest, expected) / slots)
+        self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
+        cells = (self._slots + 2) * len(tracks)
+        self.source.data = {name: np.full(cells, math.nan) for name in _COLUMNS}
 
     def _add_points(
         self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track
     ) -> None:
-        history, number = track
-        step, ring = self._step, self._slots
-        seen, end = self._seen[index], history.written  # read once: another thread adds points
+        history = track.history
+        seen = self._seen[index]
+        end = history.written  # read once: another thread adds points
         if end == seen:
             return
         self._seen[index] = end
-        names = (
-            (_TRUTH_LINE,)
-            if address.topic == TRUTH
-            else (f"valid{number % PALETTE}", _DOUBTFUL_LINE)
-        )
+        if address.topic == TRUTH:
+            valid_line = doubtful_line = _TRUTH_LINE
+        else:
+            valid_line = f"valid{track.number % PALETTE}"
+            doubtful_line = _DOUBTFUL_LINE
+        lines = ("east", valid_line, doubtful_line)
+        base = index * (self._slots + 2)
 
-        def put(slot: int, point: Mapping[str, float]) -> None:
-            for name in ("east", *names):
-                # the copy continues the line after the last slot
-                for place in (0, ring) if slot == 0 else (slot,):
-                    cells[name][index * (ring + 2) + place] = point.get(name, math.nan)
+        def put(number: int, east: float, line: str, north: float) -> None:
+            """Write slot `number` of the ring, with a gap in the other lines."""
+            slot = number % self._slots
+            values = dict.fromkeys(lines, math.nan)
+            values["east"] = east
+            values[line] = north
+            places = [base + slot]
+            if slot == 0:  # the copy continues the line after the last slot
+                places.append(base + self._slots)
+            for name, value in values.items():
+                for place in places:
+                    cells[name][place] = value
 
-        points = history.points(seen // step * step, end)
-        broken = False
+        first = seen // self._step * self._step
+        points = history.points(first, end)
+        is_broken = False
         for position, point in enumerate(points.tolist(), end - len(points)):
             east = point[_EAST]
-            north = point[_NORTH]
-            doubtful = point[_DOUBTFUL]
-            broken = math.isnan(east) or (broken and position % step > 0)
-            kind = names[-1 if doubtful > 0 else 0]
-            put(
-                position // step % ring,
-                {"east": round(east, 2), kind: math.nan if broken else round(north, 2)},
-            )
-        put(((end - 1) // step + 1) % ring, {})
+            line = doubtful_line if point[_DOUBTFUL] > 0 else valid_line
+            is_new_slot = position % self._step == 0
+            is_broken = math.isnan(east) or (is_broken and not is_new_slot)
+            north = math.nan if is_broken else round(point[_NORTH], 2)
+            put(position // self._step, round(east, 2), line, north)
+        put((end - 1) // self._step + 1, math.nan, valid_line, math.nan)

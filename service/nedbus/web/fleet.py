@@ -11,7 +11,7 @@ from itertools import count
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from nedbus import Sample
+from nedbus import Sample, limits
 from nedbus.health import (
     Fusion,
     Health,
@@ -27,13 +27,10 @@ from nedbus.vehicle_events import FIXES, MODES, State, rank_vehicle
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.messages import VehicleStatus
 
-from .stream import LONG, Origin, PageStream, is_position
+from .stream import LONG, HistorySize, Origin, PageStream, is_position
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
-# streams shown on a page, positions first; further streams are only counted
-MAX_STREAMS: Final = 1000
 _SILENT: Final = 60.0  # s without a message after which a stream may be evicted
-_MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _OK: Final = State("info", "ok", None, ())
 _DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its details
@@ -53,7 +50,9 @@ class StreamView:
     @property
     def silence(self) -> float | None:
         """Age of the last message [s], None while messages arrive."""
-        return self.health.age or 0.0 if self.state.is_silent else None
+        if not self.state.is_silent:
+            return None
+        return self.health.age or 0.0
 
 
 class StatusValue(NamedTuple):
@@ -83,9 +82,10 @@ class VehicleView:
     @property
     def attitude(self) -> StreamView | None:
         """The stream of its attitude, None if it sends none."""
-        return next(
-            (stream for stream in self.streams if stream.address.topic == "vehicle_attitude"), None
-        )
+        for stream in self.streams:
+            if stream.address.topic == "vehicle_attitude":
+                return stream
+        return None
 
     @property
     def grade(self) -> str:
@@ -95,8 +95,10 @@ class VehicleView:
     @property
     def lost(self) -> int:
         """Messages lost so far: between its service and this page, and about those of its ULog stream."""
-        after_service = sum(stream.health.lost for stream in self.streams)
-        return after_service if self.log is None else after_service + self.log.lost_messages
+        lost = sum(stream.health.lost for stream in self.streams)
+        if self.log is not None:
+            lost += self.log.lost_messages
+        return lost
 
     @property
     def brief(self) -> str:
@@ -106,12 +108,14 @@ class VehicleView:
     @property
     def last_position(self) -> str:
         """The last valid position as text."""
-        position, projection = self.main.stream.valid, self.main.stream.origin.projection
+        position = self.main.stream.valid
+        projection = self.main.stream.origin.projection
         if position is None:
             return "none yet"
         text = f"{position.north:z.1f} m north, {position.east:z.1f} m east"
-        name = "altitude" if position.is_altitude_global else "height"
-        text += f", {name} {position.altitude:z.1f} m" if math.isfinite(position.altitude) else ""
+        if math.isfinite(position.altitude):
+            name = "altitude" if position.is_altitude_global else "height"
+            text += f", {name} {position.altitude:z.1f} m"
         if not position.common or projection is None:
             return text
         latitude, longitude = projection.reproject(position.north, position.east)
@@ -154,7 +158,7 @@ class Fleet:
 
     `monitor`: the newest message and the health of each stream; each sample is added there first.
     `origin`: the common origin, by default the first one that two messages have.
-    `long`: number of points in the long histories, and seconds between two points.
+    `long`: the size of the long histories.
     """
 
     def __init__(
@@ -162,17 +166,18 @@ class Fleet:
         monitor: Monitor | None = None,
         *,
         origin: Origin | None = None,
-        long: tuple[int, float] = LONG,
+        long: HistorySize = LONG,
     ) -> None:
-        self.monitor, self.origin = Monitor() if monitor is None else monitor, origin or Origin()
+        self.monitor = Monitor() if monitor is None else monitor
+        self.origin = Origin() if origin is None else origin
         self.streams: dict[Address, PageStream] = {}
         self.snapshot = FleetSnapshot(0.0)
         self._long = long
         numbers = count()
-        self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
+        self._number_of = lru_cache(limits.PAGE_STREAMS)(lambda vehicle: next(numbers))
         self._lock = threading.Lock()  # guards `streams`
         self._rejected: Counter[Address] = Counter()
-        self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
+        self._reports: deque[RejectionReport] = deque(maxlen=limits.SHOWN_NAMES)
 
     def add(self, sample: Sample[Any], time: float) -> None:
         """Add a sample received at `time`: seconds since the Unix epoch, or since the start of a recording."""
@@ -180,24 +185,33 @@ class Fleet:
         is_estimate = is_position(address) and address.topic != TRUTH
         with self._lock:
             truth = self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None
-            if stream := self.streams.get(address):
+            stream = self.streams.get(address)
+            if stream is not None:
                 stream.add(sample, time, truth)
-            elif len(self.streams) < MAX_STREAMS or (is_position(address) and self._evict(time)):
+            elif self._has_room(address, time):
                 self.streams[address] = PageStream(sample, time, truth, self.origin, self._long)
+
+    def _has_room(self, address: Address, time: float) -> bool:
+        """Return whether a new stream may be added; a position may replace another stream."""
+        if len(self.streams) < limits.PAGE_STREAMS:
+            return True
+        return is_position(address) and self._evict(time)
 
     def reject(self, reports: Sequence[RejectionReport]) -> None:
         """Add reports of rejected messages."""
         self._reports.extendleft(reports)
         for report in reports:
             self._rejected[report.address] += 1
-            if len(self._rejected) > MAX_STREAMS:
-                del self._rejected[next(iter(self._rejected))]
+            if len(self._rejected) > limits.PAGE_STREAMS:
+                oldest = next(iter(self._rejected))
+                del self._rejected[oldest]
 
     def clear(self) -> None:
         """Remove all streams and reports for a seek; keep the common origin."""
         self.monitor = Monitor()
-        for collection in (self.streams, self._rejected, self._reports):
-            collection.clear()
+        self.streams.clear()
+        self._rejected.clear()
+        self._reports.clear()
 
     def update(
         self,
@@ -208,79 +222,100 @@ class Fleet:
     ) -> None:
         """Update `snapshot`; by vehicle: `states`, its ULog streams `logs`, and `fusion` of an external position."""
         self.reject(now.rejected)
-        alive = now.alive
         with self._lock:
             newest = dict(self.monitor.items())
             for forgotten in self.streams.keys() - newest.keys():
                 del self.streams[forgotten]
             streams = sorted(self.streams.items())
-        views: dict[str, list[StreamView]] = {}
+        by_vehicle: dict[str, list[StreamView]] = {}
         for address, stream in streams:
-            health = now.healths.get(address) or newest[address].health
-            state = stream_state(
-                health, publishers=None if alive is None else alive[address], connected=not now.link
-            )
-            view = StreamView(
-                address, stream, newest[address], health, state, self._rejected[address]
-            )
-            views.setdefault(address.vehicle, []).append(view)
+            view = self._view(stream, address, newest[address], now)
+            by_vehicle.setdefault(address.vehicle, []).append(view)
         vehicles = []
-        for name, each in views.items():
-            main = min(
-                each,
-                key=lambda view: (
-                    view.address.topic != DEFAULT_TOPIC,
-                    not is_position(view.address),
-                ),
-            )
-            vehicle_state, number = states.get(name, _OK), self._number_of(name)
-            status, log = _status(each), logs.get(name)
+        for name, views in by_vehicle.items():
             vehicle = VehicleView(
-                name, vehicle_state, main, tuple(each), status, number, log, fusion.get(name)
+                vehicle=name,
+                state=states.get(name, _OK),
+                main=min(views, key=_preference),
+                streams=tuple(views),
+                status=_status(views),
+                number=self._number_of(name),
+                log=logs.get(name),
+                fusion=fusion.get(name),
             )
             vehicles.append(vehicle)
         vehicles.sort(key=lambda view: rank_vehicle(view.vehicle, view.state.severity))
-        alarms = [
-            each for each in (now.link, now.behind.replace("this reader", "this page")) if each
-        ]
-        rejected, left_out = self._rejected.total(), len(newest) - len(streams)
+        alarms = [now.link, now.behind.replace("this reader", "this page")]
         self.snapshot = FleetSnapshot(
-            now.time, vehicles, tuple(self._reports), rejected, left_out, alarms
+            now.time,
+            vehicles,
+            reports=tuple(self._reports),
+            rejected=self._rejected.total(),
+            left_out=len(newest) - len(streams),
+            alarms=[alarm for alarm in alarms if alarm],
         )
+
+    def _view(
+        self, stream: PageStream, address: Address, newest: NewestMessage[Any], now: Snapshot
+    ) -> StreamView:
+        health = now.healths.get(address) or newest.health
+        publishers = None if now.alive is None else now.alive[address]
+        state = stream_state(health, publishers=publishers, connected=not now.link)
+        return StreamView(address, stream, newest, health, state, self._rejected[address])
 
     def _evict(self, time: float) -> bool:
         """Evict the longest-silent stream, positions last and only if silent; return True if one was evicted."""
-        address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
+
+        def rank(address: Address) -> tuple[bool, float]:
+            return is_position(address), self.streams[address].time
+
+        address = min(self.streams, key=rank)
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False
         del self.streams[address]
         return True
 
 
+def _preference(view: StreamView) -> tuple[bool, bool]:
+    """Rank a stream as the main one of its vehicle: the default topic, then another position, then any."""
+    return view.address.topic != DEFAULT_TOPIC, not is_position(view.address)
+
+
 def _status(views: Sequence[StreamView]) -> dict[str, StatusValue]:
-    known = {(view.address.topic, view.address.instance or 0): view for view in views}
+    """Return the status values of a vehicle, from the first instance of each topic."""
+    by_topic = {}
+    for view in views:
+        if not view.address.instance:
+            by_topic[view.address.topic] = view
 
     def value_of(topic: str, describe: Callable[[Any], str]) -> StatusValue:
-        view = known.get((topic, 0))
-        return (
-            StatusValue()
-            if view is None
-            else StatusValue(describe(view.newest.message), view.silence)
-        )
+        view = by_topic.get(topic)
+        if view is None:
+            return StatusValue()
+        return StatusValue(describe(view.newest.message), view.silence)
 
-    gps = "vehicle_gps_position" if ("vehicle_gps_position", 0) in known else "sensor_gps"
+    gps = "vehicle_gps_position" if "vehicle_gps_position" in by_topic else "sensor_gps"
     return {
-        "mode": value_of(
-            "vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))
-        ),
-        "armed": value_of(
-            "vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"
-        ),
-        "battery": value_of(
-            "battery_status",
-            lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else "",
-        ),
-        "gps": value_of(
-            gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"
-        ),
+        "mode": value_of("vehicle_status", _mode_of),
+        "armed": value_of("vehicle_status", _arming_of),
+        "battery": value_of("battery_status", _charge_of),
+        "gps": value_of(gps, _fix_of),
     }
+
+
+def _mode_of(message: Any) -> str:
+    return MODES.get(message.nav_state, str(message.nav_state))
+
+
+def _arming_of(message: Any) -> str:
+    return "armed" if message.arming_state == _ARMED else "disarmed"
+
+
+def _charge_of(message: Any) -> str:
+    remaining = message.remaining
+    return f"{100 * remaining:.0f} %" if 0 <= remaining <= 1 else ""
+
+
+def _fix_of(message: Any) -> str:
+    fix = FIXES.get(message.fix_type, message.fix_type)
+    return f"{fix} · {message.satellites_used}"

@@ -7,13 +7,13 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
 from nedbus import Sample
 from nedbus.errors import NedbusError
-from nedbus.flights import EventReplay
+from nedbus.flights import EventReplay, ReplayedMessage
 from nedbus.health import RejectionReport, Times
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
@@ -22,23 +22,33 @@ from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .event_timeline import EventTimeline
 from .fleet import Fleet
-from .stream import is_position
+from .stream import HistorySize, is_position
 
 _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s of history loaded before the playback position
-# maximum number of points of a whole flight, and s between two points
-_OVERVIEW: Final = 20_000, 0.5
+# of a whole flight: 20,000 points are 2.8 hours
+_OVERVIEW: Final = HistorySize(points=20_000, step=0.5)
 _STATUS_TOPICS: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
+
+
+class Entry(NamedTuple):
+    """A message of a recording at `time`, seconds since the first one.
+
+    `content`: the payload of a position or status, the reason of a rejection, else PX4's timestamp.
+    """
+
+    time: float
+    address: Address
+    content: bytes | str | int
 
 
 class Recording:
     """The messages of one or more files in chronological order, loaded in a background thread.
 
     `overview`: the whole flight at two points per second; `timeline`: the events, in seconds since the first message.
-    `entries`: the address of each message, with its payload (positions and status topics), the reason if it was
-    rejected, or only PX4's timestamp (other topics). `dues`: time of each message since the first one [s].
+    `indices`: of the messages of each stream in `entries`.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
@@ -48,46 +58,46 @@ class Recording:
         self.overview = Fleet(long=_OVERVIEW)
         self._replay = EventReplay(paths)
         self.timeline = EventTimeline(self._replay.event_log, times=Times())
-        self.dues: list[float] = []
-        self.entries: list[tuple[Address, bytes | str | int]] = []
+        self.entries: list[Entry] = []
+        self.indices: dict[Address, list[int]] = {}
         self.is_read = False
-        self.indices: dict[Address, list[int]] = {}  # in `entries`, by stream
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
     @property
     def length(self) -> float:
         """Duration read so far [s]."""
-        return self.dues[-1] if self.dues else 0.0
+        return self.entries[-1].time if self.entries else 0.0
 
     def _read(self) -> None:
+        replay = self._replay
         try:
-            self.timeline.times = self._replay.times
-            for message in self._replay:
-                address, payload = message.address, message.payload
-                entry: bytes | str | int = message.timestamp
-                if message.rejected is not None:
-                    entry = message.rejected
-                if payload is not None and (
-                    is_position(address) or address.topic in _STATUS_TOPICS
-                ):
-                    entry = payload
-                    if is_position(address):
-                        row = codec_of(DEFAULT).decode_row(payload)
-                        self.overview.add(Sample(row, address, round(message.at * 1e9)), message.at)
-                is_first = message.rejected is None and address not in self.indices
-                if is_first and is_position(address):
-                    self.timeline.set_clock(address.vehicle, message.timestamp / 1e6, message.at)
-                self.indices.setdefault(address, []).append(len(self.entries))
-                self.entries.append((address, entry))
-                self.dues.append(message.at)
-            for warning in self._replay.warnings:
-                _log.warning(
-                    "%s", warning, extra=about("damaged", source=self.name, reason=warning)
-                )
+            self.timeline.times = replay.times
+            for message in replay:
+                self._add(message)
+            for text in replay.warnings:
+                _log.warning("%s", text, extra=about("damaged", source=self.name, reason=text))
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=self.name, reason=str(exc)))
         finally:
             self.is_read = True
+
+    def _add(self, message: ReplayedMessage) -> None:
+        address = message.address
+        payload = message.payload
+        content: bytes | str | int = message.timestamp
+        if message.rejected is not None:
+            content = message.rejected
+        if payload is not None and address.topic in _STATUS_TOPICS:
+            content = payload
+        if is_position(address):
+            if payload is not None:
+                content = payload
+                row = codec_of(DEFAULT).decode_row(payload)
+                self.overview.add(Sample(row, address, round(message.at * 1e9)), message.at)
+            if message.rejected is None and address not in self.indices:
+                self.timeline.set_clock(address.vehicle, message.timestamp / 1e6, message.at)
+        self.indices.setdefault(address, []).append(len(self.entries))
+        self.entries.append(Entry(message.at, address, content))
 
 
 class Player:
@@ -111,15 +121,17 @@ class Player:
             start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False
         )
         self.controls = self._play, self._speed, self._slider
-        self._play.on_change(
-            "active", lambda _, __, active: self._play.update(label="pause" if active else "play")
-        )
+        self._play.on_change("active", self._label)
         self._slider.on_change("value_throttled", lambda _, __, value: self.seek(value))
+
+    def _label(self, _: str, __: object, is_active: bool) -> None:
+        self._play.label = "pause" if is_active else "play"
 
     def tick(self) -> None:
         """Advance the playback position by the elapsed time."""
         now = time.monotonic()
-        elapsed, self._ticked = now - self._ticked, now
+        elapsed = now - self._ticked
+        self._ticked = now
         if self._play.active:
             speed = float(self._speed.value) if self._speed.value in _SPEEDS else 1.0
             self.time = min(self.time + elapsed * speed, self.recording.length)
@@ -137,40 +149,53 @@ class Player:
         self._shown = self._slider.value
         self.fleet.clear()
         self.time = min(max(0.0, seconds), self.recording.length)
-        self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
-        indices = list(self.recording.indices.values())
-        silent = (known[at - 1] for known in indices if (at := bisect_left(known, self._next)))
-        for index in sorted(silent):  # the last message of each stream before this minute
+        recording = self.recording
+        self._next = bisect_left(recording.entries, self.time - _MINUTE, key=_time_of)
+        for index in self._last_before(self._next):
             self._add(index)
         for address, stream in self.fleet.streams.items():
-            overview = self.recording.overview.streams.get(address)
+            overview = recording.overview.streams.get(address)
             if stream.valid is None and overview is not None:
                 (stream.valid,) = overview.positions_at([self.time])
         self._feed()
         self.on_seek()
 
+    def _last_before(self, index: int) -> list[int]:
+        """Return the indices of the last message of each stream before an index, in order."""
+        last = []
+        for indices in list(self.recording.indices.values()):  # another thread adds streams
+            number = bisect_left(indices, index)
+            if number:
+                last.append(indices[number - 1])
+        return sorted(last)
+
     def _feed(self) -> None:
-        end = bisect_right(self.recording.dues, self.time)
+        """Add the messages up to the playback position, and update the snapshot."""
+        end = bisect_right(self.recording.entries, self.time, key=_time_of)
         for index in range(self._next, end):
             self._add(index)
         self._next = max(self._next, end)
-        states = {
-            name: state_at(spans, self.time)
-            for name, spans in self.recording.timeline.spans.items()
-        }
-        self.fleet.update(
-            Snapshot(self.time, self.fleet.monitor.snapshot(round(self.time * 1e9))), states, {}
-        )
+        states = {}
+        for name, spans in self.recording.timeline.spans.items():
+            states[name] = state_at(spans, self.time)
+        healths = self.fleet.monitor.snapshot(round(self.time * 1e9))
+        self.fleet.update(Snapshot(self.time, healths), states, {})
 
     def _add(self, index: int) -> None:
-        due, (address, entry) = self.recording.dues[index], self.recording.entries[index]
-        received = round(due * 1e9)
-        if isinstance(entry, str):
-            self.fleet.reject([RejectionReport(address, entry, received)])
+        time, address, content = self.recording.entries[index]
+        received = round(time * 1e9)
+        if isinstance(content, str):
+            self.fleet.reject([RejectionReport(address, content, received)])
             return
-        message: Any = SimpleNamespace(timestamp=entry)
-        if isinstance(entry, bytes):
-            message = codec_of(BY_TOPIC[address.topic]).decode_row(entry)
+        message: Any
+        if isinstance(content, bytes):
+            message = codec_of(BY_TOPIC[address.topic]).decode_row(content)
+        else:
+            message = SimpleNamespace(timestamp=content)
         sample = Sample(message, address, received)
         self.fleet.monitor.add(sample, received=received)
-        self.fleet.add(sample, due)
+        self.fleet.add(sample, time)
+
+
+def _time_of(entry: Entry) -> float:
+    return entry.time

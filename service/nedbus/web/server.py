@@ -25,7 +25,7 @@ from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.iostream import IOStream
 from tornado.web import HTTPError, RequestHandler
 
-from nedbus import Bus, Sample, clock
+from nedbus import Bus, Sample, clock, limits
 from nedbus.endpoints import is_loopback
 from nedbus.errors import ListenError
 from nedbus.health import Times
@@ -44,14 +44,8 @@ from .vision import VisionWatch
 
 _log = logging.getLogger(__name__)
 
-MAX_VIEWERS: Final = 32  # pages open at the same time, each with a WebSocket
 _WILDCARDS: Final = {"0.0.0.0", "::"}  # noqa: S104 - only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
-# request body, normally empty; Tornado buffers it before the Host header is checked
-_MAX_BODY_BYTES: Final = 2**16
-_MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
-_MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, including expiring ones
-_MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
 # s between WebSocket pings; without a pong before the next one, the connection is closed
 _PING: Final = 15.0
 # ms for which a page without a connection is kept, e.g. of a suspended browser
@@ -69,9 +63,14 @@ class PageOptions:
 
 
 def serve_live(
-    bus: Bus, selection: Selection, options: PageOptions, *, version: str, stop: threading.Event,
+    bus: Bus,
+    selection: Selection,
+    options: PageOptions,
+    *,
+    version: str,
+    stop: threading.Event,
     on_listening: Callable[[str], object],
-) -> None:  # fmt: skip
+) -> None:
     """Serve a page of the selected streams until `stop` is set; call `on_listening` with the URL once it listens.
 
     Raises ConfigError for an invalid background, ListenError if the address is not available.
@@ -125,13 +124,13 @@ class LiveFleet(Exporter):
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         super().__init__(bus, selection, version=version)
-        self.fleet, self._vision = Fleet(self.monitor), VisionWatch()
+        self.fleet = Fleet(self.monitor)
+        self._vision = VisionWatch()
         now = clock.utc()
-        reports = [
-            each
-            for each in bus.accounts(within=PAST)
-            if any(map(selection.matches_vehicle, each.vehicles))
-        ]
+        reports = []
+        for report in bus.accounts(within=PAST):
+            if any(map(selection.matches_vehicle, report.vehicles)):
+                reports.append(report)
         remembered = [event for _, event in once_per_service(reports) if event.time < now]
         self.timeline = EventTimeline(self.event_log, before=remembered)
 
@@ -143,14 +142,17 @@ class LiveFleet(Exporter):
 
     def poll(self) -> Snapshot:
         """Poll all vehicles; update the fleet and the clock of the timeline."""
-        snapshot, event_log = super().poll(), self.event_log
+        snapshot = super().poll()
+        event_log = self.event_log
         ahead = round(clock.to_utc(), 1)  # rounded: each change redraws the time axes
-        self.timeline.clock_offset, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
-        vehicles = {*event_log.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
+        self.timeline.clock_offset = ahead
+        self.timeline.times = Times(is_live=True, ahead=ahead)
+        # Another thread adds streams while these names are copied.
+        vehicles = {address.vehicle for address in [*self.fleet.streams]}
+        vehicles.update(event_log.vehicles)
         states = {vehicle: event_log.state(vehicle, snapshot.time) for vehicle in vehicles}
-        self.fleet.update(
-            snapshot, states, self.log_streams, self._vision.reports(vehicles, self.positions)
-        )
+        fusion = self._vision.reports(vehicles, self.positions)
+        self.fleet.update(snapshot, states, self.log_streams, fusion)
         return snapshot
 
 
@@ -170,43 +172,49 @@ class WebServer:
     ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
             logging.getLogger(name).setLevel(logging.ERROR)  # else they warn about each closed tab
-        host = options.host
+        self._open_page = open_page
         self._loop = IOLoop()
-
-        def open_or_refuse(document: Document) -> None:
-            sessions = self._server.get_sessions("/")
-            waiting = [each for each in sessions if not each.connection_count]
-            for each in waiting[:-MAX_VIEWERS]:  # pages whose clients have opened no WebSocket
-                each.request_expiration()
-            if len(sessions) - len(waiting) >= MAX_VIEWERS or len(waiting) >= _MAX_WAITING:
-                _log_once("limit of %d open pages reached: further pages are refused", MAX_VIEWERS)
-                document.add_root(Div(text=f"limit of {MAX_VIEWERS} open pages reached: close one"))
-            else:
-                open_page(document)
-
         try:
-            sockets, port = bind_sockets(host, options.port)
+            sockets, port = bind_sockets(options.host, options.port)
         except OSError as exc:
+            url = f"http://{options.host}:{options.port}"
             reason = (exc.strerror or str(exc)).lower()
-            hint = "choose another address with --http"
-            raise ListenError([f"http://{host}:{options.port}"], reason, hint=hint) from exc
+            raise ListenError([url], reason, hint="choose another address with --http") from exc
+        handlers = [(path, _TextHandler, {"render": render}) for path, render in pages.items()]
         tornado = _Tornado(
-            options, {"/": Application(FunctionHandler(open_or_refuse))},
-            extra_websocket_origins=["*"], auth_provider=_TokenCheck(),
-            # Bokeh's keep-alive may drop a busy session
-            keep_alive_milliseconds=0, websocket_ping_interval=_PING,
-            unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
-            websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
-            extra_patterns=[(path, _TextHandler, {"render": render}) for path, render in pages.items()],
-        )  # fmt: skip
+            options,
+            {"/": Application(FunctionHandler(self._open_or_refuse))},
+            extra_patterns=handlers,
+            extra_websocket_origins=["*"],
+            auth_provider=_TokenCheck(),
+            keep_alive_milliseconds=0,  # Bokeh's keep-alive may drop a busy session
+            websocket_ping_interval=_PING,
+            unused_session_lifetime_milliseconds=_UNUSED_LIFETIME,
+            check_unused_sessions_milliseconds=1000,
+            websocket_max_message_size_bytes=limits.PAGE_MESSAGE_BYTES,
+        )
         http = _HttpServer(
-            tornado, max_body_size=_MAX_BODY_BYTES, max_buffer_size=2 * _MAX_MESSAGE_BYTES,
-            idle_connection_timeout=TIMINGS.page_request, body_timeout=TIMINGS.page_request,
-        )  # fmt: skip
+            tornado,
+            max_body_size=limits.PAGE_REQUEST_BYTES,
+            max_buffer_size=2 * limits.PAGE_MESSAGE_BYTES,
+            idle_connection_timeout=TIMINGS.page_request,
+            body_timeout=TIMINGS.page_request,
+        )
         self._loop.add_callback(http.add_sockets, sockets)
         self._server = BaseServer(self._loop, tornado, http)
-        shown = "127.0.0.1" if host in _WILDCARDS else f"[{host}]" if ":" in host else host
-        self.url = f"http://{shown}:{port}"
+        self.url = f"http://{_shown_host(options.host)}:{port}"
+
+    def _open_or_refuse(self, document: Document) -> None:
+        sessions = self._server.get_sessions("/")
+        waiting = [session for session in sessions if not session.connection_count]
+        viewers = len(sessions) - len(waiting)
+        for session in waiting[: -limits.PAGES]:  # the oldest
+            session.request_expiration()
+        if viewers >= limits.PAGES or len(waiting) >= limits.WAITING_PAGES:
+            _log_once("limit of %d open pages reached: further pages are refused", limits.PAGES)
+            document.add_root(Div(text=f"limit of {limits.PAGES} open pages reached: close one"))
+        else:
+            self._open_page(document)
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set, in this thread."""
@@ -219,20 +227,27 @@ class WebServer:
         self._loop.close(all_fds=True)
 
 
+def _shown_host(host: str) -> str:
+    """Return a host as a browser on this machine needs it in a URL."""
+    if host in _WILDCARDS:
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
+
+
 class _HttpServer(HTTPServer):
     """Close connections above a limit: without a free file descriptor, `accept` would fail in a busy loop."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
         self._streams: list[IOStream] = []
-        self._limit = min(_MAX_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+        files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self._limit = min(limits.PAGE_CONNECTIONS, files // 2)
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
-        self._streams = [each for each in self._streams if not each.closed()]
+        self._streams = [known for known in self._streams if not known.closed()]
         if len(self._streams) >= self._limit:
-            _log_once(
-                "limit of %d connections reached: further connections are closed", self._limit
-            )
+            text = "limit of %d connections reached: further connections are closed"
+            _log_once(text, self._limit)
             stream.close()
             return
         self._streams.append(stream)
@@ -252,9 +267,11 @@ class _Tornado(BokehTornado):
         super().__init__(*args, **kwargs)
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
-        is_local, origins = is_loopback(self._options.host), self._options.origins
         refusal = why_refused(
-            request.path, request.headers.get_list, is_local=is_local, origins=origins
+            request.path,
+            request.headers.get_list,
+            is_local=is_loopback(self._options.host),
+            origins=self._options.origins,
         )
         if not refusal:
             return super().find_handler(request, **kwargs)
@@ -268,20 +285,24 @@ class _TokenCheck(NullAuth):
     login_url = "/"  # required by Bokeh, never used
 
     async def get_user_async(self, handler: RequestHandler) -> str:  # type: ignore[override] # a property in Bokeh
-        if handler.request.path.endswith("/ws"):
-            name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(
-                ","
-            )
-            try:
-                is_valid = (
-                    name == "bokeh"
-                    and clock.utc() < get_token_payload(token.strip())["session_expiry"]
-                )
-            except Exception:  # noqa: BLE001 - Bokeh does not translate the errors of its decoders
-                is_valid = False
-            if not is_valid:
+        request = handler.request
+        if request.path.endswith("/ws"):
+            protocol = request.headers.get("Sec-WebSocket-Protocol", "")
+            if not _is_valid_token(protocol):
                 raise HTTPError(403, reason="WebSocket without a valid page token")
         return "viewer"
+
+
+def _is_valid_token(protocol: str) -> bool:
+    """Return whether the protocol of a WebSocket contains the token of a page that has not expired."""
+    name, _, token = protocol.partition(",")
+    if name != "bokeh":
+        return False
+    try:
+        expiry: float = get_token_payload(token.strip())["session_expiry"]
+        return clock.utc() < expiry
+    except Exception:  # noqa: BLE001 - Bokeh does not translate the errors of its decoders
+        return False
 
 
 class _TextHandler(RequestHandler):

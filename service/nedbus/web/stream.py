@@ -14,8 +14,6 @@ from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPo
 from nedbus_msgs.frames import CommonOrigin, to_global
 
 POINTS: Final = 600  # number of points in the history of the last minute
-# number of points in the long history, and seconds between two points: 15 minutes
-LONG: Final = 900, 1.0
 COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
 """Columns of a history, NaN where the message was not valid.
 
@@ -25,11 +23,28 @@ COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "err
 """
 
 _STEP: Final = 0.095  # s between two points
-_MAX_TRUTH_AGE: Final = 0.5  # s between an estimate and the ground truth it is compared with
+_TRUTH_WINDOW: Final = 0.5  # s; older ground truth is not compared with an estimate
 _state_of = attrgetter(
-    "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "xy_global", "xy_valid", "z_valid",
+    "xy_reset_counter",
+    "z_reset_counter",
+    "vxy_reset_counter",
+    "vz_reset_counter",
+    "xy_global",
+    "xy_valid",
+    "z_valid",
     "dead_reckoning",
-)  # fmt: skip
+)
+
+
+class HistorySize(NamedTuple):
+    """The number of points of a history, and the time between two [s]."""
+
+    points: int
+    step: float
+
+
+LONG: Final = HistorySize(points=900, step=1.0)
+"""The history of 15 minutes of live vehicles."""
 
 
 def is_position(address: Address) -> bool:
@@ -55,15 +70,19 @@ class History:
     """Ring buffer of the newest `size` points; `written` counts all points written so far."""
 
     def __init__(self, size: int, step: float) -> None:
-        self.size, self.step = size, step
+        self.size = size
+        self.step = step
         self.written = 0
         # uses no memory until written, and only positions are written
         self._points = np.empty((size, len(COLUMNS)))
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
         """Return points `begin` to `end` that are not overwritten yet, oldest first; shape (n, columns)."""
-        end = self.written if end is None else end
-        return self._points[np.arange(max(begin, end - self.size, 0), end) % self.size]
+        if end is None:
+            end = self.written
+        oldest = max(begin, end - self.size, 0)
+        slots = np.arange(oldest, end) % self.size
+        return self._points[slots]
 
     def write(self, values: list[float]) -> None:
         """Write the next point."""
@@ -79,17 +98,24 @@ class Origin(CommonOrigin):
     ) -> Position:
         """Return the position in a message, NaN where invalid; a validity flag in `missing` counts as valid."""
         position = to_global(message)
-        north, east = message.x, message.y
+        north = message.x
+        east = message.y
         if position:
-            north, east = self.update(address, message).project(
-                position.latitude, position.longitude
-            )
-        if not (message.xy_valid or "xy_valid" in missing):
+            origin = self.update(address, message)
+            north, east = origin.project(position.latitude, position.longitude)
+        if not message.xy_valid and "xy_valid" not in missing:
             north = east = math.nan
-        altitude = (message.ref_alt if message.z_global else 0.0) - message.z
-        has_height = message.z_valid or "z_valid" in missing
+        altitude = -message.z
+        if message.z_global:
+            altitude += message.ref_alt
+        if not message.z_valid and "z_valid" not in missing:
+            altitude = math.nan
         return Position(
-            east, north, altitude if has_height else math.nan, bool(position), message.z_global
+            east,
+            north,
+            altitude,
+            common=position is not None,
+            is_altitude_global=message.z_global,
         )
 
 
@@ -105,15 +131,17 @@ class PageStream:
         time: float,
         truth: PageStream | None,
         origin: Origin,
-        long: tuple[int, float],
+        long: HistorySize,
     ) -> None:
-        self.minute, self.long = History(POINTS, _STEP), History(*long)
+        self.minute = History(POINTS, _STEP)
+        self.long = History(long.points, long.step)
         self.end: Sample[Any] | None = None
         self.valid: Position | None = None
         self.origin = origin
         self._tracker = ResetTracker()
         self._state: object = None
-        self._sampled = self._sampled_long = -math.inf
+        self._sampled = -math.inf
+        self._sampled_long = -math.inf
         self.add(sample, time, truth)
 
     def add(self, sample: Sample[Any], time: float, truth: PageStream | None) -> None:
@@ -121,34 +149,48 @@ class PageStream:
         self.time = time
         if not is_position(sample.address):
             return
-        before, self.end = self.end, sample
-        state = _state_of(sample.message)
-        if state == self._state:
-            if time - self._sampled < _STEP:
-                return
-        elif before is not None:
+        before = self.end
+        self.end = sample
+        message = sample.message
+        state = _state_of(message)
+        if state == self._state and time - self._sampled < _STEP:
+            return
+        if state != self._state and before is not None:
             # the tracker needs the last message before the change
             self._tracker.add(before.message)
-        self._state, self._sampled = state, time
-        message, missing = sample.message, sample.provenance.missing
+        self._state = state
+        self._sampled = time
         track = self._tracker.add(message)
-        position = self.origin.locate(sample.address, message, missing)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
-            gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
-            self.minute.write(gap)
-            self.long.write(gap)
-            self._sampled_long = -math.inf
+            self._interrupt(time)
+        point = self._point(sample, time, truth)
+        self.minute.write(point)
+        if time - self._sampled_long >= self.long.step:
+            self._sampled_long = time
+            self.long.write(point)
+
+    def _interrupt(self, time: float) -> None:
+        """Write a gap, which interrupts the lines."""
+        gap = [math.nan for _ in COLUMNS]
+        gap[0] = time * 1e3
+        self.minute.write(gap)
+        self.long.write(gap)
+        self._sampled_long = -math.inf
+
+    def _point(self, sample: Sample[Any], time: float, truth: PageStream | None) -> list[float]:
+        """Return the point of a message, in the order of COLUMNS."""
+        message = sample.message
+        missing = sample.provenance.missing
+        position = self.origin.locate(sample.address, message, missing)
         if math.isfinite(position.north):
             self.valid = position
-        height = -message.z if message.z_valid or "z_valid" in missing else math.nan
-        speed = (
-            math.hypot(message.vx, message.vy)
-            if message.v_xy_valid or "v_xy_valid" in missing
-            else math.nan
-        )
-        error = _distance(position, message, truth)
-        doubtful = float(message.dead_reckoning or "xy_valid" in missing)
-        point = [
+        height = math.nan
+        if message.z_valid or "z_valid" in missing:
+            height = -message.z
+        speed = math.nan
+        if message.v_xy_valid or "v_xy_valid" in missing:
+            speed = math.hypot(message.vx, message.vy)
+        return [
             time * 1e3,
             position.east,
             position.north,
@@ -156,13 +198,9 @@ class PageStream:
             speed,
             message.eph,
             message.epv,
-            error,
-            doubtful,
+            _distance(position, message, truth),
+            float(message.dead_reckoning or "xy_valid" in missing),
         ]
-        self.minute.write(point)
-        if time - self._sampled_long >= self.long.step:
-            self._sampled_long = time
-            self.long.write(point)
 
     def positions_at(self, times: list[float]) -> list[Position | None]:
         """Return the last valid position at each time [s], None before the histories begin."""
@@ -170,13 +208,14 @@ class PageStream:
         points = points[~np.isnan(points[:, 1])]
         points = points[points[:, 0].argsort(kind="stable")]
         numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
-        found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
-        return [
-            None
-            if point is None
-            else Position(point[0], point[1], math.nan, common=True, is_altitude_global=False)
-            for point in found
-        ]
+        positions: list[Position | None] = []
+        for number in numbers:
+            if number == 0:
+                positions.append(None)
+                continue
+            east, north = points[number - 1, 1:3].tolist()
+            positions.append(Position(east, north, math.nan, common=True, is_altitude_global=False))
+        return positions
 
 
 def _distance(position: Position, message: VehicleLocalPosition, truth: PageStream | None) -> float:
@@ -185,10 +224,10 @@ def _distance(position: Position, message: VehicleLocalPosition, truth: PageStre
         return math.nan
     real = truth.end.message
     other = truth.origin.locate(truth.end.address, real)
-    seconds = (
-        (message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)
-    ) / 1e6
-    if other.common != position.common or abs(seconds) > _MAX_TRUTH_AGE:
+    sampled = message.timestamp_sample or message.timestamp
+    real_sampled = real.timestamp_sample or real.timestamp
+    seconds = (sampled - real_sampled) / 1e6
+    if other.common != position.common or abs(seconds) > _TRUTH_WINDOW:
         return math.nan
     offsets = [
         other.east + real.vy * seconds - position.east,

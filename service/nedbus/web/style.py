@@ -10,11 +10,11 @@ from typing import Final
 
 import jinja2
 
+from nedbus import limits
 from nedbus.clock import format_duration
 from nedbus.health import describe_stream
 from nedbus_msgs.frames import derive
 
-from .fleet import MAX_STREAMS
 from .stream import is_position
 
 SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "info": "●"}
@@ -57,7 +57,7 @@ def panels() -> jinja2.Template:
     environment.filters.update(age=format_duration, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)
     environment.globals.update(
-        MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, describe=describe_stream, derive=derive
+        limits=limits, SHAPES=SHAPES, describe=describe_stream, derive=derive
     )
     return environment.from_string(re.sub(r"(?<=[>}])\n\s*(?=[<{])", "", read_asset("panels.html")))
 

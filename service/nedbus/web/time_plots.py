@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 from bokeh.models import (
     BasicTicker,
     ColumnDataSource,
@@ -16,6 +17,7 @@ from bokeh.models import (
 from bokeh.models.annotations import Legend, LegendItem
 from bokeh.plotting import figure
 
+from nedbus import limits
 from nedbus.health import Event, Span
 from nedbus.vehicle_events import ALL, KINDS
 
@@ -23,9 +25,8 @@ from .column_data import replace, table
 from .stream import COLUMNS, History
 from .style import MARKERS, SHAPES, Style
 
-_MAX_ROWS: Final = 7  # vehicles; if there are more, the last row counts the hidden ones
-_MAX_MARKS: Final = 2000
-_MIN_ROWS: Final = 4  # minimum height in rows; fewer rows would have thick bars
+_VEHICLE_ROWS: Final = 7  # if there are more vehicles, the last row counts the hidden ones
+_LEAST_ROWS: Final = 4  # height in rows; fewer rows would have thick bars
 _PLOTS: Final = (  # the title of each column of each plot
     {"height": "height above own origin [m]"},
     {"speed": "horizontal speed [m/s]"},
@@ -39,11 +40,10 @@ _TRUTH_COLUMNS: Final = {"height", "speed"}
 def notable(events: Iterable[Event]) -> list[Event]:
     """Return the events to mark: faults and flight phases; if more than 2,000, only the latest faults."""
     shown = [event for event in events if event.severity != "info" or KINDS[event.kind].phase]
-    return (
-        shown
-        if len(shown) <= _MAX_MARKS
-        else [each for each in shown if each.severity != "info"][-_MAX_MARKS:]
-    )
+    if len(shown) <= limits.PAGE_MARKS:
+        return shown
+    faults = [event for event in shown if event.severity != "info"]
+    return faults[-limits.PAGE_MARKS :]
 
 
 def set_time_range(axis: Range1d, begin: float, end: float) -> None:
@@ -62,13 +62,14 @@ class TimelinePlot:
         self._colours = style.colours
         self._ticker = FixedTicker()
         self.range = Range1d()
-        options: dict[str, Any] = {
-            "y_range": Range1d(),
-            "height": 100,
-            "css_classes": ["time"],
-            "title": _LEGEND,
-        }
-        self.figure = _time_figure(self.range, clock, **options)
+        self.figure = _time_figure(
+            self.range,
+            clock,
+            y_range=Range1d(),
+            height=100,
+            css_classes=["time"],
+            title=_LEGEND,
+        )
         self.figure.yaxis.ticker = self._ticker
         self.figure.xaxis.ticker = DatetimeTicker(desired_num_ticks=4)
         self.figure.ygrid.grid_line_color = None
@@ -76,9 +77,15 @@ class TimelinePlot:
             "row", 0.28, "end", "begin", source=self._spans, color="colour", alpha=0.75
         )
         marks = self.figure.scatter(
-            "time", "row", source=self.marks, marker="marker", size=11, fill_color="colour",
-            line_color=style.colours["ground"], nonselection_alpha=1.0,
-        )  # fmt: skip
+            "time",
+            "row",
+            source=self.marks,
+            marker="marker",
+            size=11,
+            fill_color="colour",
+            line_color=style.colours["ground"],
+            nonselection_alpha=1.0,
+        )
         self.figure.vspan(
             x="time", source=self._now, line_color=style.colours["text"], line_dash="dotted"
         )
@@ -87,64 +94,98 @@ class TimelinePlot:
         )
 
     def update(
-        self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
-        begin: float, end: float, now: float,
-    ) -> None:  # fmt: skip
+        self,
+        events: Sequence[Event],
+        spans: Mapping[str, Sequence[Span]],
+        vehicles: Sequence[str],
+        *,
+        begin: float,
+        end: float,
+        now: float,
+    ) -> None:
         """Show the events from `begin` to `end` [s]; `vehicles`: the selected one first, then by severity."""
         events = notable(event for event in events if begin <= event.time <= end)
-        held = [  # bad last, drawn over watch
-            (name, span)
-            for severity in ("watch", "bad")
-            for name in vehicles
-            for span in spans.get(name, ())
-            if span.severity == severity
-            and span.until != span.since
-            and (span.until is None or span.until > begin)
-        ]
-        affected = {event.vehicle for event in events if event.severity != "info"} | {
-            name for name, _ in held
-        }
-        others = sorted(vehicles[1:], key=lambda name: name not in affected)
-        names = [*([ALL] if ALL in affected else []), *vehicles[:1], *others]
-        hidden = len(names) - _MAX_ROWS + 1 if len(names) > _MAX_ROWS else 0
-        names = names[: len(names) - hidden]
+        held = _held_since(begin, spans, vehicles)
+        affected = {name for name, _ in held}
+        for event in events:
+            if event.severity != "info":
+                affected.add(event.vehicle)
+        # The selected vehicle stays first, then those with faults.
+        names = [*vehicles[:1], *sorted(vehicles[1:], key=lambda name: name not in affected)]
+        if ALL in affected:
+            names.insert(0, ALL)
+        hidden = 0
+        if len(names) > _VEHICLE_ROWS:
+            hidden = len(names) - _VEHICLE_ROWS + 1
+            names = names[: _VEHICLE_ROWS - 1]
         rows = {name: len(names) - index for index, name in enumerate(names)}
         self.shown = [event for event in events if event.vehicle in rows]
-        marks = [
-            {"time": event.time * 1e3, "row": rows[event.vehicle], "marker": MARKERS[event.severity],
-             "colour": self._colours[event.severity], "words": event.words[:100], "vehicle": event.vehicle}
-            for event in self.shown
-        ]  # fmt: skip
-        replace(self.marks, marks)
-        bars = [
-            {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": self._colours[span.severity],
-             "end": (end if span.until is None else min(end, span.until)) * 1e3}
-            for name, span in held if name in rows
-        ]  # fmt: skip
+        replace(self.marks, [self._mark(event, rows[event.vehicle]) for event in self.shown])
+        bars = [self._bar(span, rows[name], begin, end) for name, span in held if name in rows]
         replace(self._spans, bars)
         replace(self._now, [{"time": now * 1e3}])
-        labels: dict[Any, Any] = {
-            row: "link, page" if name == ALL else name[:14] for name, row in rows.items()
+        self._label_rows(rows, hidden)
+
+    def _mark(self, event: Event, row: int) -> dict[str, Any]:
+        return {
+            "time": event.time * 1e3,
+            "row": row,
+            "marker": MARKERS[event.severity],
+            "colour": self._colours[event.severity],
+            "words": event.words[:100],
+            "vehicle": event.vehicle,
         }
-        labels |= {0: f"+{hidden} more"} if hidden else {}
+
+    def _bar(self, span: Span, row: int, begin: float, end: float) -> dict[str, Any]:
+        until = end if span.until is None else min(end, span.until)
+        return {
+            "begin": max(begin, span.since) * 1e3,
+            "end": until * 1e3,
+            "row": row,
+            "colour": self._colours[span.severity],
+        }
+
+    def _label_rows(self, rows: Mapping[str, int], hidden: int) -> None:
+        """Label the rows with their vehicles; `hidden`: number of vehicles without a row."""
+        labels: dict[Any, Any] = {}
+        for name, row in rows.items():
+            labels[row] = "link, page" if name == ALL else name[:14]
+        padding = max(_LEAST_ROWS - len(rows), 0) / 2
+        low = 0.4 - padding
+        if hidden:
+            labels[0] = f"+{hidden} more"
+            low -= 1
         self._ticker.ticks = list(labels)
         self.figure.yaxis.major_label_overrides = labels
-        padding = max(_MIN_ROWS - len(names), 0) / 2
-        self.figure.y_range.update(
-            start=0.4 - padding - bool(hidden), end=len(names) + 0.6 + padding
-        )
+        self.figure.y_range.update(start=low, end=len(rows) + 0.6 + padding)
+
+
+def _held_since(
+    begin: float, spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str]
+) -> list[tuple[str, Span]]:
+    """Return the conditions that were active after `begin` [s], with their vehicles: bad last, drawn over watch."""
+    held: list[tuple[str, Span]] = []
+    for severity in ("watch", "bad"):
+        for name in vehicles:
+            for span in spans.get(name, ()):
+                is_recent = span.until is None or span.until > begin
+                if span.severity == severity and span.until != span.since and is_recent:
+                    held.append((name, span))
+    return held
 
 
 class Plots:
     """Three plots with a shared time axis; `chosen`: the points of the selected stream."""
 
     def __init__(self, style: Style, clock: Any) -> None:
-        self.chosen, self._truth = table(*COLUMNS), table(*COLUMNS)
+        self.chosen = table(*COLUMNS)
+        self._truth = table(*COLUMNS)
         self.range = Range1d()
         self._marks = table("time", "colour")
         self._spans = table("begin", "end", "colour")
         self._shown: dict[ColumnDataSource, tuple[History | None, int]] = {}
-        self._style, self._clock = style, clock
+        self._style = style
+        self._clock = clock
 
     def draw(self) -> Iterator[figure]:
         """Yield new plots one by one, because each takes a browser as long to draw as the map."""
@@ -152,41 +193,47 @@ class Plots:
 
     def update(self, chosen: History | None, truth: History | None) -> None:
         """Add the new points of the selected stream and of its ground truth."""
-        for source, history in (
-            (self.chosen, chosen),
-            (self._truth, truth if truth is not chosen else None),
-        ):
-            shown, seen = self._shown.get(source, (None, 0))
-            # read once: another thread adds points
-            end = history.written if history is not None else 0
-            self._shown[source] = history, end
-            points = (
-                _NO_POINTS
-                if history is None
-                else history.points(seen if history is shown else 0, end)
-            )
-            columns: dict[str, Any] = dict(zip(COLUMNS, points.T, strict=True))
-            if history is not shown:
-                source.data = columns
-            elif history is not None and len(points):
-                source.stream(columns, rollover=history.size)
+        self._update_points(self.chosen, chosen)
+        self._update_points(self._truth, None if truth is chosen else truth)
+
+    def _update_points(self, source: ColumnDataSource, history: History | None) -> None:
+        shown, seen = self._shown.get(source, (None, 0))
+        if history is None:
+            self._shown[source] = (None, 0)
+            if shown is not None:
+                source.data = _to_columns(_NO_POINTS)
+            return
+        end = history.written  # read once: another thread adds points
+        self._shown[source] = (history, end)
+        if history is not shown:
+            source.data = _to_columns(history.points(0, end))
+        elif end > seen:
+            source.stream(_to_columns(history.points(seen, end)), rollover=history.size)
 
     def mark_events(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
         """Mark the events of the vehicle and shade its conditions; active ones end at `end` [s]."""
         colours = self._style.colours
-        replace(
-            self._marks,
-            [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events],
-        )
-        held = [
-            {"begin": span.since * 1e3, "end": (end if span.until is None else span.until) * 1e3,
-             "colour": colours[span.severity]}
-            for span in spans if span.severity != "info" and span.until != span.since
-        ]  # fmt: skip
-        replace(self._spans, held)
+        marks = []
+        for event in events:
+            marks.append({"time": event.time * 1e3, "colour": colours[event.severity]})
+        replace(self._marks, marks)
+        bars = []
+        for span in spans:
+            if span.severity != "info" and span.until != span.since:
+                until = end if span.until is None else span.until
+                bars.append(
+                    {
+                        "begin": span.since * 1e3,
+                        "end": until * 1e3,
+                        "colour": colours[span.severity],
+                    }
+                )
+        replace(self._spans, bars)
 
     def _draw(self, titles: Mapping[str, str]) -> figure:
-        title = next(iter(titles.values())) if len(titles) == 1 else None  # otherwise the legend
+        title = None  # the legend
+        if len(titles) == 1:
+            (title,) = titles.values()
         plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
         plot.vstrip(
             x0="begin",
@@ -217,6 +264,10 @@ class Plots:
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
         plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)
         return plot
+
+
+def _to_columns(points: npt.NDArray[np.float64]) -> dict[str, Any]:
+    return dict(zip(COLUMNS, points.T, strict=True))
 
 
 def _time_figure(span: Range1d, clock: Any, **options: Any) -> figure:

@@ -104,7 +104,7 @@ def test_image_above_the_pixel_limit_raises_before_it_is_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pillow_limit: int
 ) -> None:
     """An image above the limit raises an error with the remedy, even if Pillow would warn about it or refuse it."""
-    monkeypatch.setattr("nedbus.web.background._MAX_PIXELS", 960)
+    monkeypatch.setattr("nedbus.limits.MAP_PIXELS", 960)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", pillow_limit)
     file = write_image(tmp_path, world=WORLD, size=(31, 31))
     monkeypatch.setattr("PIL.ImageFile.ImageFile.load", pytest.fail)
@@ -116,7 +116,7 @@ def test_image_above_the_pixel_limit_raises_before_it_is_decoded(
 
 def test_image_at_the_pixel_limit_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An image with as many pixels as the limit is drawn."""
-    monkeypatch.setattr("nedbus.web.background._MAX_PIXELS", 961)
+    monkeypatch.setattr("nedbus.limits.MAP_PIXELS", 961)
     assert Background(write_image(tmp_path, world=WORLD, size=(31, 31))).pixels.shape == (31, 31)
 
 

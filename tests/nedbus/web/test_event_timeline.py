@@ -14,7 +14,7 @@ def test_cached_stories_and_verdicts_are_bounded(
     sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Moments and names that viewers request are cached up to a limit, although no event ends their validity."""
-    monkeypatch.setattr("nedbus.web.event_timeline._MAX_CACHED", 10)
+    monkeypatch.setattr("nedbus.limits.PAGE_STORIES", 10)
     timeline = EventTimeline(sim.event_log)
     sim.fly(5)
     sim.fly(5, xy_valid=False)

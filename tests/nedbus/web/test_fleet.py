@@ -225,7 +225,7 @@ def test_streams_above_the_limit_are_only_counted(
     sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Streams above the limit are counted but not shown, until a shown stream has been silent for a minute."""
-    monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 3)
+    monkeypatch.setattr("nedbus.limits.PAGE_STREAMS", 3)
     names = [Address(f"v{number}", VLP) for number in range(5)]
     sim.fly(1, *names)
     snapshot = sim.poll()
@@ -244,7 +244,7 @@ def test_streams_added_during_an_update_are_counted(
     sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Streams above the limit that arrive in another thread while the snapshot is updated are counted."""
-    monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
+    monkeypatch.setattr("nedbus.limits.PAGE_STREAMS", 2)
     others = [Address(f"v{number}", VLP) for number in range(2)]
     waiting, adding = list(others), list[threading.Thread]()
 
@@ -269,7 +269,7 @@ def test_position_replaces_other_streams_at_the_limit(
     sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the limit, a new position stream replaces a stream of another topic; no other new stream does."""
-    monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
+    monkeypatch.setattr("nedbus.limits.PAGE_STREAMS", 2)
     attitude, battery = Address("wing", "vehicle_attitude"), Address("wing", "battery_status", 0)
     sim.fly(2, attitude, battery)
     assert addresses_of(sim.poll()) == [battery, attitude]

@@ -294,7 +294,7 @@ def test_only_timestamps_of_other_topics_are_kept(tmp_path: Path, clock: SimpleN
     file = write_flight(tmp_path, {VLP: lambda _: {}, "vehicle_attitude": lambda _: {}}, seconds=20)
     opened = Recording(file)
     wait_for(lambda: opened.length > 19.8, what="the recording")
-    assert {type(payload) for address, payload in opened.entries if address.topic != VLP} == {int}
+    assert {type(entry.content) for entry in opened.entries if entry.address.topic != VLP} == {int}
     player = Player(opened)
     run(player, clock, 10)
     assert Page(opened, player).plot_range == pytest.approx((0, 19.9), abs=0.01), (
@@ -317,7 +317,8 @@ def test_message_without_a_timestamp_is_rejected(tmp_path: Path) -> None:
         writer.write(messages, VehicleAttitude.DEFINITION, streams, logged=(1, 2), published=(1, 2))
     opened = Recording(file)
     wait_for(lambda: len(opened.entries) == 2, what="the recording")
-    assert opened.entries == [(attitude, "timestamp: Field required"), (attitude, 2)]
+    contents = [(entry.address, entry.content) for entry in opened.entries]
+    assert contents == [(attitude, "timestamp: Field required"), (attitude, 2)]
 
 
 def test_unreadable_recording_raises(tmp_path: Path) -> None:

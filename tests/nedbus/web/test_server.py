@@ -141,7 +141,7 @@ def test_page_above_the_viewer_limit_shows_a_notice(
     monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
     """A page beyond the maximum number of open pages, here 1, shows only a notice."""
-    monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
+    monkeypatch.setattr("nedbus.limits.PAGES", 1)
     for text in ("a word", "limit of 1 open pages reached: close one"):
         session = pull_session(url=url)
         assert [root.text for root in session.document.roots if isinstance(root, Div)] == [text]
@@ -152,12 +152,12 @@ def test_requests_without_websocket_do_not_count_as_viewers(
     monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
     """Pages requested without opening a WebSocket do not count as viewers, but have a separate limit."""
-    monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
+    monkeypatch.setattr("nedbus.limits.PAGES", 1)
     for _ in range(10):
         assert status_of(url) == 200
     session = pull_session(url=url)
     assert [root.text for root in session.document.roots if isinstance(root, Div)] == ["a word"]
-    monkeypatch.setattr("nedbus.web.server._MAX_WAITING", 0)
+    monkeypatch.setattr("nedbus.limits.WAITING_PAGES", 0)
     refused = pull_session(url=url)
     assert [root.text for root in refused.document.roots if isinstance(root, Div)] != ["a word"]
 
@@ -166,7 +166,7 @@ def test_requests_without_websocket_do_not_count_as_viewers(
 def low_limits(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Lower the limits of the server that `url` starts."""
     timings.page_request = 0.3
-    monkeypatch.setattr("nedbus.web.server._MAX_CONNECTIONS", 3)
+    monkeypatch.setattr("nedbus.limits.PAGE_CONNECTIONS", 3)
     _log_once.cache_clear()
 
 

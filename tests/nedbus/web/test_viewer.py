@@ -86,10 +86,10 @@ def test_incremental_tracks_equal_those_of_a_new_viewer(
     """
     (limit, step), points = budget, 60
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"_MAX_POINTS": limit, "_MIN_TRACK_POINTS": 6}.items():
-            patch.setattr(f"nedbus.web.column_data.{name}", value)
-        histories: dict[Address, Track] = {
-            Address(*name): (History(points, 0.1), number)
+        patch.setattr("nedbus.limits.PAGE_TRACK_POINTS", limit)
+        patch.setattr("nedbus.web.column_data._LEAST_POINTS", 6)
+        histories = {
+            Address(*name): Track(History(points, 0.1), number)
             for number, name in enumerate((("a", VLP), ("b", VLP), ("c", TRUTH)))
         }
         tracks, fresh = Tracks(), Tracks()
@@ -126,7 +126,7 @@ def data_sent(document: Document) -> list[Any]:
 def tracks_of(sim: SimulatedFleet) -> dict[Address, Track]:
     """Return the last minute of all streams, each with its own colour."""
     return {
-        address: (stream.minute, number)
+        address: Track(stream.minute, number)
         for number, (address, stream) in enumerate(sim.fleet.streams.items())
     }
 

@@ -10,10 +10,10 @@ from typing import Annotated, Final
 
 import typer
 
-from nedbus import Bus, Sample, __version__
+from nedbus import Bus, Sample, __version__, limits
 from nedbus.cli.absence import describe_outdated
 from nedbus.cli.options import JsonOption, command
-from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
+from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.clock import format_duration
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
@@ -74,15 +74,16 @@ def health(
     for name in required:
         check_vehicle(name)
     estimates = _parse_names("--valid", valid)
-    if unknown := [each for each in estimates if each not in VALID]:
-        raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
+    for estimate in estimates:
+        if estimate not in VALID:
+            raise ConfigError("--valid", f"{estimate!r}: expected a list of {', '.join(VALID)}")
     check = _Check(
         bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within)
     )
     faults = [*check.service_faults(), *check.vehicle_faults()]
     for remark in check.outdated:
         if remark not in faults:
-            write_stderr(to_text(f"nedbus: {remark}", MAX_TEXT))
+            write_stderr(to_text(f"nedbus: {remark}", limits.LINE_TEXT))
     if json_output:
         counts = {
             "services": len(check.services),
@@ -101,16 +102,16 @@ def health(
         )
     if faults:
         for fault in faults[:-1]:
-            write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
+            write_stderr(to_text(f"nedbus: {fault}", limits.LINE_TEXT))
         raise NedbusError(faults[-1])
     if not json_output:
         newest = (
             f"{format_duration(min(check.ages.values()))} old" if check.ages else "of unknown age"
         )
-        found = (
-            f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
-        )
-        write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest}")
+        services_text = counted(len(check.services), "service")
+        sources_text = counted(len(check.sources), "source")
+        vehicles_text = counted(len(check.ages), "vehicle")
+        write(f"{services_text}, {sources_text}, {vehicles_text}, newest message {newest}")
 
 
 def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
@@ -141,12 +142,14 @@ class _Check:
         self._routers = " or ".join(bus.routers)
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self._statuses = [
-            each for each in bus.services() if not self._is_local or each.host == _HOST
+            status for status in bus.services() if not self._is_local or status.host == _HOST
         ]
-        self.services = dict.fromkeys(each.service for each in self._statuses)
+        self.services = dict.fromkeys(status.service for status in self._statuses)
         self.outdated = describe_outdated(self._statuses)
         self.sources = {
-            (each.service, source.source) for each in self._statuses for source in each.sources
+            (status.service, source.source)
+            for status in self._statuses
+            for source in status.sources
         }
         # A source occurs once for each of its vehicles.
         self._sources = [source for status in self._statuses for source in status.sources]
@@ -176,7 +179,8 @@ class _Check:
             latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]
             refused = {name for status in self._statuses for name in status.refused}
             self._is_refused = (vehicle in self.ages or vehicle in refused) and not latencies
-            measured = min((max(0.0, each) for each in latencies if each is not None), default=None)
+            known = [max(0.0, latency) for latency in latencies if latency is not None]
+            measured = min(known, default=None)
             newest = self.ages.get(vehicle, measured)
             self.ages = {vehicle: newest} if latencies and newest is not None else {}
 
@@ -196,16 +200,19 @@ class _Check:
         elif failed and self._vehicle is None:
             source = failed[0]
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
-        elif overloaded := [each for each in self._sources if each.overload]:
+        elif overloaded := [source for source in self._sources if source.overload]:
             yield f"{to_text(overloaded[0].source)}: {to_text(overloaded[0].overload, 300)}"
         elif not self.ages and (
             self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)
         ):
             texts = (
-                f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self._sources
+                f"{to_text(source.source, 60)} is {to_text(source.state, 20)}"
+                for source in self._sources
             )
             states = ", ".join(dict.fromkeys(texts))
-            others = sorted({each.vehicle for each in self._publishers} - {self._vehicle})[:20]
+            others = sorted({address.vehicle for address in self._publishers} - {self._vehicle})[
+                :20
+            ]
             only = f" (published: {', '.join(others)})" if others and not self._is_refused else ""
             what = (
                 f"vehicle {self._vehicle} is not published{only}"
@@ -214,7 +221,7 @@ class _Check:
             )
             yield f"{what}{_REFUSED if self._is_refused else f': {states[:300]}' if states else ''}"
         elif self.ages and min(self.ages.values()) > self._max_age:
-            name = min(self.ages, key=lambda each: self.ages[each])
+            name = min(self.ages, key=self.ages.__getitem__)
             age = format_duration(self.ages[name])
             yield f"the newest message is {age} old, from vehicle {name}: the limit is {self._max_age:g} s"
 
@@ -311,14 +318,16 @@ def doctor(
     )
     state = worst_state(findings)
     if json_output:
-        write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
+        write(json.dumps({"state": state, "findings": [asdict(finding) for finding in findings]}))
     else:
-        for each in findings:
-            name = f"{each.check} {each.subject}".rstrip(" :")
-            write(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
-            if each.advice:
-                write(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
-        counts = Counter(each.state for each in findings)
+        for finding in findings:
+            name = f"{finding.check} {finding.subject}".rstrip(" :")
+            write(
+                fold(f"{finding.state:<8} ", to_text(f"{name}: {finding.seen}", limits.LINE_TEXT))
+            )
+            if finding.advice:
+                write(fold(f"{'':<8} -> ", to_text(finding.advice, limits.LINE_TEXT)))
+        counts = Counter(finding.state for finding in findings)
         write(f"\n{', '.join(f'{count} {name}' for name, count in counts.items())}")
     if state == "wrong":
         raise typer.Exit(1)
@@ -341,11 +350,10 @@ def check(
     mistakes = [] if files else check_service(offline=offline)
     for file in files or ():
         is_toml = file.suffix == ".toml"
-        mistakes += (
-            check_service(file, offline=offline)
-            if is_toml
-            else check_router_file(file, offline=offline)
-        )
+        if is_toml:
+            mistakes += check_service(file, offline=offline)
+        else:
+            mistakes += check_router_file(file, offline=offline)
     report_mistakes(mistakes)
 
 

@@ -24,7 +24,7 @@ from nedbus.cli.output.samples import CsvLines, Lines, to_fields, to_json
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus_msgs import Address, Selection, check_max_rate
 
-_MAX_RATE: Final = "Downsample each stream at its publisher to this rate, in Hz"
+_RATE: Final = "Downsample each stream at its publisher to this rate, in Hz"
 _EVERY: Final = (
     "Print every message in order; a replay at speed=max waits for this terminal or pipe"
 )
@@ -45,7 +45,7 @@ def echo(
     interval: Annotated[
         float, typer.Option(min=0.0, help="Minimum time between messages of a stream, in s")
     ] = 0.0,
-    max_rate: Annotated[float | None, typer.Option(metavar="HZ", help=_MAX_RATE)] = None,
+    max_rate: Annotated[float | None, typer.Option(metavar="HZ", help=_RATE)] = None,
     once: Annotated[
         bool, typer.Option("--once", help="Stop after one message, same as --count 1")
     ] = False,

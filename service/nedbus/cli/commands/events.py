@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 import nedbus
+from nedbus import limits
 from nedbus.cli.options import (
     CsvOption,
     DurationOption,
@@ -36,7 +37,6 @@ _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
     "author",
 )  # fmt: skip
-_MAX_TEXT: Final = 400  # characters of a peer's text
 _WITHIN: Final = "First show the events of the last SECONDS"
 _ORIGIN: Final = "PX4's own log messages, or events derived by nedbus"
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
@@ -170,7 +170,7 @@ def why(
             write(json.dumps({"vehicle": name} | _verdict_fields(verdict)))
             continue
         faults += len(verdict.stories)
-        texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
+        texts.append(fold(f"{name}: ", to_text(verdict.text, limits.LINE_TEXT)))
         if details:
             texts += ["\n".join(_describe(verdict, story, advice)) for story in verdict.stories]
             if verdict.others:
@@ -210,7 +210,7 @@ def _require_history(
 def _name_unreported(bus: "Bus", vehicles: Sequence[str]) -> None:
     """Name vehicles that are published, but about which no service reports, and older services."""
     if vehicles:
-        names = to_text(", ".join(vehicles), _MAX_TEXT)
+        names = to_text(", ".join(vehicles), limits.LINE_TEXT)
         write_stderr(
             f"no verdict on {names}: published, but no nedbus service keeps the event history"
         )
@@ -226,10 +226,13 @@ def _name_outdated(bus: "Bus") -> None:
 
 def _describe(verdict: Verdict, story: Story, advice: str) -> Iterator[str]:
     times = verdict.times
-    yield fold(f"{verdict.vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {verdict.period(story)}")
+    yield fold(
+        f"{verdict.vehicle}: ", f"{to_text(story.what, limits.LINE_TEXT)} {verdict.period(story)}"
+    )
     sections = {"evidence": story.before, "meanwhile": story.meanwhile}
     if story.end is not None:
-        sections[f"ended at {times.text(story.end)}{' with' * bool(story.after)}"] = story.after
+        with_events = " with" if story.after else ""
+        sections[f"ended at {times.text(story.end)}{with_events}"] = story.after
     for title, shown in sections.items():
         if shown or title.startswith("ended"):
             yield f"  {title}"
@@ -255,7 +258,7 @@ _ADVICE: Final = {
 
 def to_line(event: Event, times: Times) -> str:
     """Format an event as one line: time, vehicle, severity, text and evidence."""
-    evidence = ", ".join(_before(each, event.time) for each in event.evidence)
+    evidence = ", ".join(_before(cause, event.time) for cause in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
     return fold(
@@ -265,7 +268,7 @@ def to_line(event: Event, times: Times) -> str:
 
 
 def _shown(event: Event) -> str:
-    return to_text(event.words, _MAX_TEXT)
+    return to_text(event.words, limits.LINE_TEXT)
 
 
 def _timed(event: Event, times: Times, since: float | None = None) -> str:
@@ -322,9 +325,9 @@ def _to_fields(event: Event, times: Times) -> dict[str, object]:
         None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
     )
     evidence = [
-        {"kind": each.kind, "change": each.change, "text": each.text, "topic": each.topic,
-         "before": round(event.time - each.time, 3)}
-        for each in event.evidence
+        {"kind": cause.kind, "change": cause.change, "text": cause.text, "topic": cause.topic,
+         "before": round(event.time - cause.time, 3)}
+        for cause in event.evidence
     ]  # fmt: skip
     return (
         {"time": time, "clock": times.clock(event)}
@@ -336,7 +339,7 @@ def _to_fields(event: Event, times: Times) -> dict[str, object]:
 def _to_csv(event: Event, times: Times) -> str:
     fields = _to_fields(event, times)
     fields["evidence"] = "; ".join(
-        f"{each.kind} {event.time - each.time:.1f} s" for each in event.evidence
+        f"{cause.kind} {event.time - cause.time:.1f} s" for cause in event.evidence
     )
     fields["numbers"] = json.dumps(dict(event.numbers)) if event.numbers else ""
     return csv_line([fields[name] for name in _HEAD])
@@ -348,11 +351,11 @@ def _verdict_fields(verdict: Verdict) -> dict[str, object]:
 
     faults = [
         {
-            "what": each.what, "begin": fields([each.begin])[0], "end": fields([each.end])[0],
-            "lasted": None if each.until is None else each.until - each.since, "before": fields(each.before),
-            "meanwhile": fields(each.meanwhile), "after": fields(each.after), "lacking": each.lacking,
+            "what": story.what, "begin": fields([story.begin])[0], "end": fields([story.end])[0],
+            "lasted": None if story.until is None else story.until - story.since, "before": fields(story.before),
+            "meanwhile": fields(story.meanwhile), "after": fields(story.after), "lacking": story.lacking,
         }
-        for each in verdict.stories
+        for story in verdict.stories
     ]  # fmt: skip
     begin, end = fields([verdict.begin, verdict.end])
     head = {
@@ -370,7 +373,7 @@ def _require_vehicles(where: object, names: Collection[str], vehicles: Collectio
         if vehicle in names:
             continue
         check_vehicle(vehicle)
-        known = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT)
+        known = to_text(", ".join(sorted(names)[:20]), limits.LINE_TEXT)
         raise ConfigError(
             "--vehicle", f"no vehicle {vehicle} in {where}{known and f': choose one of {known}'}"
         )

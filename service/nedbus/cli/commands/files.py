@@ -1,5 +1,6 @@
 """Commands for files: convert, plot."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -11,6 +12,7 @@ from nedbus.cli.options import InstanceOption, VehiclesOption, command, parse_fi
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.output.table import show_progress
 from nedbus.errors import ConfigError, SourceError
+from nedbus.health import Event, EventHistory
 from nedbus.vehicle_events import KINDS
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
@@ -71,18 +73,18 @@ def plot(
     ] = None,
 ) -> None:
     """Plot flights: track, height, speed, flags, resets and events; or fields over time."""
-    draw, limit = tables.draw, tables.MAX_STREAMS
-    selection, name = Selection(topic, vehicle or ANY, instance), ", ".join(map(str, sources))
+    draw = tables.draw  # names a missing package before the files are read
+    name = ", ".join(map(str, sources))
+    selection = Selection(topic, vehicle or ANY, instance)
     fields = parse_fields(field, selection)
     is_position = topic in (ANY, *DEFAULT.topics)
     if not fields and not is_position:
         positions = " or ".join(DEFAULT.topics)
-        raise ConfigError(
-            "--topic", f"{topic} has no track; name fields with --field, or plot {positions}"
-        )
-    flight, selected = tables.read_plotted(
-        sources, selection, DEFAULT.topics if is_position else [topic]
-    )
+        problem = f"{topic} has no track; name fields with --field, or plot {positions}"
+        raise ConfigError("--topic", problem)
+    topics = DEFAULT.topics if is_position else [topic]
+    flight, selected = tables.read_plotted(sources, selection, topics)
+    limit = len(tables.STREAM_COLORS)
     if len(selected) > limit:
         write_stderr(
             f"{name}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i"
@@ -98,13 +100,7 @@ def plot(
         raise SourceError(name, "nothing to plot: the selected streams have no valid message")
     target = output or sources[0].with_suffix(".png")
     history = nedbus.events(sources)
-    held = (condition for vehicle in history.vehicles.values() for condition in vehicle.held)
-    initial = [
-        condition.begin
-        for condition in held
-        if condition.initial and not KINDS[condition.kind].usual
-    ]
-    events = [*dict.fromkeys(initial), *history.events]
+    events = [*_initial_events(history), *history.events]
     title = ", ".join(source.name for source in sources)
     if fields:
         tables.draw_fields(streams, fields, target, title=title, events=events, times=history.times)
@@ -112,6 +108,16 @@ def plot(
         draw(streams, target, title=title, events=events, times=history.times)
     write(str(target))
     _require_undamaged(flight.damaged, sources, "plotted")
+
+
+def _initial_events(history: EventHistory) -> Iterable[Event]:
+    """Return the unusual conditions that were active before the first message, each once."""
+    events: dict[Event, None] = {}
+    for vehicle in history.vehicles.values():
+        for condition in vehicle.held:
+            if condition.initial and not KINDS[condition.kind].usual:
+                events[condition.begin] = None
+    return events
 
 
 def _require_undamaged(is_damaged: bool, sources: list[Path], what: str) -> None:

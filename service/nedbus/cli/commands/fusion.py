@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 import nedbus
+from nedbus import limits
 from nedbus.cli.options import (
     DurationOption,
     FilesArgument,
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from nedbus import Bus, Sample
     from nedbus.health import PositionStatus
 
-_MAX_TEXT: Final = 1000  # characters of a report, parts of which peers wrote
 _STATUS_INTERVAL: Final = 1.0  # s between two queries of what is sent
 
 
@@ -99,6 +99,6 @@ def _show(changes: Iterator[tuple[float, Fusion]], *, json_output: bool) -> None
             write(json.dumps({"time": seconds} | asdict(report)))
             continue
         for line in report.lines:
-            write(fold(f"{report.vehicle}: {seconds:.1f} s: ", to_text(line, _MAX_TEXT)))
+            write(fold(f"{report.vehicle}: {seconds:.1f} s: ", to_text(line, limits.LINE_TEXT)))
     if not json_output:
         write_stderr("times: seconds since the boot of the vehicle")

@@ -96,8 +96,11 @@ def _states(bus: Bus, monitor: Monitor) -> Iterator[tuple[Address, Health, Strea
 def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
     rate = "-" if health.rate is None else f"{health.rate:.1f}"
     jitter = "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms"
-    latencies = (
-        None if health.rate is None else each for each in (health.latency, health.latency_max)
-    )
-    ages = ("-" if each is None else format_duration(each) for each in latencies)
-    return [str(address), rate, jitter, *ages, str(health.lost), describe_stream(health, state)]
+    latencies = []
+    for latency in (health.latency, health.latency_max):
+        if latency is None or health.rate is None:
+            latencies.append("-")
+        else:
+            latencies.append(format_duration(latency))
+    state_text = describe_stream(health, state)
+    return [str(address), rate, jitter, *latencies, str(health.lost), state_text]

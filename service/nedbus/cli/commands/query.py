@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus import Bus
+from nedbus import Bus, limits
 from nedbus.cli.absence import explain_absence
 from nedbus.cli.options import (
     POSITIONS,
@@ -65,10 +65,8 @@ _ABSENT: Final = {
     "not_carried": "not carried: ",
 }
 _SIMILAR: Final = 0.8  # minimum similarity of a name that counts as a misspelling
-_MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
-_MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 # shown per source: damage of its file, or the first rejection of each origin
-_MAX_WARNINGS: Final = 5
+_WARNINGS: Final = 5
 
 
 @command
@@ -158,7 +156,7 @@ def _write_left_out(service: ServiceStatus) -> None:
     """Write what a service does not publish: topics that it lacks, and copies."""
     for what, head in _ABSENT.items():
         if absent := [each for source in service.sources for each in getattr(source, what)]:
-            write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+            write(fold(head, to_text(", ".join(absent), limits.LIST_TEXT)))
     if copies := sum(source.copies for source in service.sources):
         write(
             f"left out: {copies} messages that came again, or late, over a second link to their vehicle"
@@ -174,29 +172,32 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             write(json.dumps(asdict(service)))
         return
     write(f"router    {' or '.join(bus.routers)}")
-    write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
-    for service in services[:_MAX_ROWS]:
+    write(f"vehicles  {to_text(', '.join(vehicles) or 'none', limits.LIST_TEXT)}")
+    for service in services[: limits.TABLE_ROWS]:
         write(f"\n{_head_of(service)}")
         rows = [
             [*map(to_text, (
                 each.source, each.state, each.published, each.rejected,
-                f"{'~' * any(log.gaps for log in each.log_streams)}{each.lost}", each.reboots, each.retries,
+                _lost_of(each), each.reboots, each.retries,
                 each.error or each.overload or (f"{len(each.stale)} gone" if each.stale else "-"),
             ))]
             for each in service.sources
         ]  # fmt: skip
         if rows:
-            write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
+            write(
+                to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=limits.TABLE_ROWS)
+            )
         _write_left_out(service)
-        for text in (
-            each for source in service.sources for each in source.warnings[:_MAX_WARNINGS]
-        ):
-            write(fold("warning: ", to_text(text, _MAX_VEHICLES)))
+        for text in (each for source in service.sources for each in source.warnings[:_WARNINGS]):
+            write(fold("warning: ", to_text(text, limits.LIST_TEXT)))
         for head, text in _links_of(service):
-            write(fold(f"{head}: ", to_text(text, _MAX_VEHICLES)))
+            write(fold(f"{head}: ", to_text(text, limits.LIST_TEXT)))
         if refused := service.refused:
             write(
-                fold("vehicles refused by the router: ", to_text(", ".join(refused), _MAX_VEHICLES))
+                fold(
+                    "vehicles refused by the router: ",
+                    to_text(", ".join(refused), limits.LIST_TEXT),
+                )
             )
         streams = [
             _stream_row(source, refused, each)
@@ -204,14 +205,22 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             for each in source.streams
         ]
         if streams:
-            table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
+            table = to_table(
+                _STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=limits.TABLE_ROWS
+            )
             write(f"\n{table}")
-    if len(services) > _MAX_ROWS:
-        write(counted(len(services) - _MAX_ROWS, "more service"))
+    if len(services) > limits.TABLE_ROWS:
+        write(counted(len(services) - limits.TABLE_ROWS, "more service"))
     if not services:
         write_stderr(
             "no nedbus service answers: start one with 'nedbus serve', or run 'nedbus doctor'"
         )
+
+
+def _lost_of(source: SourceStatus) -> str:
+    """Return the number of lost messages, marked if gaps in a ULog stream make it an estimate."""
+    is_estimate = any(log.gaps for log in source.log_streams)
+    return f"~{source.lost}" if is_estimate else str(source.lost)
 
 
 def _links_of(service: ServiceStatus) -> Iterator[tuple[str, str]]:

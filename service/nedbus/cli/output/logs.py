@@ -14,19 +14,18 @@ from datetime import UTC, datetime
 from types import TracebackType
 from typing import Final, TextIO
 
+from nedbus import limits
 from nedbus.errors import NedbusError
 from nedbus.log_event import EVENTS, About, about
 from nedbus_msgs.text import counted
 
 from . import LogFormat, LogLevel
-from .streams import MAX_TEXT, STRUCTURED, printable, to_text
+from .streams import STRUCTURED, printable, to_text
 
 BURST: Final = 50  # lines of one kind that may be logged at once
 PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a burst
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
-_MAX_KINDS: Final = 1000  # nedbus itself has about 40
-_MAX_TRACEBACK: Final = 20_000  # characters; the end is kept, which names the error
 _PRIORITIES: Final = (
     (logging.ERROR, 3),
     (logging.WARNING, 4),
@@ -45,12 +44,12 @@ class TextFormatter(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - overrides logging
         """Return the line without a traceback."""
-        record.message = to_text(record.message, MAX_TEXT)
+        record.message = to_text(record.message, limits.LINE_TEXT)
         return super().formatMessage(record)
 
     def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - overrides logging
         """Return the end of a traceback, with control characters escaped."""
-        return printable(super().formatException(ei)[-_MAX_TRACEBACK:])
+        return printable(super().formatException(ei)[-limits.TRACEBACK_TEXT :])
 
 
 class JsonFormatter(TextFormatter):
@@ -59,19 +58,18 @@ class JsonFormatter(TextFormatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the JSON object of a record."""
         about: About | None = getattr(record, "about", None)  # None for records of other packages
+        created = datetime.fromtimestamp(record.created, UTC)
+        text = created.isoformat(timespec="milliseconds")
         fields: dict[str, object] = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[
-                :-6
-            ]
-            + "Z",
+            "time": f"{text.removesuffix('+00:00')}Z",
             "level": record.levelname.lower(),
             "event": None,
-            "message": to_text(record.getMessage(), MAX_TEXT),
+            "message": to_text(record.getMessage(), limits.LINE_TEXT),
             "logger": record.name,
         }
         for key, value in asdict(about).items() if about else ():
             if value is not None:
-                fields[key] = to_text(value, MAX_TEXT) if isinstance(value, str) else value
+                fields[key] = to_text(value, limits.LINE_TEXT) if isinstance(value, str) else value
         if record.exc_info:
             fields["exception"] = self.formatException(record.exc_info)
         return json.dumps(fields)
@@ -137,14 +135,15 @@ class RateLimit(logging.Filter):
             return True
         kind = record.name, event, str(record.msg)
         with self._lock:
-            if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
+            if kind not in self._buckets and len(self._buckets) >= limits.LOG_KINDS:
                 kind = "", None, ""  # one bucket for all further kinds
             bucket = self._buckets.setdefault(kind, _TokenBucket(now))
             if bucket.refill(now):
                 bucket.tokens -= 1
                 return True
             if not bucket.suppressed:
-                text = f"suppressed %s like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
+                example = record.getMessage()[: limits.LINE_TEXT].replace("%", "%%")
+                text = f"suppressed %s like this one: {example}"
                 names = {
                     "name": record.name,
                     "levelno": record.levelno,
@@ -181,20 +180,21 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 
 def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     """Log to stderr, one line per record, with syslog priorities if stderr is the journal."""
-    is_journal, is_json = False, log_format == "json"
+    is_journal = False
+    is_json = log_format == "json"
     with suppress(OSError, ValueError):  # stderr is closed, or not a file
         status = os.fstat(sys.stderr.fileno())
         # see systemd.exec(5)
         is_journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
-    formatter = (
-        JsonFormatter()
-        if is_json
-        else TextFormatter("%(message)s")
-        if is_journal
-        else TextFormatter()
-    )
+    formatter: logging.Formatter = TextFormatter()
+    if is_json:
+        formatter = JsonFormatter()
+    elif is_journal:
+        formatter = TextFormatter("%(message)s")
+    if is_journal:
+        formatter = JournalFormatter(formatter)
     handler = _StderrHandler()
-    handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
+    handler.setFormatter(formatter)
     if is_journal or is_json:
         handler.name = STRUCTURED
         sys.excepthook = _log_uncaught

@@ -58,10 +58,10 @@ def log_progress(daemon: Daemon) -> Iterator[None]:
 
 def suggested_commands(endpoints: Sequence[str]) -> str:
     """Return commands to try in a second terminal; a hint if all endpoints require a client certificate."""
-    plain = [each for each in endpoints if not each.startswith(("tls/", "quic/"))]
+    plain = [endpoint for endpoint in endpoints if not endpoint.startswith(("tls/", "quic/"))]
     if not plain:
         return f"Clients of {endpoints[0]} need their own certificate, see docs/security.md"
-    here = [dial_endpoint(each) for each in plain]
+    here = [dial_endpoint(endpoint) for endpoint in plain]
     is_on_path = Path(sys.argv[0]).name != "nedbus" or shutil.which("nedbus") is not None
     program = "nedbus" if is_on_path else sys.argv[0]
     return _HINT.format(nedbus=program, where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")

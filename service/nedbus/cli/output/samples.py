@@ -19,7 +19,7 @@ from .table import COLUMN_GAP, fit_columns, terminal_width
 
 _TIMES: Final = ("timestamp", "timestamp_sample")
 _DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
-_MAX_FLAGS: Final = 8  # with their names, in a summary
+_NAMED_FLAGS: Final = 8  # in a summary; of more, the false ones are counted
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
 _MIN_PAGE: Final = 10  # minimum number of lines between two headers
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
@@ -107,10 +107,10 @@ class Lines:
 
 def _to_state(sample: Sample[Any]) -> str:
     """Return a sample's doubtful flags, or "ok"; then its age if old, and the number of messages lost before it."""
-    is_position = sample.message.DEFINITION is DEFAULT
-    return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(
-        sample
-    )
+    state = "ok"
+    if sample.message.DEFINITION is DEFAULT:
+        state = message_doubts(sample.message, sample.missing)
+    return state + _notes(sample)
 
 
 def _to_summary(message: Message) -> str:
@@ -130,7 +130,7 @@ def _to_summary(message: Message) -> str:
                 false_flags.append(f"{name} {_to_number(value, None)}")
         elif name not in _TIMES and value != kind.absent and repr(value) != repr(kind.absent):
             numbers.append(f"{name} {_to_number(value, _SUMMARY_DIGITS.get(kind.base))}")
-    if len(flags) + len(false_flags) > _MAX_FLAGS:
+    if len(flags) + len(false_flags) > _NAMED_FLAGS:
         false_flags = [f"({len(false_flags)} flags False)"] if false_flags else []
     flags += false_flags
     return "  ".join([*numbers, *flags])
@@ -214,15 +214,14 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
         digits = _DIGITS.get(types[name].base) if name in types else None
         if isinstance(value, tuple):
             row += [
-                (f"{name}[{index}]", _to_number(each, digits)) for index, each in enumerate(value)
+                (f"{name}[{index}]", _to_number(element, digits))
+                for index, element in enumerate(value)
             ]
         else:
             row.append((name, _to_number(value, digits)))
-    return (
-        [*row, ("state", message_doubts(message, sample.missing))]
-        if message.DEFINITION is DEFAULT
-        else row
-    )
+    if message.DEFINITION is DEFAULT:
+        row.append(("state", message_doubts(message, sample.missing)))
+    return row
 
 
 def _derived_fields(message: Message, fields: Sequence[str]) -> list[str]:
@@ -235,15 +234,15 @@ def _to_value(sample: Sample[Any], name: str) -> str:
     if _derived_fields(sample.message, [name]):
         return f"{derive(sample.message, name):.9g}"
     kind = sample.message.DEFINITION.types.get(name)
-    return (
-        "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
-    )
+    if kind is None:
+        return "-"
+    return _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
 
 
 def _to_number(value: object, digits: int | None) -> str:
     """Format a value, or the elements of an array, with `digits` significant digits; None: all digits."""
     if isinstance(value, tuple):
-        return " ".join(_to_number(each, digits) for each in value)
+        return " ".join(_to_number(element, digits) for element in value)
     if isinstance(value, str):
         return value.replace("\n", "\\n")
     return str(value) if digits is None else f"{value:.{digits}g}"

@@ -10,13 +10,12 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Final
 
+from nedbus import limits
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 
-MAX_TEXT: Final = 1000  # maximum number of characters of an error or log line
 # name of the log handler if the log is read by a program: JSON, or the journal
 STRUCTURED: Final = "structured"
-_MAX_CELL: Final = 120  # characters of a value from a peer
 # As listed by OWASP, with the wide forms of Japanese input.
 _FORMULA_STARTS: Final = (
     "=",
@@ -44,7 +43,7 @@ def printable(text: str) -> str:
     )
 
 
-def to_text(value: object, limit: int = _MAX_CELL) -> str:
+def to_text(value: object, limit: int = limits.CELL_TEXT) -> str:
     """Return text from a peer as one printable line, truncated to `limit` characters before they are escaped."""
     text = str(value)
     short = text if len(text) <= limit else f"{text[: limit - 3]}..."

@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final, Literal
 
+from nedbus import limits
+
 from .streams import write
 
 COLUMN_GAP: Final = "  "
 # optional columns are removed to make the last one this wide
 _LAST_WIDTH: Final = len("disconnected: no link")
 _MIN_LAST_WIDTH: Final = 16  # the first column is folded to make the last one this wide
-_MAX_ROWS: Final = 50  # rows of a live table
 _UNLIMITED: Final = 10_000  # width if stdout is not a terminal
 
 Rows = Sequence[Sequence[str]]
@@ -67,8 +68,10 @@ def to_table(
     from rich.table import Table
     from rich.text import Text
 
-    shown, width = rows[:max_rows], terminal_width() or _UNLIMITED
-    first, last = head[0], head[-1]
+    shown = rows[:max_rows]
+    width = terminal_width() or _UNLIMITED
+    first = head[0]
+    last = head[-1]
     widths = {
         name: max(map(len, (name, *cells))) for name, *cells in zip(head, *shown, strict=True)
     }
@@ -85,16 +88,17 @@ def to_table(
     drawn = io.StringIO()
     Console(file=drawn, width=width, color_system=None).print(table)
     lines = [line.rstrip() for line in drawn.getvalue().splitlines()]
-    return "\n".join(
-        [*lines, f"{len(rows) - len(shown)} more"] if len(rows) > len(shown) else lines
-    )
+    hidden = len(rows) - len(shown)
+    if hidden:
+        lines.append(f"{hidden} more")
+    return "\n".join(lines)
 
 
 @contextmanager
 def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callable[[Rows], None]]:
     """Yield a function that prints rows; on a terminal, each call redraws the table in place, below the log lines."""
     if terminal_width() is None:
-        yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=_MAX_ROWS))
+        yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=limits.LIVE_ROWS))
         return
     from rich.console import Console
     from rich.live import Live
@@ -102,7 +106,7 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
 
     def show(rows: Rows) -> None:
         # minus header and the line "N more"
-        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))
+        most = max(1, min(limits.LIVE_ROWS, shutil.get_terminal_size().lines - 3))
         text = to_table(head, rows, optional=optional, max_rows=most)
         live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 
