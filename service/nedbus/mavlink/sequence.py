@@ -1,6 +1,6 @@
 """Losses between numbered packets; no I/O, callers pass monotonic time [s]."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 _MODULUS: Final = 256  # of MAVLink's sequence
@@ -46,11 +46,17 @@ class PacketRate:
 
 @dataclass(slots=True)
 class _Link:
-    """The packets that one sender numbered for one link; `last`: the number of the last one, which came at `time`."""
+    """The packets that one sender numbered for one link; `last`: the number of the last one, which came at `time`.
+
+    A second link may be the main one, some of whose packets were overtaken: `first` is then the number of its first
+    packet, and `skipped` has the numbers that it skipped since.
+    """
 
     number: int
     last: int
     time: float
+    first: int | None = None
+    skipped: set[int] = field(default_factory=set)
 
     def step_to(self, sequence: int) -> int:
         """Return the number of packets from the last one to one with this sequence number."""
@@ -62,7 +68,8 @@ class SequenceCounter:
 
     Two modems number their packets on their own, and those of a slower link arrive late. A packet that follows no
     other one is of a second link if the main one goes on, and else the first one of a sender that restarted. Losses
-    are those of the main link.
+    are those of the main link. Packets of one link that overtake others have numbers that no other packet had: a second
+    link a few packets ahead has a number of its own once the main one sends a sequence number of it again.
 
     `link`: number of the link of the last packet, from 0; `REPEATED` if the packet came before.
     """
@@ -72,7 +79,9 @@ class SequenceCounter:
         self._main: _Link | None = None
         self._second: _Link | None = None
         self._earlier: _Link | None = None  # the main link before the last gap, which may go on
-        self._skipped = 0  # packets in that gap, which counted as lost
+        self._has_gap = False  # packets of that gap counted as lost
+        self._gap_end = 0  # the packet behind that gap
+        self._early: set[int] = set()  # packets of that gap that overtook others of it
         self._is_late = False  # the last packet was in that gap
         self._is_numbered = False  # two packets of the main link followed each other
         self._missing: set[int] = set()  # sequence numbers that the main link skipped
@@ -94,9 +103,10 @@ class SequenceCounter:
         self.link = main.number
         if main.step_to(sequence) == 1:
             self._is_numbered = True
+            self._tell_apart(main, second, sequence)
             return self._go_on(main, sequence, now)
         if second is not None and second.step_to(sequence) == 1:
-            return self._add_to_second(second, sequence, now)
+            return self._add_to_second(main, second, sequence, now)
         if earlier is not None and earlier.step_to(sequence) == 1:
             return self._add_to_earlier(main, earlier, sequence, now)
         if main.step_to(sequence) == 0:
@@ -110,6 +120,7 @@ class SequenceCounter:
             return main
         self._main = self._second = self._earlier = None
         if second is not None and now - second.time <= _SILENCE:
+            second.first = None
             self._main = second
         return self._main
 
@@ -118,10 +129,22 @@ class SequenceCounter:
         self._links += 1
         return _Link(number, sequence, now)
 
+    def _tell_apart(self, main: _Link, second: _Link | None, sequence: int) -> None:
+        """Give the second link a number of its own if the main one, with this packet, sends a number of it again."""
+        if second is None or second.first is None:
+            return
+        if main.step_to(second.first) <= main.step_to(sequence):
+            second.first = None
+            second.number = self._links
+            self._links += 1
+
     def _go_on(self, main: _Link, sequence: int, now: float) -> int:
-        lost = main.step_to(sequence) - 1
+        lost = 0
+        if main.step_to(sequence) > 1:
+            skipped = _between(main.last, sequence) - self._early
+            self._missing |= skipped
+            lost = len(skipped)
         self._missing.discard(sequence)
-        self._missing.update((main.last + skipped) % _MODULUS for skipped in range(1, lost + 1))
         main.last, main.time = sequence, now
         self._rate.add(now)
         return lost
@@ -135,31 +158,52 @@ class SequenceCounter:
             self.link = REPEATED
         return 0
 
-    def _add_to_second(self, second: _Link, sequence: int, now: float) -> int:
+    def _add_to_second(self, main: _Link, second: _Link, sequence: int, now: float) -> int:
+        """Add a packet of the second link, which replaces the main one once it shows that they are one."""
         self.link = second.number
+        if second.first is None:
+            second.last, second.time = sequence, now
+            return 0
+        second.skipped |= _between(second.last, sequence)
         second.last, second.time = sequence, now
-        return 0
+        overtaken = self._missing & _between(main.last, second.first)
+        ahead = (sequence - second.first) % _MODULUS
+        is_main_silent = ahead > _MODULUS // 2  # the rest of the overtaken packets was lost
+        if overtaken and not is_main_silent:
+            return 0
+        lost = overtaken | second.skipped
+        self._missing |= lost
+        second.first = None
+        self._main = second
+        self._second = None
+        self._rate.add(now)
+        return len(lost)
 
     def _add_to_earlier(self, main: _Link, earlier: _Link, sequence: int, now: float) -> int:
         """Add a packet that follows the main link from before the last gap.
 
         One packet may have been overtaken. If the next one follows too, there was no gap: the link went on, and the
-        packets behind the gap are those of another link.
+        packets behind the gap have overtaken several, or are those of another link.
         """
         self.link = earlier.number
         earlier.last, earlier.time = sequence, now
-        if self._skipped and not self._is_late:
+        if self._has_gap and not self._is_late:
             self._is_late = True
-            self._skipped -= 1
-            self._missing.discard(sequence)
-            return -1
-        if main.number == earlier.number:
-            main.number = self._links
-            self._links += 1
+            return self._add_late(sequence)
         self._main = earlier
         self._second = main
         self._earlier = None
-        return -self._skipped
+        if main.number != earlier.number:
+            return 0
+        gap = _between(sequence, self._gap_end)
+        self._early = gap - self._missing
+        main.first = self._gap_end
+        main.skipped = set()
+        counted = len(gap & self._missing)
+        if sequence in self._missing:
+            self._missing.discard(sequence)
+            counted += 1
+        return -counted
 
     def _add_after_gap(self, main: _Link, sequence: int, now: float) -> int:
         """Add a packet that follows none: after a loss, late, the first one of another link, or after a restart."""
@@ -169,25 +213,39 @@ class SequenceCounter:
         margin = _MARGIN if self._is_numbered else _MAX_OVERTAKEN
         is_loss = ahead <= _MODULUS // 2 and self._rate.explains(ahead - 1, now, margin=margin)
         if second is not None:
+            if second.first is not None and sequence in second.skipped:
+                second.skipped.discard(sequence)
+                self.link = second.number
+                return 0
             ahead_of_second = second.step_to(sequence)
             nearest = min(ahead_of_second, _MODULUS - ahead_of_second)
             if nearest <= _MARGIN and nearest < min(ahead, behind):
                 if nearest == ahead_of_second and nearest:
-                    return self._add_to_second(second, sequence, now)
+                    return self._add_to_second(main, second, sequence, now)
                 self.link = second.number
                 return 0
         if is_loss:
             if second is None:
-                self._earlier, self._skipped = _Link(main.number, main.last, main.time), ahead - 1
+                self._earlier = _Link(main.number, main.last, main.time)
+                self._has_gap = True
+                self._gap_end = sequence
+                self._early = set()
                 self._is_late = False
+            self._tell_apart(main, second, sequence)
             return self._go_on(main, sequence, now)
-        if behind <= _MAX_OVERTAKEN:
+        is_missing = behind <= _MARGIN and sequence in self._missing
+        if is_missing or behind <= _MAX_OVERTAKEN:
             return self._add_late(sequence)
         self._earlier = main
-        self._skipped = 0
+        self._has_gap = False
         self._is_late = False
         self._is_numbered = False
         self._main = self._new_link(sequence, now)
         self.link = self._main.number
         self._rate.add(now)
         return 0
+
+
+def _between(first: int, last: int) -> set[int]:
+    """Return the sequence numbers between two."""
+    return {(first + step) % _MODULUS for step in range(1, (last - first) % _MODULUS)}

@@ -20,6 +20,7 @@ from .boot_time import new_clock, read_time, time_since_boot
 from .fields import CONVERSIONS, HIGH_LATENCY, OF_HIGH_LATENCY, can_be_vtol, vtol_status
 from .senders import text_source
 from .sequence import REPEATED
+from .text_copies import TextCopies
 
 _log = logging.getLogger(__name__)
 
@@ -146,6 +147,7 @@ class Vehicle:
         self._last: dict[Address, tuple[int, int]] = {}
         self._delivered = RecentTimes()
         self._texts = _StatusTexts()
+        self._text_copies = TextCopies()
         self._started = now
         self._arrivals: dict[int, float] = {}  # last arrival of each requested message
         self._pending = [*self._rates] * _FIRST_ROUNDS
@@ -221,7 +223,7 @@ class Vehicle:
             return [] if item is None else [item]
         self._high_latency = now
         timestamp = self._track_time(message, now)
-        if self._is_copy(now):
+        if self._is_copy(message, now):
             self.copies += 1
             return []
         items = [
@@ -243,7 +245,7 @@ class Vehicle:
         timestamp = self._track_time(message, now)
         if timestamp is not None and self._kind is TimeKind.WILD:
             return self._rejected(topic, message, f"wild time ({timestamp // 1000} ms since boot)")
-        if self._is_copy(now):
+        if self._is_copy(message, now):
             self.copies += 1
             return None
         if (number := message.get_msgId()) in self._rates:
@@ -273,10 +275,15 @@ class Vehicle:
         # a text is discarded only now
         return self._publish(address, fields_of(message), timestamp, now, log)
 
-    def _is_copy(self, now: float) -> bool:
-        """Return whether the last message came before; one without a time did if it is of a link behind the first."""
+    def _is_copy(self, message: Any, now: float) -> bool:
+        """Return whether the last message came before.
+
+        A text did if another link delivered it; any other message without a time, if its link is behind the first.
+        """
         if self._kind is not None:
             return self._kind is TimeKind.COPY
+        if message.get_type() == "STATUSTEXT":
+            return self._text_copies.add(message, self._link, now)
         if self._link == REPEATED:
             return True
         is_led = self._first_link is not None and now - self._led <= _LINK_TIMEOUT

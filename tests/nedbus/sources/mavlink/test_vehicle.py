@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,6 +14,7 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.parser import new_parser
+from nedbus.mavlink.sequence import SequenceCounter
 from nedbus.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_stream import LogStream
@@ -20,6 +22,8 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import TOPICS, Address
 from nedbus_msgs.frames import quaternion_to_euler
 from tests.flights.messages import VLP
+
+from .receiving.test_sequence import ORDERS
 
 NEEDED = (32, 230, 33, 141, 331)  # for vehicle_local_position
 
@@ -225,6 +229,69 @@ def test_second_link_replaces_the_first_one() -> None:
     vehicle.count_lost(0, 102.0, link=1)
     assert isinstance(vehicle.handle(position(11_700), 102.0), SourceMessage)
     assert isinstance(vehicle.handle(heartbeat(), 102.0), SourceMessage)
+
+
+def numbered_texts(
+    packets: Iterable[tuple[float, int, int]], *, offset: int = 0
+) -> tuple[Counter[object], int]:
+    """Return how often each text is published, and the number of copies, of packets that arrive over two links.
+
+    Each packet has its time of arrival, its number and its link. Each tenth one is a text that names its number, the
+    others are positions; the second link numbers its packets from `offset`.
+    """
+    vehicle, counter, texts = new_vehicle("*"), SequenceCounter(), Counter[object]()
+    for now, number, link in packets:
+        lost = counter.add((number + offset * link) % 256, now)
+        vehicle.count_lost(lost, now, link=counter.link)
+        message = position(10_000 + 10 * number)
+        if number % 10 == 5:
+            message = chunk(b"text %d" % number, 0)
+        for each in vehicle.handle_all(message, now):
+            if isinstance(each, SourceMessage) and each.address.topic == "log_message":
+                texts[each.fields["text"]] += 1
+    return texts, vehicle.copies
+
+
+@pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
+def test_texts_of_a_link_with_overtaken_packets_are_published(order: list[int]) -> None:
+    """No text is left out as a copy because packets of its link overtook others."""
+    texts, copies = numbered_texts(
+        (100 + place / 100, number, 0) for place, number in enumerate(order)
+    )
+    assert len(texts) == 60
+    assert set(texts.values()) == {1}
+    assert copies == 0
+
+
+@pytest.mark.parametrize("offset", [0, 5, 60, 250])
+@pytest.mark.parametrize("late", [0.001, 0.3, 1.0])
+def test_texts_of_two_links_are_published_once(late: float, offset: int) -> None:
+    """A text that comes over two links, one of them late, is published once; one that a link lost, by the other one.
+
+    Where the second link begins, its packets may be those of the first one in another order.
+    """
+    packets = []
+    for number in range(1500):
+        now = 100 + number / 100
+        if number % 30 != 5:
+            packets.append((now, number, 0))
+        if number % 30 != 15 and number > 200:
+            packets.append((now + late, number, 1))
+    texts, copies = numbered_texts(sorted(packets), offset=offset)
+    between = [texts[f"text {number}"] for number in range(245, 1400, 10)]
+    assert between == [1] * 116
+    assert copies > 1000
+
+
+def test_repeated_text_of_two_links_is_published_as_often_as_it_was_sent() -> None:
+    """A vehicle that sends a text twice within a second sends it twice over each link: it is published twice."""
+    vehicle, published = new_vehicle("*"), 0
+    for now, link in ((100.0, 0), (100.3, 1), (100.5, 0), (100.8, 1)):
+        vehicle.count_lost(0, now, link=link)
+        vehicle.handle(position(round(1000 * now - 90_000 - 300 * link)), now)
+        published += isinstance(vehicle.handle(chunk(b"Preflight Fail", 0), now), SourceMessage)
+    assert published == 2
+    assert vehicle.copies == 2 + 2
 
 
 def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:

@@ -161,3 +161,72 @@ def test_packet_that_came_twice_is_marked() -> None:
     for _ in range(3):
         counter.add(0, 100.0)
         assert counter.link == 0
+
+
+ORDERS = {
+    "one packet overtakes two": [*range(200), 202, 200, 201, *range(203, 600)],
+    "two swap": [*range(200), 201, 200, *range(202, 600)],
+    "a block overtakes a block": [*range(200), *range(206, 212), *range(200, 206), *range(212, 600)],
+    "two blocks alternate": [*range(200), 205, 200, 206, 201, 202, 207, 203, 204, *range(208, 600)],
+    "the first of a block comes late": [*range(200), 205, 201, 202, 200, 203, 204, *range(206, 600)],
+    "a block around 255": [*range(250), *range(258, 262), *range(250, 258), *range(262, 600)],
+    "one packet in ten": [k + (2 if k % 10 == 4 else -1 if k % 10 in (5, 6) else 0) for k in range(600)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)
+def test_overtaken_packets_are_of_the_same_link(order: list[int]) -> None:
+    """Packets of one link that arrive in another order are neither lost nor those of a second link."""
+    counter, lost = SequenceCounter(), 0
+    assert sorted(order) == list(range(600))
+    for place, number in enumerate(order):
+        lost += counter.add(number % 256, 100 + place / 100)
+        assert counter.link == 0
+    assert lost == 0
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.02])
+def test_shuffled_blocks_are_of_the_same_link(loss: float) -> None:
+    """Blocks of up to 16 packets in random order, with losses: all are of one link, and the losses are counted."""
+    rng, kept, shuffled = random.Random(7), list[int](), list[int]()
+    for number in range(6000):
+        if number < 50 or rng.random() >= loss:
+            kept.append(number)
+    while kept:
+        size = rng.choice([1, 1, 1, 1, 3, 8, 16])
+        block = kept[:size]
+        del kept[:size]
+        if len(shuffled) > 50:
+            rng.shuffle(block)
+        shuffled += block
+    counter, lost = SequenceCounter(), 0
+    for place, number in enumerate(shuffled):
+        lost += counter.add(number % 256, 100 + place / 100)
+        assert counter.link == 0
+    assert lost == pytest.approx(6000 - len(shuffled), abs=6000 * 0.005)
+
+
+def test_second_link_a_few_packets_ahead_is_told_apart() -> None:
+    """A second link that numbers its packets from 5 more: as soon as a number comes twice, it is a link of its own."""
+    counter, links = SequenceCounter(), {0: set[int](), 1: set[int]()}
+    for number in range(300):
+        assert counter.add(number % 256, 100 + number / 100) == 0
+    lost = 0
+    for number in range(300, 900):
+        for link, offset in ((0, 0), (1, 5)):
+            lost += counter.add((number + offset) % 256, 100 + number / 100 + 0.001 * link)
+            if number > 320:
+                links[link].add(counter.link)
+    assert lost == 0
+    assert [len(each) for each in links.values()] == [1, 1]
+    assert links[0].isdisjoint(links[1])
+
+
+def test_packets_after_a_gap_that_is_never_filled_are_of_the_same_link() -> None:
+    """If packets of an overtaken block are lost, the link goes on behind the block, and 200 packets are no new link."""
+    order = [*range(200), 206, 200, 201, *range(207, 800)]
+    counter, lost = SequenceCounter(), 0
+    for place, number in enumerate(order):
+        lost += counter.add(number % 256, 100 + place / 100)
+        assert counter.link == 0
+    assert lost == 4
