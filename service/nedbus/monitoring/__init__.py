@@ -5,15 +5,25 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .access import why_refused
-from .http_server import HttpServer, Page
 from .live_events import LinkLosses, LiveEvents
 from .observer import Observer, Snapshot
-from .pages import service_pages, why_not_ready
+from .readiness import why_not_ready
 
 if TYPE_CHECKING:
     from .exporter import Exporter
+    from .http_server import HttpServer, Page
+    from .pages import service_pages
 else:
-    __getattr__ = lazy_exports(__name__, {"Exporter": ("metrics", "exporter")})
+    # The HTTP server of the standard library takes 2 MB, which a service without --http saves.
+    __getattr__ = lazy_exports(
+        __name__,
+        {
+            "Exporter": ("metrics", "exporter"),
+            "HttpServer": ("", "http_server"),
+            "Page": ("", "http_server"),
+            "service_pages": ("", "pages"),
+        },
+    )
 
 __all__ = [
     "Exporter",

@@ -58,7 +58,7 @@ Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 class Options(BaseModel):
     """Options shared by all kinds of source."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     topics: Annotated[tuple[str, ...], BeforeValidator(_parse_topics)] = Field(
         (), description="topic or message names, separated by commas, or * for all"

@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -21,15 +21,10 @@ from nedbus.cli.output.progress import log_progress
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
 from nedbus.daemon import SOURCE_FORMS, Daemon, run_router
-from nedbus.doctor import check_service
 from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
-
-from .bridges import serve_pages
-from .checks import report_mistakes
 
 _log = logging.getLogger("nedbus")
 _SOURCES = f"Source to publish: {', '.join(SOURCE_FORMS)}, with ?OPTION=VALUE&...; repeatable"
@@ -77,15 +72,21 @@ def serve(
     """
     given = {name: value for name, value in locals().items() if name not in {"config", "check"}}
     if check:
+        from nedbus.doctor import check_service
+
+        from .checks import report_mistakes
+
         report_mistakes(check_service(config, given))
         return
     settings = load_settings(config, **given)
     daemon = Daemon(settings, version=__version__)
-    pages = (
-        serve_pages(settings.http, service_pages(daemon))
-        if settings.http is not None
-        else nullcontext()
-    )
+    pages: AbstractContextManager[object] = nullcontext()
+    if settings.http is not None:
+        from nedbus.monitoring import service_pages
+
+        from .bridges import serve_pages
+
+        pages = serve_pages(settings.http, service_pages(daemon))
     progress = log_progress(daemon)
     with pages, Notifier(daemon) as notifier:
 
