@@ -50,14 +50,40 @@ class SensorGps(Message):
         Topic("vehicle_gps_position", 50.0, "the GNSS selector or blending"),
     )
     LAYOUTS = (
-        Layout("1.13", """1.14, without timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
-            selected_rtcm_instance, automatic_gain_control: jamming_indicator"""),
-        Layout("1.14", """1.15, without latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m rtcm_crc_failed
-            rtcm_msg_used, device_id: lat lon alt alt_ellipsoid"""),
-        Layout("1.15", "1.17, without authentication_state system_error"),
-        Layout("1.17", "1.18, without antenna_offset_x antenna_offset_y antenna_offset_z"),
+        Layout(
+            "1.13",
+            base="1.14",
+            without="""
+                timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
+                selected_rtcm_instance
+            """,
+            insert_after={
+                "automatic_gain_control": "jamming_indicator",
+            },
+        ),
+        Layout(
+            "1.14",
+            base="1.15",
+            without="""
+                latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m
+                rtcm_crc_failed rtcm_msg_used
+            """,
+            insert_after={
+                "device_id": "lat lon alt alt_ellipsoid",
+            },
+        ),
+        Layout(
+            "1.15",
+            base="1.17",
+            without="authentication_state system_error",
+        ),
+        Layout(
+            "1.17",
+            base="1.18",
+            without="antenna_offset_x antenna_offset_y antenna_offset_z",
+        ),
         Layout("1.18", "*"),
-    )  # fmt: skip
+    )
     OLDER = (
         RenamedField(
             "lat", "latitude_deg", lambda lat: lat / 1e7, lambda deg: _integer(deg, 1e7), "int32"
