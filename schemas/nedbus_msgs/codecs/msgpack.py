@@ -6,7 +6,6 @@ Any other valid msgpack encoding of the array is decoded as well.
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Generic, NamedTuple, cast
 
 import msgpack
@@ -85,7 +84,6 @@ def _array_of(value: FullWidth, length: int) -> FullWidth:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Codec(Generic[M]):
     """The codec of one message.
 
@@ -94,141 +92,159 @@ class Codec(Generic[M]):
     `offsets`: field, array index and payload offset of every value.
     `encode_flat(values)`: return the payload of valid values, flattened by the validation; raise OverflowError for one
     beyond the range of its float32 field.
-
-    `encode(message)`: return the payload of a message; float32 fields are rounded.
-    Raises EncodeError for a value that does not fit its field, in a message whose validation was bypassed.
-    `encode_fields(fields)`: validate fields and return their payload, without building a model.
-    Raises InvalidMessageError for an invalid message.
-    `encode_row(values)`: the same for the values of all fields in order.
-    Also raises EncodeError for a wrong number of values.
-    `decode(payload, newer=...)`: return the validated message of a payload.
-    Raises UnknownLayoutError for a layout number that is neither known nor in `newer`, DecodeError for any other
-    invalid payload: wrong types or lengths, missing or trailing bytes, values that the model rejects.
-    `decode_row(payload, newer=...)`: the same, as a Row.
     """
 
-    definition: Definition[M]
-    size: int
-    tags: int
-    tag_mask: int
-    offsets: tuple[tuple[str, int, int], ...]
-    encode_flat: Callable[[Values], bytes]
-    encode: Callable[[M], bytes]
-    encode_fields: Callable[[Mapping[str, object]], bytes]
-    encode_row: Callable[[Sequence[object]], bytes]
-    decode: Callable[..., M]
-    decode_row: Callable[..., M]
+    __slots__ = (
+        "_all_fields",
+        "_by_name",
+        "_decode_full_width",
+        "_flatten",
+        "_make_row",
+        "_validation",
+        "definition",
+        "encode_flat",
+        "offsets",
+        "size",
+        "tag_mask",
+        "tags",
+    )
+
+    def __init__(self, definition: Definition[M]) -> None:
+        self.definition = definition
+        form, self.offsets = _payload_form(definition.types, cast("int", definition.current.wire))
+        self.size = len(form.tags)
+        self.tags = int.from_bytes(form.tags, "big")
+        all_bits = (1 << 8 * self.size) - 1
+        self.tag_mask = all_bits ^ int.from_bytes(form.bits, "big")
+        self._validation = definition.validation
+        self._flatten = self._validation.flatten
+        self._by_name = self._validation.by_name
+        self._all_fields = definition.all_fields
+        self._make_row = definition.row
+        packed = struct.Struct(">" + form.code)
+        self.encode_flat = self._encoder(packed)
+        self._decode_full_width = self._decoder(packed)
+
+    # The two functions of every message are closures, because that avoids attribute access on the hot path.
+
+    def _encoder(self, packed: struct.Struct) -> Callable[[Values], bytes]:
+        pack = packed.pack
+        from_bytes = int.from_bytes
+        size = self.size
+        tags = self.tags
+
+        def encode_flat(values: Values) -> bytes:
+            # The packed struct has zeros for the tags, and `tags` has zeros for the values.
+            return (from_bytes(pack(*values), "big") | tags).to_bytes(size, "big")
+
+        return encode_flat
+
+    def _decoder(self, packed: struct.Struct) -> Callable[[bytes], Values | None]:
+        from_bytes = int.from_bytes
+        size = self.size
+        tags = self.tags
+        tag_mask = self.tag_mask
+        passes_rules = self._validation.passes_rules
+        unflatten = self._validation.unflatten
+        has_text = self.definition.has_text
+        unpack = msgpack.unpackb
+
+        def decode_full_width(payload: bytes) -> Values | None:
+            """Decode a payload in the form that `encode` writes; return None for any other, or a broken rule."""
+            if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
+                return None
+            # The tags prove type and range of every value; only the rules are left to check.
+            row: Values
+            if has_text:  # which ends at the first NUL, and may contain invalid UTF-8
+                values = (from_bytes(payload, "big") ^ tags).to_bytes(size, "big")
+                row = unflatten(packed.unpack(values))
+            else:
+                row = unpack(payload, use_list=False)[1:]
+            return row if passes_rules(row) else None
+
+        return decode_full_width
+
+    def encode(self, message: M) -> bytes:
+        """Return the payload of a message; float32 fields are rounded.
+
+        Raises EncodeError for a value that does not fit its field, in a message whose validation was bypassed.
+        """
+        try:
+            return self.encode_flat(self._flatten(tuple(message.__dict__.values())))
+        except (struct.error, OverflowError, TypeError) as exc:
+            raise EncodeError(str(exc), self.definition.name) from exc
+
+    def encode_fields(self, fields: Mapping[str, object]) -> bytes:
+        """Validate fields and return their payload, without building a model.
+
+        Raises InvalidMessageError for an invalid message.
+        """
+        row = self._validation.row_of(fields)
+        if row is None:
+            return self.encode(self._to_model(fields))
+        return self._encode_valid(row)
+
+    def encode_row(self, values: Sequence[object]) -> bytes:
+        """Validate the values of all fields in order, and return their payload.
+
+        Raises InvalidMessageError for an invalid message, EncodeError for a wrong number of values.
+        """
+        values = tuple(values)
+        count = len(self.definition.names)
+        if len(values) != count:
+            raise EncodeError(f"{len(values)} values, expected {count}", self.definition.name)
+        row = self._validation.check_row(values)
+        if row is None:
+            return self.encode(self._to_model(self._by_name(values)))
+        return self._encode_valid(row)
+
+    def _encode_valid(self, row: Values) -> bytes:
+        try:
+            return self.encode_flat(self._flatten(row))
+        except OverflowError:  # beyond float32; the model raises the error
+            return self.encode(self._to_model(self._by_name(row)))
+
+    def _to_model(self, fields: Mapping[str, object]) -> M:
+        try:
+            return self.definition.model.model_validate(dict(fields))
+        except ValidationError as exc:
+            details = exc.errors(include_url=False)
+            violations = [(str(detail["loc"][0]), detail["msg"]) for detail in details]
+            reason = describe(exc, self.definition)
+            raise InvalidMessageError(reason, violations, message=self.definition.name) from exc
+
+    def decode(self, payload: bytes, *, newer: NewerLayouts | None = None) -> M:
+        """Return the validated message of a payload; `newer`: layouts unknown to this version.
+
+        Raises UnknownLayoutError for a layout number that is neither known nor in `newer`, DecodeError for any other
+        invalid payload: wrong types or lengths, missing or trailing bytes, values that the model rejects.
+        """
+        row = self._decode_full_width(payload)
+        if row is None:
+            return self._decode_any(payload, newer)
+        model = self.definition.model
+        return fill(model.__new__(model), self._by_name(row), self._all_fields)
+
+    def decode_row(self, payload: bytes, *, newer: NewerLayouts | None = None) -> M:
+        """Return the same as a Row, which type checkers treat as the message."""
+        row = self._decode_full_width(payload)
+        if row is None:
+            row = tuple(self._decode_any(payload, newer).__dict__.values())
+        return cast("M", tuple.__new__(self._make_row, row))
+
+    def _decode_any(self, payload: bytes, newer: NewerLayouts | None) -> M:
+        """Decode any msgpack encoding of any known layout."""
+        fields = _unpack_fields(self.definition, payload, newer or {})
+        try:
+            return upgrade_with(self.definition, fields)
+        except ValidationError as exc:
+            raise DecodeError(describe(exc, self.definition), self.definition.name) from exc
 
 
 @cached_on_owner
 def codec_of(definition: Definition[M]) -> Codec[M]:
-    """Return the codec of a message; its functions are closures, to avoid attribute access on the hot path."""
-    name = definition.name
-    types = definition.types
-    model = definition.model
-    make_row = definition.row
-    has_text = definition.has_text
-    all_fields = definition.all_fields
-    count = len(types)
-    validation = definition.validation
-    check_row = validation.check_row
-    row_of = validation.row_of
-    passes_rules = validation.passes_rules
-    by_name = validation.by_name
-    flatten = validation.flatten
-    unflatten = validation.unflatten
-    form, offsets = _payload_form(types, cast("int", definition.current.wire))
-    packed = struct.Struct(">" + form.code)
-    size = packed.size
-    pack_flat = packed.pack
-    unpack_flat = packed.unpack
-    from_bytes = int.from_bytes
-    tags = from_bytes(form.tags, "big")
-    all_bits = (1 << 8 * size) - 1
-    tag_mask = all_bits ^ from_bytes(form.bits, "big")
-    new_row = tuple.__new__
-    unpack = msgpack.unpackb
-
-    def pack(row: Values) -> bytes:
-        """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
-        return encode_flat(flatten(row))
-
-    def encode_flat(values: Values) -> bytes:
-        # The packed struct has zeros for the tags, and `tags` has zeros for the values.
-        return (from_bytes(pack_flat(*values), "big") | tags).to_bytes(size, "big")
-
-    def encode(message: M) -> bytes:
-        try:
-            return pack(tuple(message.__dict__.values()))
-        except (struct.error, OverflowError, TypeError) as exc:
-            raise EncodeError(str(exc), name) from exc
-
-    def encode_fields(fields: Mapping[str, object]) -> bytes:
-        row = row_of(fields)
-        return encode(to_model(fields)) if row is None else encode_valid(row)
-
-    def encode_row(values: Sequence[object]) -> bytes:
-        values = tuple(values)
-        if len(values) != count:
-            raise EncodeError(f"{len(values)} values, expected {count}", name)
-        row = check_row(values)
-        return encode(to_model(by_name(values))) if row is None else encode_valid(row)
-
-    def encode_valid(row: Values) -> bytes:
-        try:
-            return pack(row)
-        except OverflowError:  # beyond float32; the model raises the error
-            return encode(to_model(by_name(row)))
-
-    def to_model(fields: Mapping[str, object]) -> M:
-        try:
-            return model.model_validate(dict(fields))
-        except ValidationError as exc:
-            details = exc.errors(include_url=False)
-            violations = [(str(detail["loc"][0]), detail["msg"]) for detail in details]
-            raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
-
-    def decode_full_width(payload: bytes) -> Values | None:
-        """Decode a payload in the form that `encode` writes; return None for any other, which `decode_any` decodes."""
-        if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
-            return None
-        # The tags prove type and range of every value; only the rules are left to check.
-        row: Values
-        if has_text:
-            row = decode_values(payload)
-        else:
-            row = unpack(payload, use_list=False)[1:]
-        return row if passes_rules(row) else None
-
-    def decode_values(payload: bytes) -> Values:
-        """Decode a payload with text, which ends at the first NUL and may contain invalid UTF-8."""
-        values = (from_bytes(payload, "big") ^ tags).to_bytes(size, "big")
-        return unflatten(unpack_flat(values))
-
-    def decode_any(payload: bytes, newer: NewerLayouts | None) -> M:
-        """Decode any msgpack encoding of any known layout."""
-        fields = _unpack_fields(definition, payload, newer or {})
-        try:
-            return upgrade_with(definition, fields)
-        except ValidationError as exc:
-            raise DecodeError(describe(exc, definition), name) from exc
-
-    def decode(payload: bytes, *, newer: NewerLayouts | None = None) -> M:
-        row = decode_full_width(payload)
-        if row is None:
-            return decode_any(payload, newer)
-        return fill(model.__new__(model), by_name(row), all_fields)
-
-    def decode_row(payload: bytes, *, newer: NewerLayouts | None = None) -> M:  # a Row at run time
-        row = decode_full_width(payload)
-        if row is None:
-            row = tuple(decode_any(payload, newer).__dict__.values())
-        return cast("M", new_row(make_row, row))
-
-    return Codec(
-        definition, size, tags, tag_mask, offsets,
-        encode_flat, encode, encode_fields, encode_row, decode, decode_row,
-    )  # fmt: skip
+    """Return the cached codec of a message."""
+    return Codec(definition)
 
 
 def _payload_form(
