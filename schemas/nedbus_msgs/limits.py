@@ -31,3 +31,6 @@ MSG_NESTING: Final = 3
 
 MSG_COMMENT: Final = 2000
 """Characters of the comment of a field in a .msg file. The rest is cut."""
+
+MSG_FIELDS: Final = 1000
+"""Fields of a .msg file, including those of nested messages, before a message is defined. More are an error."""

@@ -1,6 +1,7 @@
 """SensorGps: output of a GNSS receiver."""
 
 import math
+from typing import ClassVar
 
 from nedbus_msgs.frames import GlobalPosition, Ned
 from nedbus_msgs.model import (
@@ -109,10 +110,13 @@ class SensorGps(Message):
         FiniteWhile(vel_ned_valid="vel_n_m_s vel_e_m_s vel_d_m_s"),
     )
 
-    (
-        FIX_TYPE_NONE, FIX_TYPE_2D, FIX_TYPE_3D, FIX_TYPE_RTCM_CODE_DIFFERENTIAL, FIX_TYPE_RTK_FLOAT,
-        FIX_TYPE_RTK_FIXED, FIX_TYPE_EXTRAPOLATED,
-    ) = 1, 2, 3, 4, 5, 6, 8  # fmt: skip
+    FIX_TYPE_NONE: ClassVar = 1
+    FIX_TYPE_2D: ClassVar = 2
+    FIX_TYPE_3D: ClassVar = 3
+    FIX_TYPE_RTCM_CODE_DIFFERENTIAL: ClassVar = 4
+    FIX_TYPE_RTK_FLOAT: ClassVar = 5
+    FIX_TYPE_RTK_FIXED: ClassVar = 6
+    FIX_TYPE_EXTRAPOLATED: ClassVar = 8
     JAMMING_STATE_UNKNOWN, JAMMING_STATE_OK, JAMMING_STATE_MITIGATED, JAMMING_STATE_DETECTED = (
         range(4)
     )
@@ -123,10 +127,14 @@ class SensorGps(Message):
         AUTHENTICATION_STATE_UNKNOWN, AUTHENTICATION_STATE_INITIALIZING, AUTHENTICATION_STATE_ERROR,
         AUTHENTICATION_STATE_OK, AUTHENTICATION_STATE_DISABLED,
     ) = range(5)  # fmt: skip
-    (
-        SYSTEM_ERROR_OK, SYSTEM_ERROR_INCOMING_CORRECTIONS, SYSTEM_ERROR_CONFIGURATION, SYSTEM_ERROR_SOFTWARE,
-        SYSTEM_ERROR_ANTENNA, SYSTEM_ERROR_EVENT_CONGESTION, SYSTEM_ERROR_CPU_OVERLOAD, SYSTEM_ERROR_OUTPUT_CONGESTION,
-    ) = 0, 1, 2, 4, 8, 16, 32, 64  # fmt: skip
+    SYSTEM_ERROR_OK: ClassVar = 0
+    SYSTEM_ERROR_INCOMING_CORRECTIONS: ClassVar = 1
+    SYSTEM_ERROR_CONFIGURATION: ClassVar = 2
+    SYSTEM_ERROR_SOFTWARE: ClassVar = 4
+    SYSTEM_ERROR_ANTENNA: ClassVar = 8
+    SYSTEM_ERROR_EVENT_CONGESTION: ClassVar = 16
+    SYSTEM_ERROR_CPU_OVERLOAD: ClassVar = 32
+    SYSTEM_ERROR_OUTPUT_CONGESTION: ClassVar = 64
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
     timestamp_sample: Uint64 = field(
