@@ -33,9 +33,72 @@ BATCH_MESSAGES: Final = 4096
 
 # --- Services ---
 
+LIVE_ADDRESSES: Final = 1000
+"""Published and stale addresses of one live source. Beyond it the longest stale one goes, or messages are rejected."""
+
+REPLAYED_ADDRESSES: Final = 10_000
+"""Addresses of one replay, as many as a reader tracks. Messages of further ones are rejected."""
+
+REJECTION_ORIGINS: Final = 50
+"""Origins of rejections of a source that are kept and logged. Rejections of further origins are only counted."""
+
+REJECTION_RULES: Final = 50
+"""Violated rules of a source with a separate counter. Further rules count as "other"."""
+
+LOGGED_INVALID: Final = 5
+"""Invalid messages of a source that are logged. Further ones are counted, and published as reports."""
+
+STATUS_STREAMS: Final = 100
+"""Streams of a source in its status, which must fit into one reply. Further ones are left out."""
+
 # --- Sources ---
 
+PX4_KEYS: Final = 10_000
+"""Keys of rmw_zenoh per source; a vehicle has a few dozen. Messages on further keys are rejected."""
+
+PX4_PUBLISHERS: Final = 64
+"""Announced publishers per key, which a peer could announce without end. Further ones are ignored."""
+
+PX4_SUBSCRIPTIONS: Final = 1000
+"""Topics to which a source subscribes; a vehicle has a handful. Further ones are not received."""
+
+PX4_PENDING: Final = 4096
+"""Samples that wait to be decoded, so that a slow host does not fill its memory. Beyond it new ones are dropped."""
+
+PX4_PAYLOAD: Final = 4096
+"""Bytes of a sample, as of a message. A larger sample is rejected before it waits."""
+
+REPORTED_TOPICS: Final = 100
+"""Unsupported messages, and silent topics, in one report of a source. The rest is left out."""
+
 # --- MAVLink ---
+
+MAVLINK_VEHICLES: Final = 100
+"""Vehicles per link, because a stranger could send with many ids. Messages of further ones are rejected."""
+
+MAVLINK_WAITING: Final = 16_384
+"""Received messages of all vehicles that wait for the source. Beyond it the oldest of the longest queue is dropped."""
+
+WAITING_REJECTIONS: Final = 1000
+"""Different rejections that wait for the source. Further ones count as one of "further places"."""
+
+MAVLINK_UNSENT: Final = 4096
+"""Bytes that a TCP or serial link may queue; more would be too old when they arrive. A frame beyond it is not sent."""
+
+ENCODING: Final = 512
+"""Characters of an encoding of a position from the bus; those of nedbus have at most 250. The rest is not parsed."""
+
+TIMESYNC_REQUESTS: Final = 10
+"""TIMESYNC requests that may be unanswered. Beyond it the oldest is forgotten, and its answer ignored."""
+
+LOG_STREAM_PENDING: Final = 2**22
+"""Bytes of a ULog stream that wait for its file, until its first message. Beyond it no file is written."""
+
+DAMAGE_REASONS: Final = 100
+"""Different reasons for damaged records of a ULog stream that are kept. Further ones count as "further damage"."""
+
+SAME_NAMES: Final = 100
+"""Files of ULog streams with the same name, told apart by a number. Beyond it no file is written."""
 
 # --- Files ---
 
