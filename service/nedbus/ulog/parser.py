@@ -55,17 +55,10 @@ class _Inspection(NamedTuple):
     record: Record | None = None
 
 
-class _Route(NamedTuple):
-    """What to do with the data messages that begin with some five bytes.
-
-    `subscription`: with which they are returned; None to drop them. `length`: of a message in the log [bytes].
-    `used`: the same without padding. `payloads`: the list to which payloads are added instead.
-    """
-
-    subscription: Subscription | None
-    length: int
-    used: int
-    payloads: list[bytes] | None
+# What to do with the data messages that begin with some five bytes: their subscription (None: not returned), their
+# length, the length without padding, and the list to which payloads are added instead.
+# A plain tuple, because each message unpacks one, and a NamedTuple is unpacked through an iterator.
+_Route = tuple[Subscription | None, int, int, list[bytes] | None]
 
 
 class UlogParser:
@@ -356,12 +349,12 @@ class UlogParser:
             except ValueError as exc:
                 self._records.append(Damage(str(exc)))
         elif inspected.validity == "valid":
-            route = self._known[self._buffer[at : at + _DATA_HEADER]]
-            payload = self._buffer[at + _DATA_HEADER : at + route.used]
-            if route.payloads is not None:
-                route.payloads.append(payload)
-            elif route.subscription is not None:
-                self._records.append(Data(route.subscription, payload))
+            subscription, _, used, payloads = self._known[self._buffer[at : at + _DATA_HEADER]]
+            payload = self._buffer[at + _DATA_HEADER : at + used]
+            if payloads is not None:
+                payloads.append(payload)
+            elif subscription is not None:
+                self._records.append(Data(subscription, payload))
         elif kind == ord("D"):
             self.undecodable += 1
             message_id = int.from_bytes(self._buffer[at + _HEADER : at + _DATA_HEADER], "little")
@@ -421,7 +414,7 @@ class UlogParser:
         returned = subscription if is_returned else None
         used = subscription.layout.size + _DATA_HEADER
         for length, head in _heads(message_id, subscription.layout):
-            self._known[head] = _Route(returned, length, used, payloads)
+            self._known[head] = (returned, length, used, payloads)
 
     def _unsubscribe(self, message_id: int) -> None:
         old = self.subscriptions.pop(message_id, None)
