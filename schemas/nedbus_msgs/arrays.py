@@ -28,16 +28,19 @@ from .model.validation import Values, accessors_of
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
-MAX_FEW: Final = 12
+FEW_PAYLOADS: Final = 12
 """Number of payloads up to which `decode_few` is faster than `decode` in a reader that mostly waits."""
 
-_MIN_COLUMNAR: Final = 20  # messages for which checking rules by column is faster than by message
+_COLUMNAR: Final = 20  # messages from which checking rules by column is faster than by message
 
 _WINDOW: Final = 256  # bytes, the length of a table of bytes.translate
 
 
 def _numpy_type(kind: FieldType) -> Any:
-    return np.dtype(f"S{kind.size}" if kind.is_text else (BASES[kind.base].code, kind.length or ()))
+    if kind.is_text:
+        return np.dtype(f"S{kind.size}")
+    code = BASES[kind.base].code
+    return np.dtype((code, kind.length or ()))
 
 
 class Arrays(Generic[M]):
@@ -47,43 +50,50 @@ class Arrays(Generic[M]):
     """
 
     def __init__(self, definition: Definition[M]) -> None:
-        self.definition, types = definition, definition.types
+        self.definition = definition
+        types = definition.types
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
-        self._size = size = self._codec.size
-        # Payload offset of each byte of an element.
-        self._from_wire = np.array([], np.intp)
-        for name, _, offset in self._codec.offsets:
-            bytes_of = np.arange(offset, offset + types[name].size)
-            is_swapped = sys.byteorder == "little" and not types[name].is_text
-            self._from_wire = np.append(self._from_wire, bytes_of[::-1] if is_swapped else bytes_of)
-        # The same by windows of the payload: the first byte of the window, and offsets from there.
-        windows = groupby(self._from_wire.tolist(), lambda offset: offset - offset % _WINDOW)
-        self._gathers = [
-            (start, bytes([offset - start for offset in offsets])) for start, offsets in windows
-        ]
+        size = self._codec.size
+        self._size = size
+        self._from_wire = self._wire_offsets()
+        self._windows = _windows_of(self._from_wire)
         self._to_wire = np.zeros(size, np.intp)
         self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
         self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
-        checked = {name for rule in definition.rules for name in rule.fields}
+
         # A struct that unpacks only the fields with rules from an element, and an expression for each unpacked field.
-        forms = (
-            kind.form if name in checked else f"{self.dtype[name].itemsize}x"
-            for name, kind in types.items()
-        )
-        accessors = accessors_of({name: kind for name, kind in types.items() if name in checked})
-        self._checked = struct.Struct("=" + "".join(forms))
-        self._passes_rules = compile_lambda(
-            f"lambda values: {expression_of(definition.rules, accessors)}"
-        )
+        checked: dict[str, FieldType] = {}
+        form = "="
+        fields_of_rules = {name for rule in definition.rules for name in rule.fields}
+        for name, kind in types.items():
+            if name in fields_of_rules:
+                checked[name] = kind
+                form += kind.form
+            else:
+                form += f"{self.dtype[name].itemsize}x"
+        self._checked = struct.Struct(form)
+        rules = expression_of(definition.rules, accessors_of(checked))
+        self._passes_rules = compile_lambda(f"lambda values: {rules}")
         self._column_checks = column_checks(
             definition.rules,
             isfinite=np.isfinite,
             any=np.logical_or.reduce,
             squared_norm=lambda quaternions: squared_norm(quaternions.astype(float)),
         )
+
+    def _wire_offsets(self) -> npt.NDArray[np.intp]:
+        """Return the payload offset of each byte of an element."""
+        offsets: list[int] = []
+        for name, _, first in self._codec.offsets:
+            kind = self.definition.types[name]
+            of_value = range(first, first + kind.size)
+            if sys.byteorder == "little" and not kind.is_text:
+                of_value = of_value[::-1]
+            offsets.extend(of_value)
+        return np.array(offsets, np.intp)
 
     def decode(self, payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
         """Decode concatenated full-width payloads; return the messages and a mask of the valid ones.
@@ -98,27 +108,29 @@ class Arrays(Generic[M]):
             wire &= self._value_mask
         array = np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
         valid = self.valid_mask(array)
-        return array, valid & ~wrong.any(axis=1) if is_damaged else valid
+        if is_damaged:
+            valid = valid & ~wrong.any(axis=1)
+        return array, valid
 
     def decode_few(self, payloads: Iterable[bytes]) -> MessageArray | None:
-        """Decode up to MAX_FEW payloads one by one; return None if one may be invalid."""
+        """Decode up to FEW_PAYLOADS payloads one by one; return None if one may be invalid."""
         size = self._size
         tags = self._codec.tags
         tag_mask = self._codec.tag_mask
         elements = bytearray()
         for payload in payloads:
-            if (
-                len(payload) != size
-                or (number := int.from_bytes(payload, "big")) & tag_mask != tags
-            ):
+            if len(payload) != size:
+                return None
+            number = int.from_bytes(payload, "big")
+            if number & tag_mask != tags:
                 return None
             wire = (number ^ tags).to_bytes(size, "big")
             # `translate` maps each offset to the byte of the window at this offset.
-            windows = [
-                offsets.translate(wire[at : at + _WINDOW].ljust(_WINDOW))
-                for at, offsets in self._gathers
+            parts = [
+                offsets.translate(wire[start : start + _WINDOW].ljust(_WINDOW))
+                for start, offsets in self._windows
             ]
-            element = b"".join(windows)
+            element = b"".join(parts)
             if not self._passes_rules(self._checked.unpack(element)):
                 return None
             elements += element
@@ -127,11 +139,12 @@ class Arrays(Generic[M]):
     def encode(self, array: MessageArray) -> bytes:
         """Encode messages as concatenated payloads, without validating them."""
         native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
-        return (native.take(self._to_wire, axis=1) & self._value_mask | self._tags).tobytes()
+        wire = native.take(self._to_wire, axis=1)
+        return (wire & self._value_mask | self._tags).tobytes()
 
     def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the messages that pass the rules."""
-        if len(array) < _MIN_COLUMNAR:
+        if len(array) < _COLUMNAR:
             rows = self._checked.iter_unpack(array.tobytes())
             return np.fromiter(map(self._passes_rules, rows), np.bool_, len(array))
         invalid = np.zeros(len(array), np.bool_)
@@ -151,16 +164,13 @@ class Arrays(Generic[M]):
 
     def of(self, messages: Sequence[M]) -> MessageArray:
         """Convert messages to a structured array."""
-        return np.array(
-            [self.to_element(tuple(message.__dict__.values())) for message in messages], self.dtype
-        )
+        rows = [tuple(message.__dict__.values()) for message in messages]
+        return np.array([self.to_element(row) for row in rows], self.dtype)
 
     def absent(self, count: int) -> MessageArray:
         """Return `count` messages with every field "not provided": NaN, false or 0."""
-        return np.repeat(
-            np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype),
-            count,
-        )
+        values = tuple(kind.absent for kind in self.definition.types.values())
+        return np.repeat(np.array([values], self.dtype), count)
 
     def to_row(self, element: np.void) -> Values:
         """Return the values of one element in PX4's order, arrays as tuples."""
@@ -180,8 +190,9 @@ class Arrays(Generic[M]):
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
         """Encode messages as CDR payloads without validating them; the model must have all fields of the layout."""
         cdr = cdr_layout(layout)
+        names = list(layout.types)
         formats = [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()]
-        names, offsets = zip(*cdr.offsets.items(), strict=True)
+        offsets = [cdr.offsets[name] for name in names]
         dtype = np.dtype(
             {"names": names, "formats": formats, "offsets": offsets, "itemsize": cdr.size}
         )
@@ -189,6 +200,15 @@ class Arrays(Generic[M]):
         for name in layout.types:
             payloads[name] = array[name]
         return payloads
+
+
+def _windows_of(wire_offsets: npt.NDArray[np.intp]) -> list[tuple[int, bytes]]:
+    """Split payload offsets into runs within one window: the first byte of the window, and the offsets from there."""
+    windows: list[tuple[int, bytes]] = []
+    runs = groupby(wire_offsets.tolist(), lambda offset: offset - offset % _WINDOW)
+    for start, offsets in runs:
+        windows.append((start, bytes([offset - start for offset in offsets])))
+    return windows
 
 
 @cached_on_owner
@@ -208,7 +228,8 @@ def dtype_of(message: type[Message] | str) -> np.dtype[Any]:
 
 def to_array(messages: Sequence[M]) -> MessageArray:
     """Return messages of one class as a structured array."""
-    return arrays_of(messages[0].DEFINITION if messages else DEFAULT).of(messages)
+    definition = messages[0].DEFINITION if messages else DEFAULT
+    return arrays_of(definition).of(messages)
 
 
 def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # default of M
@@ -219,9 +240,12 @@ def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type
 def mask_invalid(messages: MessageArray) -> MessageArray:
     """Return a copy with NaN in each field whose flag, such as `xy_valid`, is false or not provided."""
     masked = messages.copy()
-    for flags in (definition.flags for definition in MESSAGES.values()):
-        for flag in flags.keys() & set(messages.dtype.names or ()):
-            for name in flags[flag]:
+    fields = messages.dtype.names or ()
+    for definition in MESSAGES.values():
+        for flag, guarded in definition.flags.items():
+            if flag not in fields:
+                continue
+            for name in guarded:
                 masked[name][~masked[flag]] = np.nan
     return masked
 
@@ -233,7 +257,6 @@ def derive_column(messages: MessageArray, name: str) -> npt.NDArray[np.float64]:
     is_valid = messages[derived.flag] if derived.flag else is_rotation(values[0])
     functions = Functions(np.sqrt, np.arctan2)
     with np.errstate(invalid="ignore", over="ignore"):  # of invalid values, which are replaced
-        found: npt.NDArray[np.float64] = np.where(
-            is_valid, derived.compute(functions, *values), np.nan
-        )
-    return found
+        computed = derived.compute(functions, *values)
+        column: npt.NDArray[np.float64] = np.where(is_valid, computed, np.nan)
+    return column

@@ -7,6 +7,7 @@ from typing import Any, Final
 from pydantic import Field, create_model
 from typing_extensions import TypeVar
 
+from . import limits
 from .codecs.msgpack import PAYLOAD_LIMIT, full_width
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import DEFAULT_TOPIC, Layout
@@ -17,7 +18,7 @@ from .model.rules import Rule
 
 _NAME = re.compile(r"[A-Z][A-Za-z0-9]{0,63}")
 _FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}")
-_MAX_FIELDS: Final = 256  # three times as many as PX4's largest message has
+
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 
 
@@ -55,23 +56,23 @@ def define(
         if field in types:
             raise ValueError(f"duplicate field {field!r}, after flattening nested messages")
         types[field] = kind
-    if len(types) > _MAX_FIELDS:
-        raise ValueError(f"{len(types)} fields, more than the limit of {_MAX_FIELDS}")
+    if len(types) > limits.FIELDS:
+        raise ValueError(f"{len(types)} fields, more than the limit of {limits.FIELDS}")
     if str(types.get("timestamp")) != "uint64":
         raise ValueError("missing field 'uint64 timestamp'")
-    size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
+    size = 4 + sum(len(full_width(kind).tags) for kind in types.values())
     if size > PAYLOAD_LIMIT:
         raise ValueError(f"a payload of {size} bytes, more than the limit of {PAYLOAD_LIMIT}")
-    described = {name: Field(description=meanings.get(name)) for name in types}
-    annotated: dict[str, Any] = {
-        name: (kind.annotation, described[name]) for name, kind in types.items()
-    }
-    annotated["timestamp"] = Timestamp, described["timestamp"]  # required
-    model = create_model(
-        name, __base__=Message, __doc__="A message defined at run time.", **annotated
-    )
+    annotated: dict[str, Any] = {}
+    for field, kind in types.items():
+        is_required = field == "timestamp"
+        annotation = Timestamp if is_required else kind.annotation
+        annotated[field] = annotation, Field(description=meanings.get(field))
+    doc = "A message defined at run time."
+    model = create_model(name, __base__=Message, __doc__=doc, **annotated)
     # the model has timestamp first
-    model.LAYOUTS, model.RULES = (Layout("PX4", " ".join(types)),), rules
+    model.LAYOUTS = (Layout("PX4", " ".join(types)),)
+    model.RULES = rules
     model.DEFINITION = Definition(model)
     return model.DEFINITION
 

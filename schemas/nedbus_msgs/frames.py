@@ -70,25 +70,30 @@ def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
 enu_to_ned = ned_to_enu
 flu_to_frd = frd_to_flu
 yaw_enu_to_ned = yaw_ned_to_enu
-variances_enu_to_ned, quaternion_enu_to_ned = variances_ned_to_enu, quaternion_ned_to_enu
+variances_enu_to_ned = variances_ned_to_enu
+quaternion_enu_to_ned = quaternion_ned_to_enu
 
 
 def wrap(angle: float) -> float:
     """Wrap an angle to [-pi, pi]; NaN for NaN and infinities."""
-    return math.remainder(angle, math.tau) if math.isfinite(angle) else math.nan
+    if not math.isfinite(angle):
+        return math.nan
+    return math.remainder(angle, math.tau)
 
 
 def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> _Quaternion:
     """Return the rotation from body FRD to NED (w, x, y, z) for roll, pitch and heading."""
-    (cr, sr), (cp, sp), (cy, sy) = (
-        (math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, yaw)
-    )
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    cos_roll = math.cos(roll / 2)
+    sin_roll = math.sin(roll / 2)
+    cos_pitch = math.cos(pitch / 2)
+    sin_pitch = math.sin(pitch / 2)
+    cos_yaw = math.cos(yaw / 2)
+    sin_yaw = math.sin(yaw / 2)
+    w = cos_roll * cos_pitch * cos_yaw + sin_roll * sin_pitch * sin_yaw
+    x = sin_roll * cos_pitch * cos_yaw - cos_roll * sin_pitch * sin_yaw
+    y = cos_roll * sin_pitch * cos_yaw + sin_roll * cos_pitch * sin_yaw
+    z = cos_roll * cos_pitch * sin_yaw - sin_roll * sin_pitch * cos_yaw
+    return w, x, y, z
 
 
 def quaternion_to_euler(q: Sequence[float]) -> Vector:
@@ -114,7 +119,8 @@ def _euler(functions: Functions, q: Any) -> tuple[Any, Any, Any]:
     """Return roll, pitch and yaw [rad] of the elements of q, numbers or arrays."""
     w, x, y, z = q
     # both times the cosine of pitch
-    sine_roll, cosine_roll = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
+    sine_roll = 2 * (w * x + y * z)
+    cosine_roll = 1 - 2 * (x * x + y * y)
     cosine_pitch = functions.sqrt(sine_roll * sine_roll + cosine_roll * cosine_roll)
     roll = functions.atan2(sine_roll, cosine_roll)
     pitch = functions.atan2(2 * (w * y - z * x), cosine_pitch)
@@ -165,25 +171,32 @@ DERIVED: Final[Mapping[str, DerivedField]] = {
 def derived_from(fields: Iterable[str]) -> list[str]:
     """Return the names in DERIVED of the quantities that a message with these fields has, except its own fields."""
     own = set(fields)
-    return [
-        name
-        for name, each in DERIVED.items()
-        if name not in own and own.issuperset({*each.fields, each.flag} - {""})
-    ]
+    names: list[str] = []
+    for name, derived in DERIVED.items():
+        needed = set(derived.fields)
+        if derived.flag:
+            needed.add(derived.flag)
+        if name not in own and own.issuperset(needed):
+            names.append(name)
+    return names
 
 
 def derive(message: object, name: str) -> float:
     """Return a quantity of DERIVED of a message or row; NaN while it is invalid."""
     derived = DERIVED[name]
     values = [getattr(message, field) for field in derived.fields]
-    is_valid = getattr(message, derived.flag) is True if derived.flag else is_rotation(values[0])
-    return float(derived.compute(_OF_NUMBERS, *values)) if is_valid else math.nan
+    if derived.flag and getattr(message, derived.flag) is not True:
+        return math.nan
+    if not derived.flag and not is_rotation(values[0]):
+        return math.nan
+    return float(derived.compute(_OF_NUMBERS, *values))
 
 
 def is_rotation(q: Any) -> Any:
     """Return whether q has norm 1 within 0.001, as a valid message has; false for zeros and NaN."""
     w, x, y, z = q
     squared = w * w + x * x + y * y + z * z
+    # `&`, because `and` does not work on arrays
     return (squared >= 0.999**2) & (squared <= 1.001**2)
 
 
@@ -199,27 +212,33 @@ class MapProjection:
         sine, cosine = _sine_and_cosine(self.latitude)
         sine_other, cosine_other = _sine_and_cosine(latitude)
         difference = math.radians(longitude - self.longitude)
-        angle = math.acos(_clip(sine * sine_other + cosine * cosine_other * math.cos(difference)))
-        scale = EARTH_RADIUS * (angle / math.sin(angle) if math.sin(angle) else 1.0)
-        north = scale * (cosine * sine_other - sine * cosine_other * math.cos(difference))
-        return north, scale * cosine_other * math.sin(difference)
+        cosine_difference = math.cos(difference)
+        cosine_angle = sine * sine_other + cosine * cosine_other * cosine_difference
+        angle = math.acos(min(1.0, max(-1.0, cosine_angle)))
+        scale = EARTH_RADIUS
+        if math.sin(angle):
+            scale = EARTH_RADIUS * (angle / math.sin(angle))
+        north = scale * (cosine * sine_other - sine * cosine_other * cosine_difference)
+        east = scale * cosine_other * math.sin(difference)
+        return north, east
 
     def reproject(self, north: float, east: float) -> tuple[float, float]:
         """Return latitude and longitude [deg] of a point [m]; the longitude is within [-180, 180]."""
-        x, y = north / EARTH_RADIUS, east / EARTH_RADIUS
+        x = north / EARTH_RADIUS
+        y = east / EARTH_RADIUS
         angle = math.hypot(x, y)
         if not angle:
             return self.latitude, math.remainder(self.longitude, 360.0)
         sine, cosine = _sine_and_cosine(self.latitude)
-        sine_angle, cosine_angle = math.sin(angle), math.cos(angle)
+        sine_angle = math.sin(angle)
+        cosine_angle = math.cos(angle)
         axial = cosine_angle * sine + x * sine_angle * cosine / angle
         radial = cosine_angle * cosine - x * sine_angle * sine / angle
         eastward = y * sine_angle / angle
         # PX4 uses an arc sine, which is inexact at the poles; elsewhere the result is the same.
         latitude = math.degrees(math.atan2(axial, math.hypot(radial, eastward)))
-        return latitude, math.remainder(
-            self.longitude + math.degrees(math.atan2(eastward, radial)), 360.0
-        )
+        turned = math.degrees(math.atan2(eastward, radial))
+        return latitude, math.remainder(self.longitude + turned, 360.0)
 
 
 @dataclass(slots=True)
@@ -240,15 +259,16 @@ class CommonOrigin:
         """Add a message with a global origin; return the projection."""
         projection = self.projection
         if projection is None or (not self._is_confirmed and vehicle == self._vehicle):
-            origin = (message.ref_lat, message.ref_lon, message.ref_alt)[
-                : 3 if message.z_global else 2
-            ]
+            origin: tuple[float, ...] = (message.ref_lat, message.ref_lon)
+            if message.z_global:
+                origin = (*origin, message.ref_alt)
             self._is_confirmed = origin == self._first
             if projection is None or not self._is_confirmed:
                 self._vehicle = vehicle
                 self._first = origin
                 self.altitude = math.nan
-                projection = self.projection = MapProjection(message.ref_lat, message.ref_lon)
+                projection = MapProjection(message.ref_lat, message.ref_lon)
+                self.projection = projection
         if math.isnan(self.altitude) and message.z_global:
             self.altitude = message.ref_alt
         return projection
@@ -277,12 +297,12 @@ def to_global(message: Message) -> GlobalPosition | None:
     """
     if not message.xy_global or not math.isfinite(message.x + message.y):
         return None
-    latitude, longitude = MapProjection(message.ref_lat, message.ref_lon).reproject(
-        message.x, message.y
-    )
-    return GlobalPosition(
-        latitude, longitude, message.ref_alt - message.z if message.z_global else math.nan
-    )
+    projection = MapProjection(message.ref_lat, message.ref_lon)
+    latitude, longitude = projection.reproject(message.x, message.y)
+    altitude = math.nan
+    if message.z_global:
+        altitude = message.ref_alt - message.z
+    return GlobalPosition(latitude, longitude, altitude)
 
 
 def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
@@ -292,16 +312,14 @@ def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
     """
     if not origin.xy_global:
         return None
-    x, y = MapProjection(origin.ref_lat, origin.ref_lon).project(
-        position.latitude, position.longitude
-    )
-    return x, y, origin.ref_alt - position.altitude if origin.z_global else math.nan
+    projection = MapProjection(origin.ref_lat, origin.ref_lon)
+    x, y = projection.project(position.latitude, position.longitude)
+    z = math.nan
+    if origin.z_global:
+        z = origin.ref_alt - position.altitude
+    return x, y, z
 
 
 def _sine_and_cosine(degrees: float) -> tuple[float, float]:
     angle = math.radians(degrees)
     return math.sin(angle), math.cos(angle)
-
-
-def _clip(value: float) -> float:
-    return min(1.0, max(-1.0, value))

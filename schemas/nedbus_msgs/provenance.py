@@ -65,43 +65,54 @@ def encoding_of(
     definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None
 ) -> str:
     """Return the Zenoh encoding for a source that provides these fields; None means all fields."""
-    names = definition.names
-    mask = (
-        0
-        if provided is None
-        else sum(1 << index for index, name in enumerate(names) if name not in provided)
-    )
     parts = [f"application/msgpack;px4_msgs/{definition.name}"]
-    is_built_in = MESSAGES.get(definition.name) is definition
-    if not is_built_in or cast("int", definition.current.wire) > _WITHOUT_HASH.get(
-        definition.name, -1
-    ):
+    if not _has_first_layout(definition):
         parts.append(f"hash={short_hash(definition.name, definition.types)}")
     if source is not None:
         parts.append(f"source={source}")
+    mask = 0
+    if provided is not None:
+        for index, name in enumerate(definition.names):
+            if name not in provided:
+                mask |= 1 << index
     if mask:
         parts.append(f"missing={mask:x}")
     return ";".join(parts)
 
 
+def _has_first_layout(definition: Definition[Any]) -> bool:
+    """Return whether every version of nedbus has this layout."""
+    if MESSAGES.get(definition.name) is not definition:
+        return False
+    newest_known = _WITHOUT_HASH.get(definition.name, -1)
+    return cast("int", definition.current.wire) <= newest_known
+
+
 def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
     """Return the first 32 hex digits (128 bits) of the RIHS01 hash of a message with these fields."""
-    return hash_of(Layout("", "", types=types), f"{PACKAGE}/{name}").removeprefix("RIHS01_")[:32]
+    digits = hash_of(Layout("", types=types), f"{PACKAGE}/{name}").removeprefix("RIHS01_")
+    return digits[:32]
 
 
 @lru_cache(1024)
 def identity_of(encoding: str) -> tuple[str, str] | None:
     """Return the message name and hash from an encoding; None if it has no hash."""
-    found = _IDENTITY.fullmatch(encoding)
-    return (found[1], found[2]) if found else None
+    identity = _IDENTITY.fullmatch(encoding)
+    if identity is None:
+        return None
+    return identity[1], identity[2]
 
 
 @cached_on_owner
 def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
     """Parse the provenance in an encoding; unknown or invalid parts, perhaps of other programs, are ignored."""
-    parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])
-    source, missing = parts.get("source", ""), parts.get("missing", "")
+    parts: dict[str, str] = {}
+    for part in encoding.split(";")[2:]:
+        name, _, value = part.partition("=")
+        parts[name] = value
+    source = parts.get("source", "")
     digits = math.ceil(len(definition.names) / 4)
-    mask = int(missing, 16) if re.fullmatch(f"[0-9a-f]{{1,{digits}}}", missing) else 0
+    missing = re.fullmatch(f"[0-9a-f]{{1,{digits}}}", parts.get("missing", ""))
+    mask = int(missing[0], 16) if missing else 0
     fields = frozenset(name for index, name in enumerate(definition.names) if mask >> index & 1)
     return Provenance(source if _SOURCE.fullmatch(source) else None, fields)

@@ -6,12 +6,15 @@ accurately as the motion in between, so the delta is used only if it agrees, or 
 Source: the resets of 15 real logs, measured by `python -m benchmarks.resets`.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import add, attrgetter, sub
+from itertools import chain
+from operator import add, attrgetter
 from statistics import fmean
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from .frames import MapProjection, wrap
 from .messages.vehicle_local_position import VehicleLocalPosition as Message
@@ -32,19 +35,23 @@ _RATES: Final[Mapping[str, tuple[str, ...]]] = {
 RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" for name in _VALUES}
 """The field that counts the resets of each quantity, modulo 256."""
 
+_FROM_ORIGIN: Final = ("xy", "z")  # quantities that a new origin changes
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
 _read_origin: Final = attrgetter(*_ORIGIN)  # compared as text, in which NaN equals NaN
+_VALUES_AND_RATES: Final = set(chain(*_VALUES.values(), *_RATES.values()))
 JUMP_FIELDS: Final = (
-    *sorted({each for names in (*_VALUES.values(), *_RATES.values()) for each in names}),
-    *(f"delta_{name}" for name in _VALUES), *_ORIGIN, "unaided_heading",
-)  # fmt: skip
+    *sorted(_VALUES_AND_RATES),
+    *(f"delta_{name}" for name in _VALUES),
+    *_ORIGIN,
+    "unaided_heading",
+)
 """The fields that `jump_of` needs besides `timestamp` and the reset counter."""
 
 # us; a larger step back in time is a reboot, a smaller one is reordering
 _REBOOT: Final = 1_000_000
 # s for which the rates at both ends determine the motion well enough to find a step
-_MAX_INTERVAL: Final = 3.0
-_MAX_UNKNOWN: Final = 0.5  # s, the same without rates
+_MEASURED_INTERVAL: Final = 3.0
+_MEASURED_WITHOUT_RATES: Final = 0.5  # s
 # s; over longer intervals, a change of the rate makes the motion uncertain
 _SURE_INTERVAL: Final = 0.15
 # Maximum difference between a delta and the step, in m, m/s or rad: for noise, for a jerk of 120 m/s^3 (the mean of two
@@ -88,9 +95,7 @@ class ResetTracker:
 
     def __init__(self) -> None:
         self._last: Message | None = None
-        self._jumps: dict[Quantity, Point] = {
-            name: (0.0,) * len(values) for name, values in _VALUES.items()
-        }
+        self._jumps: dict[Quantity, Point] = {name: _no_jump(name) for name in _VALUES}
         self._resets: dict[Quantity, int] = dict.fromkeys(_VALUES, 0)
 
     def add(self, message: Message) -> Continuous:
@@ -98,29 +103,32 @@ class ResetTracker:
 
         All tracks restart when the timestamp goes back by over a second, which counts as a reboot of the vehicle.
         """
-        last, self._last = self._last, message
-        reset, discontinued = set[Quantity](), set[Quantity]()
+        last = self._last
+        self._last = message
         rebooted = last is not None and message.timestamp < last.timestamp - _REBOOT
         origin_changed = last is not None and str(_read_origin(last)) != str(_read_origin(message))
+        reset: set[Quantity] = set()
+        discontinued: set[Quantity] = set()
         values: dict[str, float] = {}
         for name, fields in _VALUES.items():
-            zero: Point = (0.0,) * len(fields)
-            jump = None if rebooted else zero
-            if last is not None and not rebooted:
+            jump: Point | None = _no_jump(name)
+            if rebooted:
+                jump = None
+            elif last is not None:
                 counter = RESET_COUNTERS[name]
                 count = (getattr(message, counter) - getattr(last, counter)) % 256
                 if count:
                     reset.add(name)
                     self._resets[name] += count
-                if count or (origin_changed and name in ("xy", "z")):
+                if count or (origin_changed and name in _FROM_ORIGIN):
                     jump = jump_of(name, _by_name(last), _by_name(message))
             if jump is None:
                 discontinued.add(name)
-                self._jumps[name] = zero
+                self._jumps[name] = _no_jump(name)
             elif any(jump):
                 self._jumps[name] = tuple(map(add, self._jumps[name], jump))
-            point = (getattr(message, field) for field in fields)
-            values |= zip(fields, map(sub, point, self._jumps[name]), strict=True)
+            for field, jumped in zip(fields, self._jumps[name], strict=True):
+                values[field] = getattr(message, field) - jumped
         values["heading"] = wrap(values["heading"])
         return Continuous(
             **values,
@@ -131,12 +139,14 @@ class ResetTracker:
         )
 
 
+def _no_jump(name: Quantity) -> Point:
+    return (0.0,) * len(_VALUES[name])
+
+
 def _by_name(message: Message) -> dict[str, Any]:
     """Return what `jump_of` needs of a model or a row."""
-    return {
-        name: getattr(message, name)
-        for name in ("timestamp", *RESET_COUNTERS.values(), *JUMP_FIELDS)
-    }
+    names = ("timestamp", *RESET_COUNTERS.values(), *JUMP_FIELDS)
+    return {name: getattr(message, name) for name in names}
 
 
 def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any]) -> Point | None:
@@ -146,57 +156,97 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
     delta of a single reset, and at a new origin zero or the distance of the origins.
     `before`, `after`: JUMP_FIELDS and the others by name, NaN if not provided.
     """
-    values, counter = _VALUES[name], RESET_COUNTERS[name]
+    announced = _announced_jumps(name, before, after)
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
-    delta = after[f"delta_{name}"]
-    announced = []
-    if (after[counter] - before[counter]) % 256 == 1:
-        announced.append(delta if isinstance(delta, tuple) else (delta,))
-    if name in ("xy", "z") and str([before[each] for each in _ORIGIN]) != str(
-        [after[each] for each in _ORIGIN]
-    ):
-        shift = MapProjection(after["ref_lat"], after["ref_lon"]).project(
-            before["ref_lat"], before["ref_lon"]
-        )
-        announced += [
-            (0.0,) * len(values),
-            shift if name == "xy" else (after["ref_alt"] - before["ref_alt"],),
-        ]
-    announced = [jump for jump in announced if all(map(math.isfinite, jump))]
-    motions = [_motion(value, before, after, seconds) for value in values]
-    is_known = all(math.isfinite(moved) for moved, _ in motions)
-    motion, changes = zip(
-        *(each if math.isfinite(each[0]) else (0.0, 0.0) for each in motions), strict=True
-    )
+    motion = _motion_of(name, before, after, seconds)
     step = tuple(
-        after[value] - before[value] - moved for value, moved in zip(values, motion, strict=True)
+        after[value] - before[value] - distance
+        for value, distance in zip(_VALUES[name], motion.distances, strict=True)
     )
     if not all(map(math.isfinite, step)) or seconds <= 0:
         return announced[0] if announced else None
     if name == "heading":
         step = (wrap(step[0]),)
-    is_measured = seconds <= (_MAX_INTERVAL if is_known else _MAX_UNKNOWN)
-    tolerance = _UNKNOWN_SPEED * seconds
-    if is_measured and is_known:
-        tolerance = _NOISE + min(_JERK * seconds**3, _SPEED * seconds)
-        tolerance += 2 * math.hypot(*changes) if seconds > _SURE_INTERVAL else 0.0
-    elif not is_measured:
-        tolerance += math.hypot(*motion)
-    best = min(announced, key=lambda jump: math.dist(jump, step), default=None)
-    if best is not None and math.dist(best, step) <= tolerance:
-        return best
+    measured_interval = _MEASURED_INTERVAL if motion.is_known else _MEASURED_WITHOUT_RATES
+    is_measured = seconds <= measured_interval
+    if announced:
+        best = min(announced, key=lambda jump: math.dist(jump, step))
+        if math.dist(best, step) <= _tolerance(motion, seconds, is_measured=is_measured):
+            return best
     return step if is_measured else None
 
 
-def _motion(
-    value: str, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float
-) -> tuple[float, float]:
-    """Return how far a value moved by its rates at both messages, NaN if unknown, and by how much the rates differ."""
-    if value == "heading":  # the gyroscopes' heading has no resets
+def _announced_jumps(
+    name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any]
+) -> list[Point]:
+    """Return the jumps that the messages announce: the delta of a single reset, and those of a new origin."""
+    jumps: list[Point] = []
+    counter = RESET_COUNTERS[name]
+    if (after[counter] - before[counter]) % 256 == 1:
+        delta = after[f"delta_{name}"]
+        jumps.append(delta if isinstance(delta, tuple) else (delta,))
+    origin_before = [before[field] for field in _ORIGIN]
+    origin_after = [after[field] for field in _ORIGIN]
+    if name in _FROM_ORIGIN and str(origin_before) != str(origin_after):
+        jumps.append(_no_jump(name))
+        if name == "xy":
+            projection = MapProjection(after["ref_lat"], after["ref_lon"])
+            jumps.append(projection.project(before["ref_lat"], before["ref_lon"]))
+        else:
+            jumps.append((after["ref_alt"] - before["ref_alt"],))
+    return [jump for jump in jumps if all(map(math.isfinite, jump))]
+
+
+def _tolerance(motion: _Motion, seconds: float, *, is_measured: bool) -> float:
+    """Return by how much a delta may differ from the step."""
+    if not is_measured:
+        return _UNKNOWN_SPEED * seconds + math.hypot(*motion.distances)
+    if not motion.is_known:
+        return _UNKNOWN_SPEED * seconds
+    tolerance = _NOISE + min(_JERK * seconds**3, _SPEED * seconds)
+    if seconds > _SURE_INTERVAL:
+        tolerance += 2 * math.hypot(*motion.changes)
+    return tolerance
+
+
+class _Motion(NamedTuple):
+    """The motion of the values of a quantity between two messages, by their rates.
+
+    `distances`: how far each value moved, 0 if unknown; `changes`: by how much its rates differ, times the interval.
+    """
+
+    distances: Point
+    changes: Point
+    is_known: bool
+
+
+def _motion_of(
+    name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any], seconds: float
+) -> _Motion:
+    if name == "heading":  # the gyroscopes' heading has no resets
         turned: float = after["unaided_heading"] - before["unaided_heading"]
-        return (wrap(turned) if math.isfinite(turned) else math.nan), 0.0
-    for name in _RATES[value]:
-        if rates := [rate for rate in (before[name], after[name]) if math.isfinite(rate)]:
-            sign = -1 if value == "dist_bottom" else 1
-            return sign * fmean(rates) * seconds, (max(rates) - min(rates)) * seconds
-    return math.nan, 0.0
+        if math.isfinite(turned):
+            return _Motion((wrap(turned),), (0.0,), is_known=True)
+        return _Motion((0.0,), (0.0,), is_known=False)
+    distances: list[float] = []
+    changes: list[float] = []
+    is_known = True
+    for value in _VALUES[name]:
+        rates = _rates_of(value, before, after)
+        if not rates:
+            rates = [0.0]
+            is_known = False
+        distances.append(fmean(rates) * seconds)
+        changes.append((max(rates) - min(rates)) * seconds)
+    return _Motion(tuple(distances), tuple(changes), is_known)
+
+
+def _rates_of(value: str, before: Mapping[str, Any], after: Mapping[str, Any]) -> list[float]:
+    """Return the finite rates of change of a value at both messages; an empty list if all are unknown."""
+    for rate in _RATES.get(value, ()):
+        rates = [message[rate] for message in (before, after) if math.isfinite(message[rate])]
+        if value == "dist_bottom":  # which falls by vz
+            rates = [-number for number in rates]
+        if rates:
+            return rates
+    return []

@@ -8,8 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
-from typing import Final, TypeAlias, cast
+from typing import Any, Final, TypeAlias, cast
 
+from . import limits
 from .errors import AddressError, ArgumentError
 from .model.declaration import Topic
 from .model.definition import MESSAGES, TOPICS
@@ -26,12 +27,13 @@ REJECTED: Final = "/@rejected"
 """Appended to the prefix in the keys of reports on rejected messages."""
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-_MAX_LENGTH: Final = 64  # characters of a topic, and of a vehicle
+
 _TYPO_SIMILARITY: Final = 0.9  # minimum similarity of a name that counts as a misspelling
 _STREAM = re.compile(r"/([^/]*)/([^/]*)(?:/(0|[1-9][0-9]{0,2}))?")
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
-_OUT, _IN = ("fmu", "out"), ("fmu", "in")
+_OUT: Final = ("fmu", "out")
+_IN: Final = ("fmu", "in")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -57,10 +59,10 @@ class Address(_Hashed):
 
     def __post_init__(self) -> None:
         check_vehicle(self.vehicle)
-        _check_instance(self.topic, self.instance, required=get_topic(self.topic).instances is True)
-        object.__setattr__(
-            self, "__hash__", hash((self.vehicle, self.topic, self.instance)).__int__
-        )
+        has_instances = get_topic(self.topic).instances is True
+        _check_instance(self.topic, self.instance, required=has_instances)
+        value = hash((self.vehicle, self.topic, self.instance))
+        object.__setattr__(self, "__hash__", value.__int__)
 
     __hash__ = _Hashed.__hash__  # type: ignore[misc] # the slot, because a dataclass would define a method
 
@@ -70,10 +72,13 @@ class Address(_Hashed):
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
         """Parse a key; raise AddressError if it is not the key of one address, for example if it has wildcards."""
-        found = _STREAM.fullmatch(key.removeprefix(prefix)) if key.startswith(prefix) else None
-        if found is None:
+        parts = None
+        if key.startswith(prefix):
+            parts = _STREAM.fullmatch(key.removeprefix(prefix))
+        if parts is None:
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
-        return cls(found[1], found[2], None if found[3] is None else int(found[3]))
+        vehicle, topic, instance = parts.groups()
+        return cls(vehicle, topic, None if instance is None else int(instance))
 
     def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression of this address."""
@@ -177,10 +182,14 @@ class Selection:
         """The part of a key expression after the vehicle, for each topic."""
         if self.topics == (ANY,):
             return ["**"]
+        if self.instance is not None:
+            return [f"{topic}/{self.instance}" for topic in self.topics]
         any_instance = {True: f"/{ANY}", False: "", None: "/**"}
-        if self.instance is None:
-            return [f"{topic}{any_instance[get_topic(topic).instances]}" for topic in self.topics]
-        return [f"{topic}/{self.instance}" for topic in self.topics]
+        streams: list[str] = []
+        for topic in self.topics:
+            has_instances = get_topic(topic).instances
+            streams.append(f"{topic}{any_instance[has_instances]}")
+        return streams
 
     def __str__(self) -> str:
         parts = []
@@ -195,9 +204,12 @@ class Selection:
 
 def _distinct(what: str, given: object) -> tuple[str, ...]:
     """Return the distinct names in one name or several, only "*" if it is among them; the caller checks them."""
-    several = given if isinstance(given, Iterable) and not isinstance(given, str) else [given]
+    given_names: Iterable[Any] = [given]
+    if isinstance(given, Iterable) and not isinstance(given, str):
+        given_names = given
     names: list[str] = []
-    for name in map(vehicle_name, several):
+    for given_name in given_names:
+        name = vehicle_name(given_name)
         if name not in names:  # compared, because a wrong value may not be hashable
             names.append(name)
     if not names:
@@ -250,11 +262,14 @@ def parse_status_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> tuple[str | N
 
 def prefix_of(key: str) -> str:
     """Return the prefix of the key of a message or of a publisher's token; "" if it has none, as in plain ROS 2."""
-    vehicle, alive, _ = key.partition("/@alive/")
-    before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
+    before_token, alive, _ = key.partition("/@alive/")
+    chunks = before_token.split("/")
+    if not alive:
+        chunks = chunks[:-1]  # without the topic
+    prefix = chunks[:-1]  # without the vehicle
     # `<domain>/fmu/out/vehicle_local_position`
-    is_ros2_domain = bool(before) and before[0].isdecimal()
-    return "" if is_ros2_domain else "/".join(before)
+    is_ros2_domain = bool(prefix) and prefix[0].isdecimal()
+    return "" if is_ros2_domain else "/".join(prefix)
 
 
 def ack_key(key_expr: str) -> str:
@@ -274,22 +289,24 @@ def get_topic(name: object) -> Topic:
 
 @lru_cache(1024)
 def _other_topic(name: str) -> Topic:
-    if not _TOPIC.fullmatch(name) or len(name) > _MAX_LENGTH:
-        topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
-        if re.search(r"(^|/)(in|out)/", name):
-            raise AddressError(
-                "topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix"
-            )
-        base, _, instance = name.partition("/")
-        expected = f"one of {', '.join(topics)}"
-        if topics is TOPICS:
-            expected += ", or another PX4 topic in lower_snake_case"
-        raise AddressError(
-            "topic", name, f"{base} with instance {instance}" if base in TOPICS else expected
-        )
-    if meant := get_close_matches(name, TOPICS, 3, _TYPO_SIMILARITY):
-        raise AddressError("topic", name, f"{' or '.join(meant)} (looks like a misspelling)")
+    if not _TOPIC.fullmatch(name) or len(name) > limits.NAME:
+        raise AddressError("topic", name, _expected_topic(name))
+    similar = get_close_matches(name, TOPICS, 3, _TYPO_SIMILARITY)
+    if similar:
+        raise AddressError("topic", name, f"{' or '.join(similar)} (looks like a misspelling)")
     return Topic(name, 0.0, "another PX4 topic", instances=None)
+
+
+def _expected_topic(name: str) -> str:
+    """Return what to give instead of a name that no topic can have."""
+    if re.search(r"(^|/)(in|out)/", name):
+        return f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix"
+    base, _, instance = name.partition("/")
+    if base in TOPICS:
+        return f"{base} with instance {instance}"
+    if name in MESSAGES:
+        return f"one of {', '.join(MESSAGES[name].topics)}"
+    return f"one of {', '.join(TOPICS)}, or another PX4 topic in lower_snake_case"
 
 
 def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
@@ -303,11 +320,15 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
     *path, name = topic.strip("/").split("/")
     if tuple(path[-2:]) in (_OUT, _IN):
         path = path[:-2]
-    found = None if name in TOPICS else _ROS2_TOPIC.fullmatch(name)
-    uorb, number = found.groups() if found else (name, None)
-    if number is None and get_topic(uorb).instances:
-        number = 0
-    return "/".join(path), uorb, None if number is None else int(number)
+    namespace = "/".join(path)
+    digits = None
+    if name not in TOPICS:
+        parts = _ROS2_TOPIC.fullmatch(name)
+        if parts:
+            name, digits = parts.groups()
+    if digits is not None:
+        return namespace, name, int(digits)
+    return namespace, name, 0 if get_topic(name).instances else None
 
 
 def is_vehicle_input(topic: str) -> bool:
@@ -317,16 +338,21 @@ def is_vehicle_input(topic: str) -> bool:
 
 def ros2_topic_of(address: Address, namespace: str) -> str:
     """Return the ROS 2 topic of an address, without a leading slash; an empty namespace means none."""
-    plain = address.instance is None or (
-        address.instance == 0 and get_topic(address.topic).plain_first
-    )
-    topic = address.topic if plain else f"{address.topic}_{address.instance}"
-    return "/".join(filter(None, (namespace.strip("/"), *_OUT, topic)))
+    is_plain = address.instance is None
+    if address.instance == 0:
+        is_plain = get_topic(address.topic).plain_first
+    topic = "/".join([*_OUT, address.topic])
+    if not is_plain:
+        topic += f"_{address.instance}"
+    namespace = namespace.strip("/")
+    return f"{namespace}/{topic}" if namespace else topic
 
 
 def vehicle_name(vehicle: str | int) -> str:
     """Return the name of a vehicle, given by name or by number, such as a MAVLink system id."""
-    return str(vehicle) if type(vehicle) is int else cast("str", vehicle)
+    if type(vehicle) is int:
+        return str(vehicle)
+    return cast("str", vehicle)
 
 
 def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
@@ -334,12 +360,15 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 
     Raises AddressError for a topic of another message, and for a class that declares no topics.
     """
-    declared = vars(message).get("TOPICS", ()) if isinstance(message, type) else ()
-    topics = [message] if isinstance(message, str) else [each.name for each in declared]
+    topics: list[str] = []
+    if isinstance(message, str):
+        topics = [message]
+    elif isinstance(message, type):
+        topics = [declared.name for declared in vars(message).get("TOPICS", ())]
     name = getattr(message, "__name__", message)
     if not topics:
         raise AddressError("message", name, "a class that declares TOPICS, or the name of a topic")
-    if topic not in (None, *topics):
+    if topic is not None and topic not in topics:
         raise AddressError("topic", topic, f"one of {name}: {', '.join(topics)}")
     return topic or topics[0]
 
@@ -350,20 +379,19 @@ def check_vehicle(vehicle: object) -> str:
         raise AddressError(
             "vehicle", vehicle, 'a name, such as "7", a list of names, or "*" for all'
         )
-    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _MAX_LENGTH:
-        raise AddressError("vehicle", vehicle, f"1 to {_MAX_LENGTH} of A-Z a-z 0-9 _ -")
+    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > limits.NAME:
+        raise AddressError("vehicle", vehicle, f"1 to {limits.NAME} of A-Z a-z 0-9 _ -")
     return vehicle
 
 
 def _check_instance(topic: str, instance: int | None, *, required: bool = False) -> None:
+    if instance is None and not required:
+        return
     if instance is not None and get_topic(topic).instances is False:
         raise AddressError("instance", instance, f"none ({topic} has no instances)")
-    if (required or instance is not None) and (
-        type(instance) is not int or not 0 <= instance < _INSTANCES
-    ):
-        raise AddressError(
-            "instance", instance, f"an integer from 0 to {_INSTANCES - 1} for {topic}"
-        )
+    if type(instance) is not int or not 0 <= instance < _INSTANCES:
+        expected = f"an integer from 0 to {_INSTANCES - 1} for {topic}"
+        raise AddressError("instance", instance, expected)
 
 
 def check_prefix(prefix: str) -> None:
@@ -374,9 +402,8 @@ def check_prefix(prefix: str) -> None:
 
 def check_max_rate(max_rate: object) -> None:
     """Raise ArgumentError unless `max_rate` is a finite number above 0."""
-    if (
-        isinstance(max_rate, bool)
-        or not isinstance(max_rate, int | float)
-        or not 0 < max_rate < math.inf
-    ):
+    is_positive = False
+    if isinstance(max_rate, int | float) and not isinstance(max_rate, bool):
+        is_positive = 0 < max_rate < math.inf
+    if not is_positive:
         raise ArgumentError("max_rate", max_rate, "messages per second, a finite number above 0")

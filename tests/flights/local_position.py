@@ -171,7 +171,7 @@ def next_release() -> Definition[Any]:
     *older, last = VehicleLocalPosition.LAYOUTS
     model.LAYOUTS = (
         *older,
-        replace(last, text="2.0, without brand_new"),
+        replace(last, base="2.0", without="brand_new"),
         Layout("2.0", "*", wire=2),
     )
     model.DEFINITION = definition = Definition[Any](model)

@@ -38,16 +38,23 @@ class CdrLayout:
         self.offsets: dict[str, int] = {}
         for name, kind in layout.types.items():
             padding = 0 if kind.is_text else -size % kind.size
-            body += (f"{padding}x" if padding else "") + kind.form
-            self.offsets[name] = len(HEADER) + size + padding
+            if padding:
+                body += f"{padding}x"
+            body += kind.form
+            offset = len(HEADER) + size + padding
+            self.offsets[name] = offset
             if kind.base == "bool":
-                self.bool_mask |= int.from_bytes(b"\xfe" * kind.values) << 8 * self.offsets[name]
-            size += padding + kind.size * kind.values
-            unpadded += kind.size * kind.values
-        px4_struct = unpadded + -unpadded % 8
+                mask = int.from_bytes(b"\xfe" * kind.values)
+                self.bool_mask |= mask << 8 * offset
+            bytes_of_values = kind.size * kind.values
+            size += padding + bytes_of_values
+            unpadded += bytes_of_values
+        px4_struct = unpadded + -unpadded % 8  # to the next multiple of 8
         self.limit = len(HEADER) + max(size, px4_struct + _PX4_TRAILER)
-        self.body, self.zeros = struct.Struct(body), HEADER + bytes(size)
-        self.size, self.name = len(self.zeros), layout.name
+        self.body = struct.Struct(body)
+        self.zeros = HEADER + bytes(size)
+        self.size = len(self.zeros)
+        self.name = layout.name
         self.validation = Validation(layout.types, ())
 
     def check(self, payload: bytes) -> str | None:
@@ -59,12 +66,12 @@ class CdrLayout:
         if not size <= len(payload) <= self.limit:
             sizes = f"{size}" if self.limit == size else f"{size} to {self.limit}"
             return f"{len(payload)} bytes, expected {sizes} for layout {self.name}"
-        if wrong := int.from_bytes(payload[:size], "little") & self.bool_mask:
-            offset = ((wrong & -wrong).bit_length() - 1) // 8
-            name = next(
-                name for name, first in reversed([*self.offsets.items()]) if first <= offset
-            )
-            return f"{name} is {payload[offset]}, not a bool (0 or 1)"
+        wrong = int.from_bytes(payload[:size], "little") & self.bool_mask
+        if wrong:
+            lowest_bit = (wrong & -wrong).bit_length() - 1
+            offset = lowest_bit // 8
+            before = [name for name, first in self.offsets.items() if first <= offset]
+            return f"{before[-1]} is {payload[offset]}, not a bool (0 or 1)"
         return None
 
 
@@ -79,9 +86,8 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     cdr = cdr_layout(layout)
     if reason := cdr.check(payload):
         raise DecodeError(f"{reason}{_explain_size(definition, payload, layout)}", definition.name)
-    return cdr.validation.by_name(
-        cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER)))
-    )
+    values = cdr.body.unpack_from(payload, len(HEADER))
+    return cdr.validation.by_name(cdr.validation.unflatten(values))
 
 
 def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None:
@@ -89,15 +95,21 @@ def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None
 
     A payload has the size of the layout, or else that with the bytes that PX4 appends.
     """
-    forms = [(layout, cdr_layout(layout)) for layout in definition.layouts.values()]
-    found = list[Layout]()
-    exact = [layout for layout, cdr in forms if len(payload) - cdr.size in range(_ALIGNMENT)]
-    for layout in exact or [layout for layout, cdr in forms if len(payload) == cdr.limit]:
+    exact: list[Layout] = []
+    with_trailer: list[Layout] = []
+    for layout in definition.layouts.values():
+        cdr = cdr_layout(layout)
+        if 0 <= len(payload) - cdr.size < _ALIGNMENT:
+            exact.append(layout)
+        if len(payload) == cdr.limit:
+            with_trailer.append(layout)
+    fitting: list[Layout] = []
+    for layout in exact or with_trailer:
         if not cdr_layout(layout).check(payload):
             with suppress(InvalidMessageError):
                 encode_upgraded(definition, decode_with(definition, payload, layout))
-                found.append(layout)
-    return found[0] if len(found) == 1 else None
+                fitting.append(layout)
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def _explain_size(definition: Definition[Any], payload: bytes, layout: Layout) -> str:
@@ -105,14 +117,15 @@ def _explain_size(definition: Definition[Any], payload: bytes, layout: Layout) -
     fits = fitting_layout(definition, payload)
     if fits is None or fits is layout:
         return ""
-    is_release = fits.name in RELEASES
-    remedy = (
-        f"rebuild px4_msgs at release/{fits.name}"
-        if is_release
-        else "rebuild px4_msgs at the vehicle's version"
+    version = f"{fits.name}, a development version of PX4"
+    branch = "the vehicle's version"
+    if fits.name in RELEASES:
+        version = f"PX4 {fits.name}"
+        branch = f"release/{fits.name}"
+    return (
+        f"; they fit the layout of {version}: the vehicle's px4_msgs differ,"
+        f" rebuild px4_msgs at {branch}"
     )
-    which = f"PX4 {fits.name}" if is_release else f"{fits.name}, a development version of PX4"
-    return f"; they fit the layout of {which}: the vehicle's px4_msgs differ, {remedy}"
 
 
 def encode_with(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> bytes:
@@ -125,11 +138,15 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
     cdr = cdr_layout(layout)
     row = cdr.validation.values_of(fields)
     try:
-        return HEADER + cdr.body.pack(*cdr.validation.flatten(cdr.validation.validate(row)))
+        values = cdr.validation.flatten(cdr.validation.validate(row))
+        return HEADER + cdr.body.pack(*values)
     except ValidationError as exc:
-        name, problem = list(layout.types)[int(exc.errors()[0]["loc"][0])], "is not of type"
+        position = int(exc.errors()[0]["loc"][0])
+        name = list(layout.types)[position]
+        problem = "is not of type"
     except OverflowError:
-        (name, _), problem = next(cdr.validation.overflows(fields)), "is beyond the range of"
+        name, _ = next(cdr.validation.overflows(fields))
+        problem = "is beyond the range of"
     raise EncodeError(
         f"{name}={fields[name]!r:.40} {problem} {layout.types[name]}", definition.name
     )

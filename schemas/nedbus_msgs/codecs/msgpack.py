@@ -6,8 +6,7 @@ Any other valid msgpack encoding of the array is decoded as well.
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Generic, cast
+from typing import Any, Final, Generic, NamedTuple, cast
 
 import msgpack
 from pydantic import ValidationError
@@ -27,33 +26,64 @@ NewerLayouts = Mapping[int, Sequence[str]]
 """Field names of layouts unknown to this version, by layout number."""
 
 
-def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
-    """Return the msgpack bytes of a type with zeros for values, their struct format, and the bit mask of the values.
+class FullWidth(NamedTuple):
+    """The msgpack encoding of one field, or of a whole payload, at full width.
+
+    `tags`: its bytes with zeros for the values. `code`: the struct format of the values, without byte order.
+    `bits`: the bit mask of the values. `offsets`: the offset of each value.
+
+    For float32[2]:
+
+        tags     92 ca 00 00 00 00 ca 00 00 00 00
+        code     "1x1xf1xf"
+        bits     00 00 ff ff ff ff 00 ff ff ff ff
+        offsets  2, 7
+    """
+
+    tags: bytes
+    code: str
+    bits: bytes
+    offsets: tuple[int, ...]
+
+
+def full_width(kind: FieldType) -> FullWidth:
+    """Return the encoding of a type.
 
     A bool is a tag alone, 0xc2 or 0xc3: its last bit is the value. Text is a str 16, padded with NUL.
     """
-    base = BASES[kind.base]
-    tag = bytes([base.tag]) + (kind.size.to_bytes(2, "big") if kind.is_text else b"")
-    code = f"{len(tag)}x{kind.form if kind.is_text else base.code}"
-    one = tag + bytes(kind.size), code, bytes(len(tag)) + b"\xff" * kind.size
+    tag = bytes([BASES[kind.base].tag])
+    if kind.is_text:
+        tag += kind.size.to_bytes(2, "big")
+        return _tagged(tag, kind.form, kind.size)
     if kind.base == "bool":
-        one = tag, "?", b"\x01"
-    if kind.length is None or kind.is_text:
-        return one
-    head = (
-        bytes([0x90 | kind.length])
-        if kind.length < 16
-        else b"\xdc" + kind.length.to_bytes(2, "big")
-    )
-    tags, form, bits = one
-    return (
-        head + tags * kind.length,
-        f"{len(head)}x" + form * kind.length,
-        bytes(len(head)) + bits * kind.length,
+        value = FullWidth(tag, "?", b"\x01", (0,))
+    else:
+        value = _tagged(tag, BASES[kind.base].code, kind.size)
+    if kind.length is None:
+        return value
+    return _array_of(value, kind.length)
+
+
+def _tagged(tag: bytes, code: str, size: int) -> FullWidth:
+    """Return the encoding of a value of `size` bytes after its tag."""
+    bits = bytes(len(tag)) + b"\xff" * size
+    return FullWidth(tag + bytes(size), f"{len(tag)}x{code}", bits, (len(tag),))
+
+
+def _array_of(value: FullWidth, length: int) -> FullWidth:
+    head = b"\xdc" + length.to_bytes(2, "big")
+    if length < 16:
+        head = bytes([0x90 | length])
+    (first,) = value.offsets
+    step = len(value.tags)
+    return FullWidth(
+        head + value.tags * length,
+        f"{len(head)}x" + value.code * length,
+        bytes(len(head)) + value.bits * length,
+        tuple(len(head) + first + index * step for index in range(length)),
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Codec(Generic[M]):
     """The codec of one message.
 
@@ -62,155 +92,179 @@ class Codec(Generic[M]):
     `offsets`: field, array index and payload offset of every value.
     `encode_flat(values)`: return the payload of valid values, flattened by the validation; raise OverflowError for one
     beyond the range of its float32 field.
-
-    `encode(message)`: return the payload of a message; float32 fields are rounded.
-    Raises EncodeError for a value that does not fit its field, in a message whose validation was bypassed.
-    `encode_fields(fields)`: validate fields and return their payload, without building a model.
-    Raises InvalidMessageError for an invalid message.
-    `encode_row(values)`: the same for the values of all fields in order.
-    Also raises EncodeError for a wrong number of values.
-    `decode(payload, newer=...)`: return the validated message of a payload.
-    Raises UnknownLayoutError for a layout number that is neither known nor in `newer`, DecodeError for any other
-    invalid payload: wrong types or lengths, missing or trailing bytes, values that the model rejects.
-    `decode_row(payload, newer=...)`: the same, as a Row.
     """
 
-    definition: Definition[M]
-    size: int
-    tags: int
-    tag_mask: int
-    offsets: tuple[tuple[str, int, int], ...]
-    encode_flat: Callable[[Values], bytes]
-    encode: Callable[[M], bytes]
-    encode_fields: Callable[[Mapping[str, object]], bytes]
-    encode_row: Callable[[Sequence[object]], bytes]
-    decode: Callable[..., M]
-    decode_row: Callable[..., M]
+    __slots__ = (
+        "_all_fields",
+        "_by_name",
+        "_decode_full_width",
+        "_flatten",
+        "_make_row",
+        "_validation",
+        "definition",
+        "encode_flat",
+        "offsets",
+        "size",
+        "tag_mask",
+        "tags",
+    )
+
+    def __init__(self, definition: Definition[M]) -> None:
+        self.definition = definition
+        form, self.offsets = _payload_form(definition.types, cast("int", definition.current.wire))
+        self.size = len(form.tags)
+        self.tags = int.from_bytes(form.tags, "big")
+        all_bits = (1 << 8 * self.size) - 1
+        self.tag_mask = all_bits ^ int.from_bytes(form.bits, "big")
+        self._validation = definition.validation
+        self._flatten = self._validation.flatten
+        self._by_name = self._validation.by_name
+        self._all_fields = definition.all_fields
+        self._make_row = definition.row
+        packed = struct.Struct(">" + form.code)
+        self.encode_flat = self._encoder(packed)
+        self._decode_full_width = self._decoder(packed)
+
+    # The two functions of every message are closures, because that avoids attribute access on the hot path.
+
+    def _encoder(self, packed: struct.Struct) -> Callable[[Values], bytes]:
+        pack = packed.pack
+        from_bytes = int.from_bytes
+        size = self.size
+        tags = self.tags
+
+        def encode_flat(values: Values) -> bytes:
+            # The packed struct has zeros for the tags, and `tags` has zeros for the values.
+            return (from_bytes(pack(*values), "big") | tags).to_bytes(size, "big")
+
+        return encode_flat
+
+    def _decoder(self, packed: struct.Struct) -> Callable[[bytes], Values | None]:
+        from_bytes = int.from_bytes
+        size = self.size
+        tags = self.tags
+        tag_mask = self.tag_mask
+        passes_rules = self._validation.passes_rules
+        unflatten = self._validation.unflatten
+        has_text = self.definition.has_text
+        unpack = msgpack.unpackb
+
+        def decode_full_width(payload: bytes) -> Values | None:
+            """Decode a payload in the form that `encode` writes; return None for any other, or a broken rule."""
+            if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
+                return None
+            # The tags prove type and range of every value; only the rules are left to check.
+            row: Values
+            if has_text:  # which ends at the first NUL, and may contain invalid UTF-8
+                values = (from_bytes(payload, "big") ^ tags).to_bytes(size, "big")
+                row = unflatten(packed.unpack(values))
+            else:
+                row = unpack(payload, use_list=False)[1:]
+            return row if passes_rules(row) else None
+
+        return decode_full_width
+
+    def encode(self, message: M) -> bytes:
+        """Return the payload of a message; float32 fields are rounded.
+
+        Raises EncodeError for a value that does not fit its field, in a message whose validation was bypassed.
+        """
+        try:
+            return self.encode_flat(self._flatten(tuple(message.__dict__.values())))
+        except (struct.error, OverflowError, TypeError) as exc:
+            raise EncodeError(str(exc), self.definition.name) from exc
+
+    def encode_fields(self, fields: Mapping[str, object]) -> bytes:
+        """Validate fields and return their payload, without building a model.
+
+        Raises InvalidMessageError for an invalid message.
+        """
+        row = self._validation.row_of(fields)
+        if row is None:
+            return self.encode(self._to_model(fields))
+        return self._encode_valid(row)
+
+    def encode_row(self, values: Sequence[object]) -> bytes:
+        """Validate the values of all fields in order, and return their payload.
+
+        Raises InvalidMessageError for an invalid message, EncodeError for a wrong number of values.
+        """
+        values = tuple(values)
+        count = len(self.definition.names)
+        if len(values) != count:
+            raise EncodeError(f"{len(values)} values, expected {count}", self.definition.name)
+        row = self._validation.check_row(values)
+        if row is None:
+            return self.encode(self._to_model(self._by_name(values)))
+        return self._encode_valid(row)
+
+    def _encode_valid(self, row: Values) -> bytes:
+        try:
+            return self.encode_flat(self._flatten(row))
+        except OverflowError:  # beyond float32; the model raises the error
+            return self.encode(self._to_model(self._by_name(row)))
+
+    def _to_model(self, fields: Mapping[str, object]) -> M:
+        try:
+            return self.definition.model.model_validate(dict(fields))
+        except ValidationError as exc:
+            details = exc.errors(include_url=False)
+            violations = [(str(detail["loc"][0]), detail["msg"]) for detail in details]
+            reason = describe(exc, self.definition)
+            raise InvalidMessageError(reason, violations, message=self.definition.name) from exc
+
+    def decode(self, payload: bytes, *, newer: NewerLayouts | None = None) -> M:
+        """Return the validated message of a payload; `newer`: layouts unknown to this version.
+
+        Raises UnknownLayoutError for a layout number that is neither known nor in `newer`, DecodeError for any other
+        invalid payload: wrong types or lengths, missing or trailing bytes, values that the model rejects.
+        """
+        row = self._decode_full_width(payload)
+        if row is None:
+            return self._decode_any(payload, newer)
+        model = self.definition.model
+        return fill(model.__new__(model), self._by_name(row), self._all_fields)
+
+    def decode_row(self, payload: bytes, *, newer: NewerLayouts | None = None) -> M:
+        """Return the same as a Row, which type checkers treat as the message."""
+        row = self._decode_full_width(payload)
+        if row is None:
+            row = tuple(self._decode_any(payload, newer).__dict__.values())
+        return cast("M", tuple.__new__(self._make_row, row))
+
+    def _decode_any(self, payload: bytes, newer: NewerLayouts | None) -> M:
+        """Decode any msgpack encoding of any known layout."""
+        fields = _unpack_fields(self.definition, payload, newer or {})
+        try:
+            return upgrade_with(self.definition, fields)
+        except ValidationError as exc:
+            raise DecodeError(describe(exc, self.definition), self.definition.name) from exc
 
 
 @cached_on_owner
 def codec_of(definition: Definition[M]) -> Codec[M]:
-    """Return the codec of a message; its functions are closures, to avoid attribute access on the hot path."""
-    name = definition.name
-    types = definition.types
-    model = definition.model
-    validation, make_row = definition.validation, definition.row
-    check_row = validation.check_row
-    row_of = validation.row_of
-    passes_rules = validation.passes_rules
-    by_name, flatten = validation.by_name, validation.flatten
-    count = len(types)
-    head = struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
-    tags, tag_mask, packed, offsets = _payload_parts(types, head)
-    size = packed.size
-    pack_flat = packed.pack
-    unpack_flat = packed.unpack
-    new_row = tuple.__new__
-    unpack = msgpack.unpackb
-    from_bytes = int.from_bytes
-    all_fields = definition.all_fields
-
-    def pack(row: Values) -> bytes:
-        """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
-        return encode_flat(flatten(row))
-
-    def encode_flat(values: Values) -> bytes:
-        # The packed struct has zeros for the tags, and `tags` has zeros for the values.
-        return (from_bytes(pack_flat(*values), "big") | tags).to_bytes(size, "big")
-
-    def encode(message: M) -> bytes:
-        try:
-            return pack(tuple(message.__dict__.values()))
-        except (struct.error, OverflowError, TypeError) as exc:
-            raise EncodeError(str(exc), name) from exc
-
-    def encode_fields(fields: Mapping[str, object]) -> bytes:
-        row = row_of(fields)
-        return encode(to_model(fields)) if row is None else encode_valid(row)
-
-    def encode_row(values: Sequence[object]) -> bytes:
-        values = tuple(values)
-        if len(values) != count:
-            raise EncodeError(f"{len(values)} values, expected {count}", name)
-        row = check_row(values)
-        return encode(to_model(by_name(values))) if row is None else encode_valid(row)
-
-    def encode_valid(row: Values) -> bytes:
-        try:
-            return pack(row)
-        except OverflowError:  # beyond float32; the model raises the error
-            return encode(to_model(by_name(row)))
-
-    def to_model(fields: Mapping[str, object]) -> M:
-        try:
-            return model.model_validate(dict(fields))
-        except ValidationError as exc:
-            violations = [
-                (str(detail["loc"][0]), detail["msg"]) for detail in exc.errors(include_url=False)
-            ]
-            raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
-
-    def decode_full_width(payload: bytes) -> Values | None:
-        """Decode a payload in the form that `encode` writes; return None for any other, which `decode_any` decodes."""
-        if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
-            return None
-        # The tags prove type and range of every value; only the rules are left to check.
-        row: Values = (
-            decode_values(payload) if definition.has_text else unpack(payload, use_list=False)[1:]
-        )
-        return row if passes_rules(row) else None
-
-    def decode_values(payload: bytes) -> Values:
-        """Decode a payload with text, which ends at the first NUL and may contain invalid UTF-8."""
-        return validation.unflatten(
-            unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big"))
-        )
-
-    def decode_any(payload: bytes, newer: NewerLayouts | None) -> M:
-        """Decode any msgpack encoding of any known layout."""
-        try:
-            return upgrade_with(definition, _unpack_fields(definition, payload, newer or {}))
-        except ValidationError as exc:
-            raise DecodeError(describe(exc, definition), name) from exc
-
-    def decode(payload: bytes, *, newer: NewerLayouts | None = None) -> M:
-        row = decode_full_width(payload)
-        if row is None:
-            return decode_any(payload, newer)
-        return fill(model.__new__(model), by_name(row), all_fields)
-
-    def decode_row(payload: bytes, *, newer: NewerLayouts | None = None) -> M:  # a Row at run time
-        row = decode_full_width(payload)
-        values = tuple(decode_any(payload, newer).__dict__.values()) if row is None else row
-        return cast("M", new_row(make_row, values))
-
-    return Codec(
-        definition, size, tags, tag_mask, offsets,
-        encode_flat, encode, encode_fields, encode_row, decode, decode_row,
-    )  # fmt: skip
+    """Return the cached codec of a message."""
+    return Codec(definition)
 
 
-def _payload_parts(
-    types: Mapping[str, FieldType], head: bytes
-) -> tuple[int, int, struct.Struct, tuple[tuple[str, int, int], ...]]:
-    """Return the tags, the mask of bits that are not values, the struct of the values, and the offset of each."""
+def _payload_form(
+    types: Mapping[str, FieldType], layout: int
+) -> tuple[FullWidth, tuple[tuple[str, int, int], ...]]:
+    """Return the encoding of a payload, and field, array index and offset of every value."""
+    head = struct.pack(">BHB", 0xDC, 1 + len(types), layout)
     tags = head
-    values = bytes(len(head))
-    code = f">{len(head)}x"
+    code = f"{len(head)}x"
+    bits = bytes(len(head))
     offsets: list[tuple[str, int, int]] = []
     for name, kind in types.items():
-        field_tags, field_code, field_bits = full_width(kind)
-        tags = tags + field_tags
-        values = values + field_bits
-        code = code + field_code
-        tag = 3 * kind.is_text or int(kind.base != "bool")  # tag bytes before each value
-        step = tag + kind.size
-        offsets += [
-            (name, part, len(tags) - (kind.values - part) * step + tag)
-            for part in range(kind.values)
-        ]
-    mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
-    return int.from_bytes(tags, "big"), mask, struct.Struct(code), tuple(offsets)
+        field = full_width(kind)
+        for index, offset in enumerate(field.offsets):
+            offsets.append((name, index, len(tags) + offset))
+        tags += field.tags
+        code += field.code
+        bits += field.bits
+    form = FullWidth(tags, code, bits, tuple(offset for _, _, offset in offsets))
+    return form, tuple(offsets)
 
 
 def describe(error: ValidationError, definition: Definition[Any]) -> str:
@@ -220,9 +274,9 @@ def describe(error: ValidationError, definition: Definition[Any]) -> str:
         reason = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
         if detail["type"] == "extra_forbidden":
             reason = definition.explain_unknown_field(str(detail["loc"][0]))
-        reasons.append(
-            reason if detail["type"] == "missing" else f"{reason} (is {detail['input']!r:.40})"
-        )
+        if detail["type"] != "missing":
+            reason += f" (is {detail['input']!r:.40})"
+        reasons.append(reason)
     return "; ".join(reasons)
 
 
@@ -245,15 +299,16 @@ def _unpack_fields(
         ) from exc
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
         raise reject("the payload is not an array that starts with a layout number")
-    layout, *values = array
-    known = {
-        each.wire: each.fields for each in definition.layouts.values() if each.wire is not None
-    }
-    names = {**newer, **known}.get(layout)
+    number, *values = array
+    known: dict[int, Sequence[str]] = {}
+    for layout in definition.layouts.values():
+        if layout.wire is not None:
+            known[layout.wire] = layout.fields
+    names = known.get(number) or newer.get(number)
     if names is None:
-        raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
+        raise UnknownLayoutError(number, len(values), (*known, *newer), definition.name)
     if len(values) != len(names):
-        raise reject(f"{counted(len(values), 'field')}, expected {len(names)} for layout {layout}")
+        raise reject(f"{counted(len(values), 'field')}, expected {len(names)} for layout {number}")
     fields: dict[str, object] = {}
     for name, value in zip(names, values, strict=True):
         # No field has nested arrays, and formatting a deeply nested value would overflow the stack.
@@ -264,7 +319,7 @@ def _unpack_fields(
         # The model would accept floats as text, such as "NaN", for JSON.
         if not is_text and any(isinstance(part, str) for part in parts):
             raise reject(f"{name} has text, expected numbers or bools")
-        fields[name] = (
-            decode_text(value.encode(errors="surrogateescape")) if isinstance(value, str) else value
-        )
+        fields[name] = value
+        if isinstance(value, str):
+            fields[name] = decode_text(value.encode(errors="surrogateescape"))
     return fields

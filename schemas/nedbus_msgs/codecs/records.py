@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
@@ -29,12 +29,12 @@ def encode_upgraded(definition: Definition[Any], fields: Mapping[str, object]) -
     codec = codec_of(definition)
     validation = definition.validation
     upgraded = upgrade_fields(definition, fields)
-    if (values := validation.row_of(upgraded)) is not None:
+    values = validation.row_of(upgraded)
+    if values is not None:
         with suppress(OverflowError):  # beyond float32
             payload = codec.encode_flat(validation.flatten(values))
-            return Encoded(
-                tuple.__new__(definition.row, values), payload, plan.provided, plan.missing
-            )
+            row = tuple.__new__(definition.row, values)
+            return Encoded(row, payload, plan.provided, plan.missing)
     payload = codec.encode_fields(upgraded)  # the model decides
     return Encoded(codec.decode_row(payload), payload, plan.provided, plan.missing)
 
@@ -50,21 +50,25 @@ def record_encoder(
     """
     plan = definition.plan(tuple(types))
     encode_flat = codec_of(definition).encode_flat
-    new = tuple.__new__
+    new = tuple.__new__  # needs half the time of a NamedTuple's constructor
     values_of = _compile(definition, types)
     provided = plan.provided
     missing = plan.missing
-    row_class: type[Row | FlatRow] = definition.row if definition.has_text else definition.flat_row
-    unflatten = definition.validation.unflatten if definition.has_text else None
+    row_class: type[Row | FlatRow] = definition.flat_row
+    unflatten: Callable[[Values], Values] = tuple  # which returns a tuple itself
+    if definition.has_text:
+        row_class = definition.row
+        unflatten = definition.validation.unflatten
 
     def encode(record: bytes) -> Encoded | None:
         try:
-            if not (values := values_of(record, unpack)):
+            values = values_of(record, unpack)
+            if not values:
                 return None
             payload = encode_flat(values)
         except (ValidationError, TypeError, OverflowError):  # a value does not fit its field
             return None
-        row = new(row_class, values if unflatten is None else unflatten(values))
+        row = new(row_class, unflatten(values))
         return new(Encoded, (row, payload, provided, missing))
 
     return encode
@@ -73,55 +77,109 @@ def record_encoder(
 def _compile(
     definition: Definition[Any], types: Mapping[str, FieldType]
 ) -> Callable[[bytes, Callable[[bytes], Values]], Values | None]:
-    """Compile a function from a record to the valid values of a message; false or an exception if it is not valid."""
+    """Compile a function from a record to the valid values of a message; false or an exception if it is not valid.
+
+    For records with the fields and types of a VehicleAttitude, the source is, in one line:
+
+        lambda record, unpack: (values := unpack(record)) and (values := values)
+            and not ((values[1] > values[0]))
+            and not (((values[2:6][0] == values[2:6][0])
+                and (not (abs(squared_norm(values[2:6]) - 1.000001) <= 0.0019999999999998352))))
+            and values
+
+    Where a field is converted, or a type differs, the second `values` is `flatten(validate(unflatten((...,))))`.
+    """
     plan = definition.plan(tuple(types))
     validation = definition.validation
     fields = definition.types
-    copied = [(types[old], fields[name]) for name, old in plan.names.items()]
-    if "timestamp" not in plan.provided or any(
-        (a.values, a.is_text) != (b.values, b.is_text) for a, b in copied
-    ):
-        return lambda *_: None
+    is_copied_exactly = True
+    for name, old in plan.names.items():
+        given = types[old]
+        wanted = fields[name]
+        if (given.values, given.is_text) != (wanted.values, wanted.is_text):
+            return _reject
+        is_copied_exactly = is_copied_exactly and given == wanted
+    if "timestamp" not in plan.provided:
+        return _reject
+    conversion = _Conversion(definition, types)
     functions: dict[str, Callable[..., Any]] = {
-        "encode_text": encode_text, "decode_text": decode_text,
-        "flatten": validation.flatten, "unflatten": validation.unflatten, "validate": validation.validate,
-    }  # fmt: skip
-    text = _conversion(definition, types, functions)
-    if plan.converted or any(a != b for a, b in copied):
-        text = f"flatten(validate(unflatten({text})))"
+        "encode_text": encode_text,
+        "decode_text": decode_text,
+        "flatten": validation.flatten,
+        "unflatten": validation.unflatten,
+        "validate": validation.validate,
+        **conversion.functions,
+    }
+    converted = conversion.text
+    if plan.converted or not is_copied_exactly:
+        converted = f"flatten(validate(unflatten({converted})))"
     else:  # the types of the record prove those of the message
         functions["squared_norm"] = squared_norm
     rules = expression_of(definition.rules, accessors_of(fields))
-    steps = f"(values := unpack(record)) and (values := {text}) and {rules} and values"
+    steps = f"(values := unpack(record)) and (values := {converted}) and {rules} and values"
     return compile_lambda(f"lambda record, unpack: {steps}", **functions)
 
 
-def _conversion(
-    definition: Definition[Any],
-    types: Mapping[str, FieldType],
-    functions: dict[str, Callable[..., Any]],
-) -> str:
-    """Return the expression of a message's values in those of a record; add the functions that convert fields."""
-    plan = definition.plan(tuple(types))
-    positions = positions_of(types)
-    accessors = accessors_of(types)
-    # values[begin:end] is the last part, if it only copies values
-    parts = list[str]()
-    begin = 0
-    end = -1
-    for name, kind in definition.types.items():
-        old, star = plan.names.get(name), "*" * kind.is_array
-        if old is not None and not kind.is_text:
-            start = cast("int", getattr(positions[old], "start", positions[old]))
-            parts, begin = (parts[:-1], begin) if start == end else (parts, start)
-            end = start + kind.values
-            parts.append(f"*values[{begin}:{end}]" if end - begin > 1 else f"values[{begin}]")
-            continue
-        text, end = repr(kind.absent) if old is None else f"decode_text({accessors[old]})", -1
-        if name in plan.converted:
-            olds, functions[f"convert{len(functions)}"] = plan.converted[name]
-            values = ", ".join("nan" if each is None else accessors[each] for each in olds)
-            text = f"{[*functions][-1]}({values})"
-        parts.append(f"encode_text({text})" if kind.is_text else star + text)
-    is_same = parts == [f"*values[0:{sum(kind.values for kind in types.values())}]"]
-    return "values" if is_same else f"({', '.join(parts)},)"
+def _reject(record: bytes, unpack: Callable[[bytes], Values]) -> None:
+    """Do not accept a record whose fields cannot be copied."""
+
+
+class _Conversion:
+    """The expression of a message's values in the flattened values of a record.
+
+    `text`: "values" if they are the same, or else a tuple with a part for each run of values that are copied, and for
+    each other field. For a VehicleLocalPosition from a record of PX4 1.15, which has dist_bottom before its flag:
+
+        (*values[0:39], values[40], values[39], nan, nan, 0, *values[41:51], values[50],)
+
+    `functions`: the functions that it calls to convert fields, by name.
+    """
+
+    def __init__(self, definition: Definition[Any], types: Mapping[str, FieldType]) -> None:
+        self._plan = definition.plan(tuple(types))
+        self._accessors = accessors_of(types)
+        self.functions: dict[str, Callable[..., Any]] = {}
+        positions = positions_of(types)
+        parts: list[str] = []
+        run: tuple[int, int] | None = (
+            None  # begin and end of the copied values that are the last part
+        )
+        for name, kind in definition.types.items():
+            old = self._plan.names.get(name)
+            if old is None or kind.is_text:
+                parts.append(self._part(name, kind))
+                run = None
+                continue
+            position = positions[old]
+            begin = position.start if isinstance(position, slice) else position
+            end = begin + kind.values
+            if run is not None and run[1] == begin:
+                begin = run[0]
+                parts.pop()
+            run = begin, end
+            is_single = end - begin == 1
+            parts.append(f"values[{begin}]" if is_single else f"*values[{begin}:{end}]")
+        count = sum(kind.values for kind in types.values())
+        self.text = f"({', '.join(parts)},)"
+        if parts == [f"*values[0:{count}]"]:
+            self.text = "values"
+
+    def _part(self, name: str, kind: FieldType) -> str:
+        """Return the part of a field that is text, converted or absent, such as `*(nan, nan)`."""
+        if name in self._plan.converted:
+            value = self._call(name)
+        elif name in self._plan.names:
+            value = f"decode_text({self._accessors[self._plan.names[name]]})"
+        else:
+            value = repr(kind.absent)
+        if kind.is_text:
+            return f"encode_text({value})"
+        return f"*{value}" if kind.is_array else value
+
+    def _call(self, name: str) -> str:
+        """Return the call that converts a field, such as `convert0(values[3], nan)`; add its function."""
+        conversion = self._plan.converted[name]
+        function = f"convert{len(self.functions)}"
+        self.functions[function] = conversion.convert
+        arguments = ["nan" if old is None else self._accessors[old] for old in conversion.sources]
+        return f"{function}({', '.join(arguments)})"

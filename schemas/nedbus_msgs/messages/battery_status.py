@@ -26,14 +26,39 @@ class BatteryStatus(Message):
         ),
     )
     LAYOUTS = (
-        Layout("1.13", """1.16, without internal_resistance_estimate ocv_estimate ocv_estimate_filtered
-            volt_based_soc_estimate voltage_prediction prediction_error estimation_covariance_norm,
-            voltage_v: voltage_filtered_v, current_a: current_filtered_a, faults: custom_faults, warning: mode
-            average_power available_energy, remaining_capacity_wh: design_capacity average_time_to_full"""),
-        Layout("1.16", "1.17, without warning, average_time_to_empty: serial_number, faults: warning"),
-        Layout("1.17", """*, without serial_number voltage_filtered_v current_filtered_a custom_faults mode
-            average_power available_energy design_capacity average_time_to_full"""),
-    )  # fmt: skip
+        Layout(
+            "1.13",
+            base="1.16",
+            without="""
+                internal_resistance_estimate ocv_estimate ocv_estimate_filtered
+                volt_based_soc_estimate voltage_prediction prediction_error
+                estimation_covariance_norm
+            """,
+            insert_after={
+                "voltage_v": "voltage_filtered_v",
+                "current_a": "current_filtered_a",
+                "faults": "custom_faults",
+                "warning": "mode average_power available_energy",
+                "remaining_capacity_wh": "design_capacity average_time_to_full",
+            },
+        ),
+        Layout(
+            "1.16",
+            base="1.17",
+            without="warning",
+            insert_after={
+                "average_time_to_empty": "serial_number",
+                "faults": "warning",
+            },
+        ),
+        Layout(
+            "1.17",
+            without="""
+                serial_number voltage_filtered_v current_filtered_a custom_faults mode
+                average_power available_energy design_capacity average_time_to_full
+            """,
+        ),
+    )
     RULES = (InRange("remaining", -1.0, 2.0),)
 
     MAX_INSTANCES: ClassVar = 3

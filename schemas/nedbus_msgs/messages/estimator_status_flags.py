@@ -26,20 +26,62 @@ class EstimatorStatusFlags(Message):
         ),
     )
     LAYOUTS = (
-        Layout("1.13", """1.14, without cs_fake_pos cs_fake_hgt cs_gravity_vector, reject_ver_pos: reject_mag_x
-            reject_mag_y reject_mag_z"""),
-        Layout("1.14", """1.15, without cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos,
-            fs_bad_optflow_y: fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d"""),
-        Layout("1.15", """1.16, without cs_gnss_pos cs_gnss_yaw cs_gnss_yaw_fault cs_rng_terrain cs_opt_flow_terrain
-            cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel, cs_yaw_align: cs_gps, cs_rng_stuck: cs_gps_yaw,
-            cs_vehicle_at_rest: cs_gps_yaw_fault, fs_bad_optflow_y: fs_bad_acc_bias"""),
-        Layout("1.16", "1.17, without cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault"),
-        Layout("1.17", """*, without cs_in_transition cs_heading_observable fs_bad_acc_bias fs_bad_vel_n fs_bad_vel_e
-            fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d reject_mag_x reject_mag_y reject_mag_z"""),
-        Layout("1.18", """1.17, without innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos
-            reject_ver_pos reject_yaw reject_airspeed reject_sideslip reject_hagl reject_optflow_x reject_optflow_y,
-            cs_gnss_hgt_fault: cs_in_transition cs_heading_observable"""),
-    )  # fmt: skip
+        Layout(
+            "1.13",
+            base="1.14",
+            without="cs_fake_pos cs_fake_hgt cs_gravity_vector",
+            insert_after={
+                "reject_ver_pos": "reject_mag_x reject_mag_y reject_mag_z",
+            },
+        ),
+        Layout(
+            "1.14",
+            base="1.15",
+            without="cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos",
+            insert_after={
+                "fs_bad_optflow_y": "fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d",
+            },
+        ),
+        Layout(
+            "1.15",
+            base="1.16",
+            without="""
+                cs_gnss_pos cs_gnss_yaw cs_gnss_yaw_fault cs_rng_terrain cs_opt_flow_terrain
+                cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel
+            """,
+            insert_after={
+                "cs_yaw_align": "cs_gps",
+                "cs_rng_stuck": "cs_gps_yaw",
+                "cs_vehicle_at_rest": "cs_gps_yaw_fault",
+                "fs_bad_optflow_y": "fs_bad_acc_bias",
+            },
+        ),
+        Layout(
+            "1.16",
+            base="1.17",
+            without="cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault",
+        ),
+        Layout(
+            "1.17",
+            without="""
+                cs_in_transition cs_heading_observable fs_bad_acc_bias fs_bad_vel_n
+                fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d
+                reject_mag_x reject_mag_y reject_mag_z
+            """,
+        ),
+        Layout(
+            "1.18",
+            base="1.17",
+            without="""
+                innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos
+                reject_ver_pos reject_yaw reject_airspeed reject_sideslip reject_hagl
+                reject_optflow_x reject_optflow_y
+            """,
+            insert_after={
+                "cs_gnss_hgt_fault": "cs_in_transition cs_heading_observable",
+            },
+        ),
+    )
     OLDER = (
         RenamedField("cs_gps", "cs_gnss_pos"),
         RenamedField("cs_gps_yaw", "cs_gnss_yaw"),

@@ -15,16 +15,49 @@ class FailsafeFlags(Message):
 
     TOPICS = (Topic("failsafe_flags", 2.0, "the commander", on_change=True),)
     LAYOUTS = (
-        Layout("1.14", "1.15, without geofence_breached, battery_unhealthy: primary_geofence_breached"),
-        Layout("1.15", "1.16, without navigator_failure"),
-        Layout("1.16", """1.17, without mode_req_global_position_relaxed global_position_invalid_relaxed
-            position_accuracy_low, flight_time_limit_exceeded: local_position_accuracy_low"""),
-        Layout("1.17", """main, without fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure
-            fd_alt_loss parachute_unhealthy traffic_avoidance_unhealthy remote_id_unhealthy gnss_lost,
-            navigator_failure: fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure"""),
-        Layout("1.18", "main, without traffic_avoidance_unhealthy"),
+        Layout(
+            "1.14",
+            base="1.15",
+            without="geofence_breached",
+            insert_after={
+                "battery_unhealthy": "primary_geofence_breached",
+            },
+        ),
+        Layout(
+            "1.15",
+            base="1.16",
+            without="navigator_failure",
+        ),
+        Layout(
+            "1.16",
+            base="1.17",
+            without="""
+                mode_req_global_position_relaxed global_position_invalid_relaxed
+                position_accuracy_low
+            """,
+            insert_after={
+                "flight_time_limit_exceeded": "local_position_accuracy_low",
+            },
+        ),
+        Layout(
+            "1.17",
+            base="main",
+            without="""
+                fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop
+                fd_motor_failure fd_alt_loss parachute_unhealthy traffic_avoidance_unhealthy
+                remote_id_unhealthy gnss_lost
+            """,
+            insert_after={
+                "navigator_failure": "fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure",
+            },
+        ),
+        Layout(
+            "1.18",
+            base="main",
+            without="traffic_avoidance_unhealthy",
+        ),
         Layout("main", "*"),
-    )  # fmt: skip
+    )
     OLDER = (
         RenamedField("primary_geofence_breached", "geofence_breached"),
         RenamedField("local_position_accuracy_low", "position_accuracy_low"),

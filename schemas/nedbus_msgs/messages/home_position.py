@@ -21,10 +21,25 @@ class HomePosition(Message):
     )
     LAYOUTS = (
         Layout(
-            "1.13", "timestamp lat lon alt x y z yaw valid_alt valid_hpos valid_lpos manual_home"
+            "1.13",
+            """
+                timestamp lat lon alt x y z yaw valid_alt valid_hpos valid_lpos manual_home
+            """,
         ),
-        Layout("1.15", "1.13, manual_home: update_count"),
-        Layout("1.17", "1.15, z: roll pitch"),
+        Layout(
+            "1.15",
+            base="1.13",
+            insert_after={
+                "manual_home": "update_count",
+            },
+        ),
+        Layout(
+            "1.17",
+            base="1.15",
+            insert_after={
+                "z": "roll pitch",
+            },
+        ),
         Layout("main", "*"),
     )
     RULES = (

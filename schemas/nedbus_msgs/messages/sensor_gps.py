@@ -1,6 +1,7 @@
 """SensorGps: output of a GNSS receiver."""
 
 import math
+from typing import ClassVar
 
 from nedbus_msgs.frames import GlobalPosition, Ned
 from nedbus_msgs.model import (
@@ -50,14 +51,40 @@ class SensorGps(Message):
         Topic("vehicle_gps_position", 50.0, "the GNSS selector or blending"),
     )
     LAYOUTS = (
-        Layout("1.13", """1.14, without timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
-            selected_rtcm_instance, automatic_gain_control: jamming_indicator"""),
-        Layout("1.14", """1.15, without latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m rtcm_crc_failed
-            rtcm_msg_used, device_id: lat lon alt alt_ellipsoid"""),
-        Layout("1.15", "1.17, without authentication_state system_error"),
-        Layout("1.17", "1.18, without antenna_offset_x antenna_offset_y antenna_offset_z"),
+        Layout(
+            "1.13",
+            base="1.14",
+            without="""
+                timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
+                selected_rtcm_instance
+            """,
+            insert_after={
+                "automatic_gain_control": "jamming_indicator",
+            },
+        ),
+        Layout(
+            "1.14",
+            base="1.15",
+            without="""
+                latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m
+                rtcm_crc_failed rtcm_msg_used
+            """,
+            insert_after={
+                "device_id": "lat lon alt alt_ellipsoid",
+            },
+        ),
+        Layout(
+            "1.15",
+            base="1.17",
+            without="authentication_state system_error",
+        ),
+        Layout(
+            "1.17",
+            base="1.18",
+            without="antenna_offset_x antenna_offset_y antenna_offset_z",
+        ),
         Layout("1.18", "*"),
-    )  # fmt: skip
+    )
     OLDER = (
         RenamedField(
             "lat", "latitude_deg", lambda lat: lat / 1e7, lambda deg: _integer(deg, 1e7), "int32"
@@ -83,10 +110,13 @@ class SensorGps(Message):
         FiniteWhile(vel_ned_valid="vel_n_m_s vel_e_m_s vel_d_m_s"),
     )
 
-    (
-        FIX_TYPE_NONE, FIX_TYPE_2D, FIX_TYPE_3D, FIX_TYPE_RTCM_CODE_DIFFERENTIAL, FIX_TYPE_RTK_FLOAT,
-        FIX_TYPE_RTK_FIXED, FIX_TYPE_EXTRAPOLATED,
-    ) = 1, 2, 3, 4, 5, 6, 8  # fmt: skip
+    FIX_TYPE_NONE: ClassVar = 1
+    FIX_TYPE_2D: ClassVar = 2
+    FIX_TYPE_3D: ClassVar = 3
+    FIX_TYPE_RTCM_CODE_DIFFERENTIAL: ClassVar = 4
+    FIX_TYPE_RTK_FLOAT: ClassVar = 5
+    FIX_TYPE_RTK_FIXED: ClassVar = 6
+    FIX_TYPE_EXTRAPOLATED: ClassVar = 8
     JAMMING_STATE_UNKNOWN, JAMMING_STATE_OK, JAMMING_STATE_MITIGATED, JAMMING_STATE_DETECTED = (
         range(4)
     )
@@ -97,10 +127,14 @@ class SensorGps(Message):
         AUTHENTICATION_STATE_UNKNOWN, AUTHENTICATION_STATE_INITIALIZING, AUTHENTICATION_STATE_ERROR,
         AUTHENTICATION_STATE_OK, AUTHENTICATION_STATE_DISABLED,
     ) = range(5)  # fmt: skip
-    (
-        SYSTEM_ERROR_OK, SYSTEM_ERROR_INCOMING_CORRECTIONS, SYSTEM_ERROR_CONFIGURATION, SYSTEM_ERROR_SOFTWARE,
-        SYSTEM_ERROR_ANTENNA, SYSTEM_ERROR_EVENT_CONGESTION, SYSTEM_ERROR_CPU_OVERLOAD, SYSTEM_ERROR_OUTPUT_CONGESTION,
-    ) = 0, 1, 2, 4, 8, 16, 32, 64  # fmt: skip
+    SYSTEM_ERROR_OK: ClassVar = 0
+    SYSTEM_ERROR_INCOMING_CORRECTIONS: ClassVar = 1
+    SYSTEM_ERROR_CONFIGURATION: ClassVar = 2
+    SYSTEM_ERROR_SOFTWARE: ClassVar = 4
+    SYSTEM_ERROR_ANTENNA: ClassVar = 8
+    SYSTEM_ERROR_EVENT_CONGESTION: ClassVar = 16
+    SYSTEM_ERROR_CPU_OVERLOAD: ClassVar = 32
+    SYSTEM_ERROR_OUTPUT_CONGESTION: ClassVar = 64
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
     timestamp_sample: Uint64 = field(

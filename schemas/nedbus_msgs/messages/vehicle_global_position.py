@@ -34,7 +34,11 @@ class VehicleGlobalPosition(Message):
         ),
     )
     LAYOUTS = (
-        Layout("1.13", "1.16, without lat_lon_valid alt_valid delta_terrain terrain_reset_counter"),
+        Layout(
+            "1.13",
+            base="1.16",
+            without="lat_lon_valid alt_valid delta_terrain terrain_reset_counter",
+        ),
         Layout("1.16", "*"),
     )
     RULES = (

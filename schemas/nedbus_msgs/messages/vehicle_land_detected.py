@@ -13,7 +13,14 @@ class VehicleLandDetected(Message):
     """
 
     TOPICS = (Topic("vehicle_land_detected", 1.0, "the land detector", on_change=True),)
-    LAYOUTS = (Layout("1.13", "1.14, without rotational_movement"), Layout("1.14", "*"))
+    LAYOUTS = (
+        Layout(
+            "1.13",
+            base="1.14",
+            without="rotational_movement",
+        ),
+        Layout("1.14", "*"),
+    )
 
     freefall: Bool = field("Vehicle is in free fall")
     ground_contact: Bool = field("Stage 1: ground contact detected")

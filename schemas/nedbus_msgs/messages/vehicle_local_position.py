@@ -58,14 +58,39 @@ class VehicleLocalPosition(Message):
         ),
     )
     LAYOUTS = (
-        Layout("1.13", "1.14, without dead_reckoning"),
-        Layout("1.14", "1.15, without heading_var unaided_heading tilt_var"),
-        Layout("1.15", """V0, without dist_bottom dist_bottom_var delta_dist_bottom dist_bottom_reset_counter,
-            ref_alt: dist_bottom"""),
-        Layout("V0", "1.16, without hagl_max_z hagl_max_xy, hagl_min: hagl_max", wire=0, aliases=(
-            "px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0")),
+        Layout(
+            "1.13",
+            base="1.14",
+            without="dead_reckoning",
+        ),
+        Layout(
+            "1.14",
+            base="1.15",
+            without="heading_var unaided_heading tilt_var",
+        ),
+        Layout(
+            "1.15",
+            base="V0",
+            without="dist_bottom dist_bottom_var delta_dist_bottom dist_bottom_reset_counter",
+            insert_after={
+                "ref_alt": "dist_bottom",
+            },
+        ),
+        Layout(
+            "V0",
+            base="1.16",
+            without="hagl_max_z hagl_max_xy",
+            insert_after={
+                "hagl_min": "hagl_max",
+            },
+            wire=0,
+            aliases=(
+                "px4_msgs_old/msg/VehicleLocalPositionV0",
+                "px4_msgs/msg/VehicleLocalPositionV0",
+            ),
+        ),
         Layout("1.16", "*", wire=1),
-    )  # fmt: skip
+    )
     ALWAYS = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"
     OLDER = (
         # As in PX4's own translation:

@@ -36,10 +36,21 @@ class VehicleOdometry(Message):
         Topic("estimator_odometry", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
     )
     LAYOUTS = (
-        Layout("1.13", """timestamp timestamp_sample local_frame x y z q q_offset:float32[4] pose_covariance:float32[21]
-            velocity_frame vx vy vz rollspeed pitchspeed yawspeed velocity_covariance:float32[21] reset_counter"""),
+        Layout(
+            "1.13",
+            """
+                timestamp timestamp_sample local_frame x y z q q_offset pose_covariance
+                velocity_frame vx vy vz rollspeed pitchspeed yawspeed velocity_covariance
+                reset_counter
+            """,
+            other_types={
+                "q_offset": "float32[4]",
+                "pose_covariance": "float32[21]",
+                "velocity_covariance": "float32[21]",
+            },
+        ),
         Layout("1.14", "*"),
-    )  # fmt: skip
+    )
     OLDER = (
         RenamedField(
             "local_frame",

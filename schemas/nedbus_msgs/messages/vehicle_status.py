@@ -18,21 +18,55 @@ class VehicleStatus(Message):
 
     TOPICS = (Topic("vehicle_status", 2.0, "the commander", on_change=True),)
     LAYOUTS = (
-        Layout("1.13", """timestamp nav_state nav_state_timestamp arming_state hil_state failsafe failsafe_timestamp
-            system_type system_id component_id vehicle_type is_vtol is_vtol_tailsitter vtol_fw_permanent_stab
-            in_transition_mode in_transition_to_fw rc_signal_lost data_link_lost data_link_lost_counter
-            high_latency_data_link_lost engine_failure mission_failure geofence_violated failure_detector_status:uint8
-            onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health
-            latest_arming_reason latest_disarming_reason armed_time takeoff_time"""),
-        Layout("1.14", """1.15, without executor_in_charge valid_nav_states_mask can_set_nav_states_mask
-            failsafe_defer_state"""),
-        Layout("1.15", "1.16, parachute_system_healthy: avoidance_system_required avoidance_system_valid"),
-        Layout("1.16", """1.18, without nav_state_display accepts_offboard_setpoints traffic_avoidance_system_present,
-            can_set_nav_states_mask: failure_detector_status"""),
-        Layout("1.18", """*, without failure_detector_status avoidance_system_required avoidance_system_valid
-            failsafe_timestamp vtol_fw_permanent_stab rc_signal_lost engine_failure mission_failure geofence_violated
-            onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health"""),
-    )  # fmt: skip
+        Layout(
+            "1.13",
+            """
+                timestamp nav_state nav_state_timestamp arming_state hil_state failsafe
+                failsafe_timestamp system_type system_id component_id vehicle_type is_vtol
+                is_vtol_tailsitter vtol_fw_permanent_stab in_transition_mode
+                in_transition_to_fw rc_signal_lost data_link_lost data_link_lost_counter
+                high_latency_data_link_lost engine_failure mission_failure geofence_violated
+                failure_detector_status onboard_control_sensors_present
+                onboard_control_sensors_enabled onboard_control_sensors_health
+                latest_arming_reason latest_disarming_reason armed_time takeoff_time
+            """,
+            other_types={
+                "failure_detector_status": "uint8",
+            },
+        ),
+        Layout(
+            "1.14",
+            base="1.15",
+            without="""
+                executor_in_charge valid_nav_states_mask can_set_nav_states_mask
+                failsafe_defer_state
+            """,
+        ),
+        Layout(
+            "1.15",
+            base="1.16",
+            insert_after={
+                "parachute_system_healthy": "avoidance_system_required avoidance_system_valid",
+            },
+        ),
+        Layout(
+            "1.16",
+            base="1.18",
+            without="nav_state_display accepts_offboard_setpoints traffic_avoidance_system_present",
+            insert_after={
+                "can_set_nav_states_mask": "failure_detector_status",
+            },
+        ),
+        Layout(
+            "1.18",
+            without="""
+                failure_detector_status avoidance_system_required avoidance_system_valid
+                failsafe_timestamp vtol_fw_permanent_stab rc_signal_lost engine_failure
+                mission_failure geofence_violated onboard_control_sensors_present
+                onboard_control_sensors_enabled onboard_control_sensors_health
+            """,
+        ),
+    )
     OLDER = (
         RenamedField("data_link_lost", "gcs_connection_lost"),
         RenamedField("data_link_lost_counter", "gcs_connection_lost_counter"),

@@ -14,7 +14,7 @@ RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 ALL: Final = "all"
 """Name of the layout with every field of the model, if no release of PX4 has them all."""
 _HISTORY: Final = 20.0  # s of messages at the nominal rate in a history cache
-_MIN_KEPT: Final = 400  # messages of a topic with a nominal rate, because sources may be faster
+_LEAST_KEPT: Final = 400  # messages of a topic with a nominal rate, because sources may be faster
 _KEPT_WITHOUT_RATE: Final = 50  # messages of a source's topic
 _KEPT_BYTES: Final = 2**18  # of such a topic
 
@@ -44,7 +44,7 @@ class Topic:
     @property
     def kept(self) -> int:
         """Number of messages in a publisher's history cache: 20 s at the nominal rate, at least 400."""
-        return max(_MIN_KEPT, round(_HISTORY * self.rate))
+        return max(_LEAST_KEPT, round(_HISTORY * self.rate))
 
     def kept_for_source(self, size: int) -> int:
         """Return the same for a stream of a source; `size`: bytes of a message.
@@ -62,18 +62,27 @@ class Layout:
     """One layout of a message.
 
     `name`: the first PX4 release that has it.
-    `text`: its field names, `*` for those of the model, or a layout and the changes to it:
-    `1.13, without a b, c: d e` is 1.13 without a and b, and with d and e after c; `d:uint8` overrides the model's type.
+    `text`: its field names, separated by spaces; `*` for those of the model.
+    `base`: the name of another layout of the message, whose fields this layout has instead of `text`.
+    `without`: the names of fields that it lacks, separated by spaces.
+    `insert_after`: the names of fields that it has in addition, by the name of the field before them.
+    `other_types`: types of fields that differ from the model's, by name.
     `wire`: its number in payloads; None if it is not used in payloads.
     `aliases`: other ROS 2 types with this layout.
-    `types`: its fields and their types in order, parsed from `text` by the definition.
+    `types`: its fields and their types in order, which the definition derives from all these.
     `caches`: see `cached_on_owner`.
+
+        Layout("1.15", base="1.16", without="hagl_max_z hagl_max_xy", insert_after={"hagl_min": "hagl_max"})
     """
 
     name: str
-    text: str = dataclasses.field(repr=False)
+    text: str = dataclasses.field(default="*", repr=False)
     wire: int | None = None
     aliases: tuple[str, ...] = ()
+    base: str = ""
+    without: str = dataclasses.field(default="", repr=False)
+    insert_after: Mapping[str, str] = dataclasses.field(default_factory=dict, repr=False)
+    other_types: Mapping[str, str] = dataclasses.field(default_factory=dict, repr=False)
     types: Mapping[str, FieldType] = dataclasses.field(default_factory=dict, repr=False)
     caches: dict[object, Callable[..., Any]] = dataclasses.field(
         default_factory=dict, init=False, repr=False
@@ -120,5 +129,8 @@ class RenamedField:
     @property
     def targets(self) -> list[tuple[str, int | None]]:
         """The model's fields with its value, each with an element index or None."""
-        parts = [target.rstrip("]").partition("[") for target in self.new.split()]
-        return [(field, int(index) if index else None) for field, _, index in parts]
+        targets: list[tuple[str, int | None]] = []
+        for target in self.new.split():
+            field, bracket, index = target.rstrip("]").partition("[")
+            targets.append((field, int(index) if bracket else None))
+        return targets

@@ -12,14 +12,16 @@ from functools import cached_property
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
-from .declaration import ALL, RELEASES, Layout, Topic, cached_on_owner
+from nedbus_msgs import limits
+
+from .declaration import ALL, RELEASES, Layout, RenamedField, Topic, cached_on_owner
 from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values, positions_of
 
 if TYPE_CHECKING:
     from .message import Message
 
-_MAX_READERS: Final = 64  # types of messages for which a FieldReader keeps a function
+_CLOSE_NAME: Final = 0.5  # minimum similarity of a field that an error suggests
 M = TypeVar("M", bound="Message")
 M_co = TypeVar("M_co", bound="Message", covariant=True)
 
@@ -57,38 +59,56 @@ class FieldReader:
     """Fast access to some fields of models, rows and dicts; a missing field has the value `absent`."""
 
     def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
-        self.names, self._absent = tuple(names), absent
+        self.names = tuple(names)
+        self._absent = absent
         self._readers: dict[type, Callable[[Any], tuple[Any, ...]]] = {}  # by type of message
 
     def __call__(self, message: object) -> tuple[Any, ...]:
         """Return the values in the order of `names`."""
         read = self._readers.get(type(message))
         if read is None:
-            if len(self._readers) >= _MAX_READERS:
+            # A definition that arrives at run time has an own type of rows.
+            if len(self._readers) >= limits.FIELD_READERS:
                 self._readers.clear()
-            read = self._readers[type(message)] = self._reader_of(message)
+            read = self._reader_of(message)
+            self._readers[type(message)] = read
         return read(message)
 
     def _reader_of(self, message: object) -> Callable[[Any], tuple[Any, ...]]:
         """Return a function that reads the fields of messages of this type."""
         names = self.names
         absent = self._absent
-        positions = getattr(message, "_positions", None)
         if isinstance(message, Mapping):
             return lambda fields: tuple([fields.get(name, absent) for name in names])
-        if positions is None and all(hasattr(message, name) for name in names):
-            return (
-                attrgetter(*names) if len(names) > 1 else lambda model: (getattr(model, names[0]),)
-            )
-        if positions is None:
-            return lambda model: tuple([getattr(model, name, absent) for name in names])
+        positions = getattr(message, "_positions", None)
+        if positions is not None:
+            return self._reader_of_rows(positions)
+        if len(names) == 1:
+            only = names[0]
+            return lambda model: (getattr(model, only, absent),)
+        if all(hasattr(message, name) for name in names):
+            return attrgetter(*names)
+        return lambda model: tuple([getattr(model, name, absent) for name in names])
+
+    def _reader_of_rows(self, positions: Mapping[str, Any]) -> Callable[[Any], tuple[Any, ...]]:
+        names = self.names
+        absent = self._absent
         known = [positions[name] for name in names if name in positions]
         # the publisher defines the fields of a topic that is not built in
         if len(known) < len(names):
             return lambda row: tuple(
                 [row[positions[name]] if name in positions else absent for name in names]
             )
-        return itemgetter(*known) if len(known) > 1 else itemgetter(slice(known[0], known[0] + 1))
+        if len(known) == 1:
+            return itemgetter(slice(known[0], known[0] + 1))
+        return itemgetter(*known)
+
+
+class FieldConversion(NamedTuple):
+    """A field of the model that is computed from other fields; `sources`: None for a missing element of an array."""
+
+    sources: list[str | None]
+    convert: Callable[..., Any]
 
 
 class UpgradePlan(NamedTuple):
@@ -97,13 +117,13 @@ class UpgradePlan(NamedTuple):
     `provided`: the model's fields that receive a value, which are the keys of `names` and `converted`; `missing`: all
     others.
     `names`: the source field, for each field whose value is copied.
-    `converted`: for each other field, the source fields (None for a missing array element) and the conversion.
+    `converted`: the conversion of each other field.
     """
 
     provided: frozenset[str]
     missing: frozenset[str]
     names: Mapping[str, str]
-    converted: Mapping[str, tuple[Sequence[str | None], Callable[..., Any]]]
+    converted: Mapping[str, FieldConversion]
 
 
 class Definition(Generic[M_co]):
@@ -119,37 +139,35 @@ class Definition(Generic[M_co]):
     def __init__(self, model: type[M_co]) -> None:
         self.name = model.__name__
         self.model = model
-        self.types: Mapping[str, FieldType] = {
-            name: next(mark for mark in field.metadata if isinstance(mark, FieldType))
-            for name, field in model.__pydantic_fields__.items()
-        }
+        self.types: Mapping[str, FieldType] = _types_of_model(model)
         self.names = tuple(self.types)
         self.all_fields = frozenset(self.names)
         self.has_text = any(kind.is_text for kind in self.types.values())
         self.topics = {topic.name: topic for topic in model.TOPICS}
         self.older = {old.name: old for old in model.OLDER}
         self.rules = model.RULES
-        self.flags = {flag: names for rule in model.RULES for flag, names in rule.flags.items()}
+        self.flags: dict[str, Sequence[str]] = {}
+        for rule in model.RULES:
+            self.flags.update(rule.flags)
         self.always = frozenset(model.ALWAYS.split())
         self.caches: dict[object, Callable[..., Any]] = {}
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
         """PX4's layouts by name, oldest first; the last one has exactly the model's fields."""
-        found = {
-            layout.name: replace(layout, types=self._types_of(layout.text))
+        layouts = {
+            layout.name: replace(layout, types=self._types_of(layout))
             for layout in self.model.LAYOUTS
         }
-        if all(layout.wire is None for layout in found.values()):
-            fields = list(self.types.items())
-            own = next(
-                (layout for layout in found.values() if list(layout.types.items()) == fields), None
-            )
-            own = replace(
-                found.pop(own.name) if own else Layout(ALL, "*"), wire=0, types=self.types
-            )
-            found[own.name] = own
-        return found
+        if all(layout.wire is None for layout in layouts.values()):
+            # Without a declared number on the wire, the model's own fields have number 0.
+            own = Layout(ALL)
+            for layout in list(layouts.values()):
+                if list(layout.types.items()) == list(self.types.items()):
+                    own = layouts.pop(layout.name)
+                    break
+            layouts[own.name] = replace(own, wire=0, types=self.types)
+        return layouts
 
     @cached_property
     def current(self) -> Layout:
@@ -164,40 +182,44 @@ class Definition(Generic[M_co]):
     @cached_property
     def row(self) -> type[Row]:
         """The named tuple class of this message."""
+        positions = {name: index for index, name in enumerate(self.names)}
         members: dict[str, Any] = {
-            name: property(itemgetter(index)) for index, name in enumerate(self.names)
+            name: property(itemgetter(index)) for name, index in positions.items()
         }
         members |= {
-            name: each for name, each in vars(self.model).items() if isinstance(each, property)
+            name: member
+            for name, member in vars(self.model).items()
+            if isinstance(member, property)
         }
-        members |= {
-            "_positions": {name: index for index, name in enumerate(self.names)},
-            "_fields": self.names,
-        }
-        return type(f"{self.name}Row", (Row,), {**members, "__slots__": (), "DEFINITION": self})
+        members["DEFINITION"] = self
+        members["_fields"] = self.names
+        members["_positions"] = positions
+        members["__slots__"] = ()
+        return type(f"{self.name}Row", (Row,), members)
 
     @cached_property
     def flat_row(self) -> type[FlatRow]:
         """The class of flattened values of this message."""
-        return type(
-            f"{self.name}FlatRow",
-            (FlatRow,),
-            {"__slots__": (), "_positions": positions_of(self.types)},
-        )
+        members: dict[str, Any] = {"__slots__": (), "_positions": positions_of(self.types)}
+        return type(f"{self.name}FlatRow", (FlatRow,), members)
 
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout with this name or of this PX4 release; None if there is none."""
         if release in self.layouts or release not in RELEASES:
             return self.layouts.get(release)
         until = RELEASES[: RELEASES.index(release) + 1]
-        return next((self.layouts[each] for each in reversed(until) if each in self.layouts), None)
+        for earlier in reversed(until):
+            if earlier in self.layouts:
+                return self.layouts[earlier]
+        return None
 
     def find_layout(self, names: Iterable[str]) -> Layout | None:
         """Return the layout with exactly these field names in any order, or None."""
         given = frozenset(names)
-        return next(
-            (layout for layout in self.layouts.values() if given == layout.types.keys()), None
-        )
+        for layout in self.layouts.values():
+            if given == layout.types.keys():
+                return layout
+        return None
 
     @cached_property
     def known_types(self) -> Mapping[str, Set[FieldType]]:
@@ -213,51 +235,62 @@ class Definition(Generic[M_co]):
 
         If the current layout is not one of PX4's, return PX4's layout with exactly these fields, if there is one.
         """
-        return (
-            self.current if self.current.name != ALL else self.find_layout(provided) or self.current
-        )
+        if self.current.name != ALL:
+            return self.current
+        return self.find_layout(provided) or self.current
 
     @cached_on_owner  # all messages of a stream have the same field names
     def plan(self, names: tuple[str, ...]) -> UpgradePlan:
         """Return the mapping from these fields, of any PX4 release, to the model; unknown names are ignored."""
-        direct: dict[str, str] = {name: name for name in names if name in self.types}
-        converted: dict[str, tuple[list[str | None], Callable[..., Any]]] = {}
-        for old in (self.older[name] for name in names if name in self.older):
-            for base, index in old.targets:
-                if index is not None and base not in direct:
-                    sources, _ = converted.setdefault(
-                        base, ([None] * self.types[base].values, lambda *values: values)
-                    )
-                    sources[index] = old.name
-                elif old.up and base not in direct:
-                    converted.setdefault(base, ([old.name], old.up))
-                elif base not in converted:
-                    direct.setdefault(base, old.name)
-        in_order = {name: direct[name] for name in self.types if name in direct}
-        provided = frozenset({*direct, *converted})
+        copied: dict[str, str] = {name: name for name in names if name in self.types}
+        converted: dict[str, FieldConversion] = {}
+        for name in names:
+            if name in self.older:
+                self._add_older_field(self.older[name], copied, converted)
+        in_order = {name: copied[name] for name in self.types if name in copied}
+        provided = frozenset([*copied, *converted])
         return UpgradePlan(provided, self.all_fields - provided, in_order, converted)
+
+    def _add_older_field(
+        self,
+        older: RenamedField,
+        copied: dict[str, str],
+        converted: dict[str, FieldConversion],
+    ) -> None:
+        """Add the model's fields that receive the value of a field of older layouts."""
+        for name, index in older.targets:
+            if index is not None and name not in copied:
+                if name not in converted:
+                    sources: list[str | None] = [None] * self.types[name].values
+                    converted[name] = FieldConversion(sources, _as_array)
+                converted[name].sources[index] = older.name
+            elif older.up and name not in copied:
+                converted.setdefault(name, FieldConversion([older.name], older.up))
+            elif name not in converted:
+                copied.setdefault(name, older.name)
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
         """Convert the model's values to a layout, in its order; fields without a fitting value are "not provided"."""
-        found: dict[str, object] = {}
+        fields: dict[str, object] = {}
         for name, kind in layout.types.items():
-            value, old = values.get(name, kind.absent), self.older.get(name)
-            if old:
-                base, index = old.targets[0]
-                value = values[base] if index is None else values[base][index]
-                value = old.down(value) if old.down else value
-            if self.types.get(name) != kind and not (kind.length or kind.is_float):
+            older = self.older.get(name)
+            value = values.get(name, kind.absent) if older is None else _older_value(older, values)
+            is_integer = not kind.length and not kind.is_float
+            if is_integer and self.types.get(name) != kind:
                 least, greatest = kind.limits
-                value = value if least <= value <= greatest else kind.absent
-            found[name] = value
-        return found
+                if not least <= value <= greatest:
+                    value = kind.absent
+            fields[name] = value
+        return fields
 
     def meaning(self, name: str) -> str:
         """Return the unit and meaning of a field of any layout."""
         field = self.model.model_fields.get(name)
-        return (
-            field.description if field else self.older[name].doc if name in self.older else ""
-        ) or ""
+        if field is not None:
+            return field.description or ""
+        if name in self.older:
+            return self.older[name].doc
+        return ""
 
     def schema(self) -> dict[str, Any]:
         """Return the JSON Schema (2020-12), where NaN and infinities are strings, and the layouts.
@@ -271,31 +304,22 @@ class Definition(Generic[M_co]):
         for field in schema["properties"].values():
             # JSON has no NaN, and a writer should omit fields that are not provided
             field.pop("default", None)
-        layouts = [
-            {
-                "name": layout.name,
-                "wire": layout.wire,
-                "fields": [
-                    {"name": name, "type": str(kind)} for name, kind in layout.types.items()
-                ],
-            }
-            for layout in self.layouts.values()
-        ]
+        layouts = []
+        for layout in self.layouts.values():
+            fields = [{"name": name, "type": str(kind)} for name, kind in layout.types.items()]
+            layouts.append({"name": layout.name, "wire": layout.wire, "fields": fields})
         return {"json_schema": schema, "layouts": layouts}
 
     def explain_unknown_field(self, name: str) -> str:
         """Return the error text for an unknown field, with suggestions."""
         base, bracket, _ = name.partition("[")
-        near = (
-            [base]
-            if bracket and base in self.types
-            else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
-        )
-        hint = (
-            f"did you mean {' or '.join(near)}?"
-            if near
-            else f"'nedbus schema {self.name}' lists the fields"
-        )
+        if bracket and base in self.types:
+            similar = [base]
+        else:
+            similar = difflib.get_close_matches(name.lower(), self.names, 3, _CLOSE_NAME)
+        hint = f"'nedbus schema {self.name}' lists the fields"
+        if similar:
+            hint = f"did you mean {' or '.join(similar)}?"
         return f"unknown field {name!r}: {hint}"
 
     def __repr__(self) -> str:
@@ -304,33 +328,61 @@ class Definition(Generic[M_co]):
     def __reduce__(self) -> tuple[object, ...]:
         return attrgetter("DEFINITION"), (self.model,)
 
-    def _types_of(self, text: str) -> Mapping[str, FieldType]:
-        base, *changes = (part.strip() for part in text.split(","))
-        same = next((layout for layout in self.model.LAYOUTS if layout.name == base), None)
-        if same or base == "*":
-            fields = list((self._types_of(same.text) if same else self.types).items())
-        else:
-            fields = list(map(self._field, base.split()))
-        for change in changes:
-            if change.startswith("without "):
-                removed = change.split()[1:]
-                fields = [field for field in fields if field[0] not in removed]
-            else:
-                after, _, names = change.partition(":")
-                index = [name for name, _ in fields].index(after) + 1
-                fields[index:index] = map(self._field, names.split())
-        return dict(fields)
+    def _types_of(self, layout: Layout) -> Mapping[str, FieldType]:
+        """Return the fields of a layout with their types, in order."""
+        removed = layout.without.split()
+        before = self._types_before_changes(layout)
+        names = [name for name in before if name not in removed]
+        for previous, inserted in layout.insert_after.items():
+            position = names.index(previous) + 1
+            names[position:position] = inserted.split()
+        return {name: before.get(name) or self._type_of(name, layout) for name in names}
 
-    def _field(self, text: str) -> tuple[str, FieldType]:
-        """Parse `name`, or `name:type` where the type overrides the model's."""
-        name, _, kind = text.partition(":")
-        if kind or name in self.types:
-            return name, field_type(kind) if kind else self.types[name]
-        old = self.older[name]
-        base, index = old.targets[0]
-        return name, field_type(
-            old.type or (str(self.types[base]) if index is None else self.types[base].base)
-        )
+    def _types_before_changes(self, layout: Layout) -> Mapping[str, FieldType]:
+        if layout.base:
+            by_name = {other.name: other for other in self.model.LAYOUTS}
+            return self._types_of(by_name[layout.base])
+        if layout.text == "*":
+            return self.types
+        return {name: self._type_of(name, layout) for name in layout.text.split()}
+
+    def _type_of(self, name: str, layout: Layout) -> FieldType:
+        """Return the type of a field that the text of a layout names."""
+        if name in layout.other_types:
+            return field_type(layout.other_types[name])
+        if name in self.types:
+            return self.types[name]
+        older = self.older[name]
+        if older.type:
+            return field_type(older.type)
+        base, index = older.targets[0]
+        if index is None:
+            return self.types[base]
+        return field_type(self.types[base].base)
+
+
+def _types_of_model(model: type[Message]) -> dict[str, FieldType]:
+    """Return PX4's type of each field of a model, which its annotation has."""
+    types: dict[str, FieldType] = {}
+    for name, field in model.__pydantic_fields__.items():
+        for mark in field.metadata:
+            if isinstance(mark, FieldType):
+                types[name] = mark
+                break
+    return types
+
+
+def _as_array(*elements: object) -> tuple[object, ...]:
+    return elements
+
+
+def _older_value(older: RenamedField, values: Mapping[str, Any]) -> Any:
+    """Return the value of a field of older layouts, from the values of the model."""
+    name, index = older.targets[0]
+    value = values[name]
+    if index is not None:
+        value = value[index]
+    return value if older.down is None else older.down(value)
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
@@ -348,10 +400,10 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
     """Convert the fields of any PX4 release to those of the model, as `upgrade_with` does, without validation."""
     plan = definition.plan(tuple(fields))
     upgraded = {name: fields[old] for name, old in plan.names.items()}
-    for name, (olds, convert) in plan.converted.items():
-        values = [NAN if old is None else fields[old] for old in olds]
+    for name, conversion in plan.converted.items():
+        values = [NAN if old is None else fields[old] for old in conversion.sources]
         try:
-            upgraded[name] = convert(*values)
+            upgraded[name] = conversion.convert(*values)
         except (TypeError, OverflowError):  # not a number: the model rejects it
             (upgraded[name],) = values
     return upgraded
@@ -371,12 +423,13 @@ BY_TOPIC: Final[dict[str, Definition[Any]]] = {}
 
 def register(definition: Definition[Any]) -> None:
     """Register a message; raise ValueError if its name or one of its topics is already registered."""
-    if taken := [
-        name for name in (definition.name, *definition.topics) if name in MESSAGES or name in TOPICS
-    ]:
+    names = [definition.name, *definition.topics]
+    taken = [name for name in names if name in MESSAGES or name in TOPICS]
+    if taken:
         raise ValueError(
             f"cannot register {definition.name}: {', '.join(taken)} already registered"
         )
     MESSAGES[definition.name] = definition
-    for topic in definition.topics.values():
-        TOPICS[topic.name], BY_TOPIC[topic.name] = topic, definition
+    for name, topic in definition.topics.items():
+        TOPICS[name] = topic
+        BY_TOPIC[name] = definition

@@ -2,6 +2,7 @@
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, cast
 
 from pydantic import (
@@ -54,18 +55,16 @@ class Message(BaseModel):
             validation = definition.validation
             # A subclass may have its own validators, which only Pydantic runs.
             row = validation.row_of(fields) if type(self) is definition.model else None
-            try:
-                values = None if row is None else validation.rounded_by_name(row)
-            except OverflowError:
-                values = None
+            values = None
+            if row is not None:
+                with suppress(OverflowError):
+                    values = validation.rounded_by_name(row)
             if values is None:
                 super().__init__(**fields)
+            elif len(fields) == len(values):
+                fill(self, values, definition.all_fields)
             else:
-                fill(
-                    self,
-                    values,
-                    definition.all_fields if len(fields) == len(values) else frozenset(fields),
-                )
+                fill(self, values, frozenset(fields))
 
         # Marks this constructor as Pydantic's own, so that validation of dicts and JSON bypasses it.
         __init__.__pydantic_base_init__ = True
@@ -96,7 +95,8 @@ class Message(BaseModel):
     @model_validator(mode="after")
     def _round_and_check(self) -> Self:
         """Round float32 fields, then check the rules."""
-        values, validation = self.__dict__, self.DEFINITION.validation
+        values = self.__dict__
+        validation = self.DEFINITION.validation
         row = validation.values_of(values)
         try:
             values.update(validation.rounded_by_name(row))
@@ -136,7 +136,8 @@ class Message(BaseModel):
 def _is_same(one: object, other: object) -> bool:
     if isinstance(one, tuple) and isinstance(other, tuple):
         return all(map(_is_same, one, other))
-    return one == other or (repr(one) == repr(other) == "nan")
+    is_nan = repr(one) == repr(other) == "nan"
+    return one == other or is_nan
 
 
 def _to_python(value: Any, kind: FieldType | None) -> object:
@@ -146,12 +147,15 @@ def _to_python(value: Any, kind: FieldType | None) -> object:
     """
     if type(value).__module__ == "numpy":
         value = value.tolist()
-    if kind and kind.is_text and isinstance(value, bytes):
+    if kind is None:
+        return value
+    if kind.is_text and isinstance(value, bytes):
         return decode_text(value)
-    if kind and kind.is_array and isinstance(value, list | tuple):
-        parts = tuple(_to_python(part, field_type(kind.base)) for part in value)
-        return value if all(map(operator.is_, parts, value)) and isinstance(value, tuple) else parts
-    if kind and kind.is_float and isinstance(value, str) and value in _FLOAT_NAMES:
+    if kind.is_array and isinstance(value, list | tuple):
+        elements = tuple(_to_python(element, field_type(kind.base)) for element in value)
+        is_unchanged = isinstance(value, tuple) and all(map(operator.is_, elements, value))
+        return value if is_unchanged else elements
+    if kind.is_float and isinstance(value, str) and value in _FLOAT_NAMES:
         return float(value)
     return value
 
@@ -166,12 +170,11 @@ def fill(message: M, values: dict[str, object], given: Set[str]) -> M:
 
 
 # The slots that Pydantic's own validator sets (since 2.12); set directly because models are frozen.
-_set_dict, _set_fields_set, _set_extra, _set_private = (
-    cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
-    for slot in (
-        "__dict__",
-        "__pydantic_fields_set__",
-        "__pydantic_extra__",
-        "__pydantic_private__",
-    )
-)
+def _setter_of(slot: str) -> Callable[[Message, object], None]:
+    return cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
+
+
+_set_dict = _setter_of("__dict__")
+_set_fields_set = _setter_of("__pydantic_fields_set__")
+_set_extra = _setter_of("__pydantic_extra__")
+_set_private = _setter_of("__pydantic_private__")

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Final, NamedTuple, TypeVar, cast
 from pydantic import Field
 from pydantic_core import CoreSchema, core_schema
 
+from nedbus_msgs import limits
+
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
@@ -18,7 +20,6 @@ YEAR_2000: Final = 946_684_800_000_000
 # us since 1970, 2009-02-13: PX4 sets no clock to an earlier time
 FIRST_UNIX_TIME: Final = 1_234_567_890_000_000
 _YEAR_2100: Final = 4_102_444_800_000_000
-_MAX_ARRAY: Final = 1024  # elements; PX4's longest array has 512
 
 
 class Base(NamedTuple):
@@ -64,18 +65,20 @@ class FieldType(str):
         self.base, _, length = self.rstrip("]").partition("[")
         base = BASES[self.base]
         self.length = int(length) if length else None
-        self.is_text, self.is_float = self.base == "char", self.base.startswith("float")
+        self.is_text = self.base == "char"
+        self.is_float = self.base.startswith("float")
         self.is_array = self.length is not None and not self.is_text
-        self.values = int(length) if self.is_array else 1
         self.form = f"{self.length or 1}{base.code}"
+        self.values = 1
+        self.absent: object = base.absent
+        if self.is_array:
+            self.values = int(length)
+            self.absent = (base.absent,) * self.values
         self.size = struct.calcsize("<" + self.form) // self.values
-        self.absent: object = (base.absent,) * self.values if self.is_array else base.absent
-        bits = 8 * self.size
-        self.limits = (
-            (0, 2**bits - 1)
-            if self.base.startswith("uint")
-            else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-        )
+        half_range = 2 ** (8 * self.size - 1)
+        self.limits = (-half_range, half_range - 1)
+        if self.base.startswith("uint"):
+            self.limits = (0, 2 * half_range - 1)
 
     def fit(self, value: Any) -> Any:
         """Convert a value, or a tuple of at most `length` values, to this type; return None if a value would change.
@@ -84,17 +87,19 @@ class FieldType(str):
         """
         base = BASES[self.base]
         if self.is_text:
-            return (
-                value if isinstance(value, str) and len(encode_text(value)) <= self.size else None
-            )
+            fits = isinstance(value, str) and len(encode_text(value)) <= self.size
+            return value if fits else None
         if self.length is not None:
             if not isinstance(value, tuple) or len(value) > self.length:
                 return None
-            fitted = tuple(map(field_type(self.base).fit, value))
-            return None if None in fitted else fitted + (base.absent,) * (self.length - len(value))
+            elements = tuple(map(field_type(self.base).fit, value))
+            if None in elements:
+                return None
+            return elements + (base.absent,) * (self.length - len(value))
+        form = f"<{base.code}"
         try:
             number = value if self.is_float or self.base == "bool" else int(value)
-            (fitted,) = struct.unpack(f"<{base.code}", struct.pack(f"<{base.code}", number))
+            (fitted,) = struct.unpack(form, struct.pack(form, number))
         except (TypeError, ValueError, OverflowError, struct.error):
             return None
         return fitted if fitted == value or math.isnan(fitted) else None
@@ -102,17 +107,16 @@ class FieldType(str):
     @cached_property
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
-        value = (
-            str
-            if self.is_text
-            else bool
-            if self.base == "bool"
-            else float
-            if self.is_float
-            else int
-        )
-        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one per value
-        return Annotated[python, self, Field(default=self.absent)]
+        value: Any = int
+        if self.is_text:
+            value = str
+        elif self.base == "bool":
+            value = bool
+        elif self.is_float:
+            value = float
+        if self.is_array:
+            value = tuple[(value,) * self.values]  # type: ignore[misc] # one per value
+        return Annotated[value, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:
         """Return Pydantic's schema: integers have limits; with `from_json`, floats may be names such as "NaN"."""
@@ -132,9 +136,8 @@ class FieldType(str):
             return number
         names = core_schema.literal_schema(["NaN", "Infinity", "-Infinity"])
         from_name = core_schema.no_info_after_validator_function(float, names)
-        return core_schema.json_or_python_schema(
-            core_schema.union_schema([number, from_name]), number
-        )
+        from_json_value = core_schema.union_schema([number, from_name])
+        return core_schema.json_or_python_schema(from_json_value, number)
 
     def _check_text(self, text: str) -> str:
         if len(encode_text(text)) > self.size:
@@ -147,12 +150,14 @@ class FieldType(str):
 
 def encode_text(text: str) -> bytes:
     """Encode text as UTF-8 up to its first NUL; raise TypeError if it is not a str."""
-    return str.encode(text, "utf-8", "replace").partition(b"\0")[0]
+    data = str.encode(text, "utf-8", "replace")
+    return data.partition(b"\0")[0]
 
 
 def decode_text(data: bytes) -> str:
     """Decode a char array up to its first NUL; invalid UTF-8 becomes "?", which, unlike U+FFFD, takes one byte."""
-    return data.partition(b"\0")[0].decode(errors="replace").replace("\ufffd", "?")
+    text = data.partition(b"\0")[0].decode(errors="replace")
+    return text.replace("\ufffd", "?")
 
 
 @cache
@@ -161,23 +166,28 @@ def field_type(text: str) -> FieldType:
 
     Raises ValueError for an unknown base type, or an array with no or too many elements.
     """
-    found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
-    if found is None:
+    parts = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
+    if parts is None:
         raise ValueError(f"{text!r} is not a type; expected one such as uint8 or float32[4]")
-    base, length = found.groups()
-    if not (base == "char" and length):
+    base, digits = parts.groups()
+    is_text = base == "char" and digits
+    if not is_text:
         base = ALIASES.get(base, base)
     if base not in BASES:
         raise ValueError(
             f"{base!r} is not a type; expected {', '.join(BASES)}, or an array of fixed length"
         )
-    if length and not 0 < int(length) <= _MAX_ARRAY:
-        raise ValueError(f"array of {int(length)} elements; expected 1 to {_MAX_ARRAY}")
-    return FieldType(f"{base}[{int(length)}]" if length else base)
+    if not digits:
+        return FieldType(base)
+    length = int(digits)
+    if not 0 < length <= limits.ARRAY_ELEMENTS:
+        raise ValueError(f"array of {length} elements; expected 1 to {limits.ARRAY_ELEMENTS}")
+    return FieldType(f"{base}[{length}]")
 
 
 def is_unix_time(timestamp_us: Any) -> Any:
     """Return whether a timestamp [us], or each in an array, is Unix time (2009-02-13 to 2100), not time since boot."""
+    # `&`, because `and` does not work on arrays
     return (timestamp_us >= FIRST_UNIX_TIME) & (timestamp_us < _YEAR_2100)
 
 
@@ -193,15 +203,15 @@ def while_valid(make: Callable[..., _T], meaning: str, *flags: str) -> _T | None
     """
 
     def value(message: Any) -> _T | None:
-        fields = message.DEFINITION.flags
-        is_valid = all(getattr(message, flag) for flag in flags)
-        return (
-            make(*(getattr(message, name) for flag in flags for name in fields[flag]))
-            if is_valid
-            else None
-        )
+        guarded: list[Any] = []
+        for flag in flags:
+            if not getattr(message, flag):
+                return None
+            guarded += [getattr(message, name) for name in message.DEFINITION.flags[flag]]
+        return make(*guarded)
 
-    return cast("_T | None", property(value, doc=f"{meaning}; None unless {' and '.join(flags)}."))
+    doc = f"{meaning}; None unless {' and '.join(flags)}."
+    return cast("_T | None", property(value, doc=doc))
 
 
 Timestamp = Annotated[int, field_type("uint64")]

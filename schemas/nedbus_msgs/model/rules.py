@@ -7,7 +7,6 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from itertools import chain
 from string import Formatter
 from typing import Any, Final, NamedTuple, cast
 
@@ -21,6 +20,7 @@ Up to 1.15 PX4 does not wrap: MapProjection::reproject adds up to 180 degrees to
 """
 
 _QUATERNION: Final = struct.Struct("<4f")
+_COLUMN_OPERATORS: Final = {" or ": " | ", " and ": " & ", "not ": "~"}
 
 
 class Check(NamedTuple):
@@ -49,8 +49,12 @@ class Rule:
     @property
     def fields(self) -> Sequence[str]:
         """All fields that the rule reads."""
-        parts = (part for check in self.checks for part in Formatter().parse(check.wrong))
-        return list(dict.fromkeys(name for _, name, _, _ in parts if name))
+        names: list[str] = []
+        for check in self.checks:
+            for _, name, _, _ in Formatter().parse(check.wrong):
+                if name and name not in names:
+                    names.append(name)
+        return names
 
 
 class FiniteWhile(Rule):
@@ -58,34 +62,32 @@ class FiniteWhile(Rule):
 
     def __init__(self, **flags: str) -> None:
         self.flags = {flag: tuple(names.split()) for flag, names in flags.items()}
-        super().__init__(
-            Check(
-                name,
-                f"must be finite while {flag} is true",
-                f"({{{flag}}} and not isfinite({{{name}}}))",
-            )
-            for flag, names in self.flags.items()
-            for name in names
-        )
+        checks: list[Check] = []
+        for flag, names in self.flags.items():
+            reason = f"must be finite while {flag} is true"
+            for name in names:
+                wrong = f"({_value(flag)} and not isfinite({_value(name)}))"
+                checks.append(Check(name, reason, wrong))
+        super().__init__(checks)
 
 
 class NotNegative(Rule):
     """Variances, standard deviations and the like are not negative; NaN and infinity pass."""
 
     def __init__(self, *fields: str) -> None:
-        super().__init__(
-            Check(name, "must not be negative", f"({{{name}}} < 0)") for name in fields
-        )
+        reason = "must not be negative"
+        super().__init__(Check(name, reason, f"({_value(name)} < 0)") for name in fields)
 
 
 class Within(Rule):
     """The magnitude of each field is at most its bound; NaN passes."""
 
     def __init__(self, **bounds: float) -> None:
-        super().__init__(
-            Check(field, f"must be within +-{bound:.9g}", f"(abs({{{field}}}) > {bound!r})")
-            for field, bound in bounds.items()
-        )
+        checks: list[Check] = []
+        for name, bound in bounds.items():
+            reason = f"must be within +-{bound:.9g}"
+            checks.append(Check(name, reason, f"(abs({_value(name)}) > {bound!r})"))
+        super().__init__(checks)
 
 
 class InRange(Rule):
@@ -100,21 +102,22 @@ class InRange(Rule):
         or_: float | None = None,
         is_array: bool = False,
     ) -> None:
-        reason = f"must be {least:.9g} to {greatest:.9g}" + (
-            "" if or_ is None else f", or {or_:g} if unknown"
-        )
+        reason = f"must be {least:.9g} to {greatest:.9g}"
+        if or_ is not None:
+            reason += f", or {or_:g} if unknown"
         # A valid value must stay valid when rounded to float32; the bounds may be infinite.
-        least, greatest = min(least, float32(least)), max(greatest, float32(greatest))
-        each = "each" if is_array else f"{{{field}}}"
-        known = (
-            []
-            if or_ is None
-            else [f"({each} != {value!r})" for value in dict.fromkeys((or_, float32(or_)))]
-        )
-        wrong = f"({' and '.join([f'(({each} < {least!r}) or ({each} > {greatest!r}))', *known])})"
-        super().__init__(
-            [Check(field, reason, f"any([{wrong} for each in {{{field}}}])" if is_array else wrong)]
-        )
+        lowest = min(least, float32(least))
+        highest = max(greatest, float32(greatest))
+        value = "element" if is_array else _value(field)
+        wrong = f"(({value} < {lowest!r}) or ({value} > {highest!r}))"
+        if or_ is not None:
+            wrong += f" and ({value} != {or_!r})"
+            if float32(or_) != or_:
+                wrong += f" and ({value} != {float32(or_)!r})"
+        wrong = f"({wrong})"
+        if is_array:
+            wrong = f"any([{wrong} for element in {_value(field)}])"
+        super().__init__([Check(field, reason, wrong)])
 
 
 class NotLater(Rule):
@@ -122,7 +125,7 @@ class NotLater(Rule):
 
     def __init__(self, earlier: str, later: str) -> None:
         reason = f"must not be later than {later} ({{{later}}})"
-        super().__init__([Check(earlier, reason, f"({{{earlier}}} > {{{later}}})")])
+        super().__init__([Check(earlier, reason, f"({_value(earlier)} > {_value(later)})")])
 
 
 class UnitQuaternion(Rule):
@@ -135,36 +138,56 @@ class UnitQuaternion(Rule):
         reason = "must have norm 1, or NaN as first element if unknown"
         if or_zeros:
             reason = "must have norm 1, or NaN as first element or zeros if unknown"
-        least, greatest = (1.0 - tolerance) ** 2, (1.0 + tolerance) ** 2
-        middle, deviation = (greatest + least) / 2, (greatest - least) / 2
-        norm = f"squared_norm({{{field}}})"
+        least = (1.0 - tolerance) ** 2
+        greatest = (1.0 + tolerance) ** 2
+        middle = (greatest + least) / 2
+        deviation = (greatest - least) / 2
+        value = _value(field)
+        norm = f"squared_norm({value})"
+        is_known = f"({value}[0] == {value}[0])"  # false for NaN
         is_other = f"(not (abs({norm} - {middle!r}) <= {deviation!r}))"
-        is_known = f"({{{field}}}[0] == {{{field}}}[0])"
-        wrong = f"({is_known} and {is_other}"
-        wrong += f" and ({norm} != 0))" if or_zeros else ")"
-        super().__init__([Check(field, reason, wrong)])
+        wrong = f"{is_known} and {is_other}"
+        if or_zeros:
+            wrong += f" and ({norm} != 0)"
+        super().__init__([Check(field, reason, f"({wrong})")])
+
+
+def _value(name: str) -> str:
+    """Return the field's name in braces, for which its value is inserted."""
+    return f"{{{name}}}"
 
 
 def expression_of(rules: Sequence[Rule], accessors: Mapping[str, str]) -> str:
     """Return one expression that is true if `values` pass all rules; `accessors`: the expression for each field.
 
-    A single expression avoids a function call per rule.
+    A single expression avoids a function call per rule. For FiniteWhile(z_valid="z") and NotNegative("eph", "epv"):
+
+        (isfinite(values[3]) or not ((values[1] and not isfinite(values[3]))))
+            and not ((values[4] < 0) or (values[5] < 0))
     """
-    passed = []
+    if not rules:
+        return "True"
+    passed: list[str] = []
     for rule in rules:
         right = f"not ({' or '.join(check.wrong for check in rule.checks)})"
-        # Fast path: the sum of all guarded fields is almost always finite.
-        finite = " + ".join(f"{{{name}}}" for fields in rule.flags.values() for name in fields)
-        passed.append(f"(isfinite({finite}) or {right})" if finite else right)
-    return (" and ".join(passed) or "True").format_map(accessors)
+        guarded: list[str] = []
+        for fields in rule.flags.values():
+            guarded.extend(_value(name) for name in fields)
+        if guarded:
+            # Fast path: the sum of all guarded fields is almost always finite.
+            right = f"(isfinite({' + '.join(guarded)}) or {right})"
+        passed.append(right)
+    return " and ".join(passed).format_map(accessors)
 
 
 def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the name and the reason for each field that breaks a rule, given the values of all fields."""
     accessors = {name: f"values[{name!r}]" for name in values}
-    for check in chain.from_iterable(rule.checks for rule in rules):
-        if compile_lambda(f"lambda values: {check.wrong}".format_map(accessors))(values):
-            yield check.field, check.reason.format_map(values)
+    for rule in rules:
+        for check in rule.checks:
+            is_wrong = compile_lambda(f"lambda values: {check.wrong}".format_map(accessors))
+            if is_wrong(values):
+                yield check.field, check.reason.format_map(values)
 
 
 def column_checks(
@@ -172,13 +195,20 @@ def column_checks(
 ) -> list[Callable[[Any], Any]]:
     """Return one function per check that maps a structured array to a mask of the messages that break it.
 
-    `functions`: column versions of the functions that checks call; array columns are transposed.
+    `functions`: column versions of the functions that checks call; array columns are transposed. For the first check of
+    FiniteWhile(z_valid="z"):
+
+        lambda values: (values['z_valid'].T & ~isfinite(values['z'].T))
     """
-    accessors = {name: f"values[{name!r}].T" for rule in rules for name in rule.fields}
-    texts = [check.wrong.format_map(accessors) for rule in rules for check in rule.checks]
-    for word, operator in {" or ": " | ", " and ": " & ", "not ": "~"}.items():
-        texts = [text.replace(word, operator) for text in texts]
-    return [compile_lambda(f"lambda values: {text}", **functions) for text in texts]
+    checks: list[Callable[[Any], Any]] = []
+    for rule in rules:
+        accessors = {name: f"values[{name!r}].T" for name in rule.fields}
+        for check in rule.checks:
+            text = check.wrong.format_map(accessors)
+            for word, operator in _COLUMN_OPERATORS.items():
+                text = text.replace(word, operator)
+            checks.append(compile_lambda(f"lambda values: {text}", **functions))
+    return checks
 
 
 @lru_cache(1024)
@@ -199,9 +229,11 @@ def compile_lambda(expression: str, **functions: Callable[..., Any]) -> Callable
 def float32(value: float) -> float:
     """Return the nearest float32; infinity beyond its range."""
     try:
-        return cast("float", struct.unpack("<f", struct.pack("<f", value))[0])
+        packed = struct.pack("<f", value)
     except OverflowError:
         return math.copysign(math.inf, value)
+    rounded: float = struct.unpack("<f", packed)[0]
+    return rounded
 
 
 def squared_norm(quaternion: tuple[float, ...]) -> float:

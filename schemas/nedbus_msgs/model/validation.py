@@ -17,7 +17,7 @@ from pydantic_core import CoreConfig, SchemaValidator, core_schema
 from .px4_types import FieldType, decode_text, encode_text
 from .rules import Rule, compile_lambda, expression_of
 
-_FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+_LARGEST_FLOAT32: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
 Values = tuple[object, ...]  # the values of all fields of a message, in order
 ByName = Callable[[Values], dict[str, object]]
@@ -34,42 +34,38 @@ class Validation:
     """
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
-        names, kinds = tuple(types), types.values()
-        accessors = {name: f"values[{index}]" for index, name in enumerate(names)}
-        self.passes_rules = compile_lambda(f"lambda values: {expression_of(rules, accessors)}")
-        self.values_of: Callable[[Any], Values] = (
-            itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
-        )
-        self.by_name = _compile_by_name(types, "row")
         self._types = types
+        names = tuple(types)
+        kinds = list(types.values())
+        accessors = {name: f"values[{index}]" for index, name in enumerate(names)}
+        passes = expression_of(rules, accessors)
+        self.passes_rules = compile_lambda(f"lambda values: {passes}")
+        self.values_of: Callable[[Any], Values] = lambda fields: (fields[names[0]],)
+        if len(names) > 1:
+            self.values_of = itemgetter(*names)
+        self.by_name = _compile_by_name(types)
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
         # Not the model's schema: Pydantic takes 20 ms to build it for all messages, during which it swallows Ctrl-C.
-        tuples = core_schema.tuple_positional_schema(
-            [kind.core_schema(from_json=False) for kind in kinds]
-        )
-        self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
+        fields = [kind.core_schema(from_json=False) for kind in kinds]
+        schema = core_schema.tuple_positional_schema(fields)
+        self.validate = SchemaValidator(schema, CoreConfig(strict=True)).validate_python
         self._struct = struct.Struct("=" + "".join(kind.form for kind in kinds))
-        self._flat, nested = _flat_expressions(list(kinds))
+        self._flat = _flat_values(kinds)
         self.flatten: Callable[[Values], Values] = tuple
         self.unflatten: Callable[[Values], Values] = tuple
         if any(kind.length is not None for kind in kinds):
+            restored = _restored_values(kinds)
             self.flatten = compile_lambda(f"lambda row: ({self._flat},)", encode_text=encode_text)
-            self.unflatten = compile_lambda(f"lambda row: ({nested},)", decode_text=decode_text)
-        valid = (
-            f"(values := validate(values)) and {expression_of(rules, accessors)} and values or None"
-        )
+            self.unflatten = compile_lambda(f"lambda row: ({restored},)", decode_text=decode_text)
+        steps = f"(values := validate(values)) and {passes} and values or None"
         self._valid_row: Callable[[Values], Values | None] = compile_lambda(
-            f"lambda values: {valid}", validate=self.validate
+            f"lambda values: {steps}", validate=self.validate
         )
 
     @cached_property
     def rounded_by_name(self) -> ByName:
         """Return the same as `by_name`, rounded to float32; raise OverflowError beyond its range."""
-        functions: dict[str, Callable[..., Any]] = {
-            "pack": self._struct.pack,
-            "unpack": self._struct.unpack,
-        }
-        return _compile_by_name(self._types, f"unpack(pack({self._flat}))", **functions)
+        return _compile_rounded_by_name(self._types, self._flat, self._struct)
 
     def check_row(self, values: Values) -> Values | None:
         """Validate the values of all fields without rounding; return None to let the model decide."""
@@ -99,45 +95,77 @@ class Validation:
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the name and the reason for each number beyond the range of its float32 field."""
         for name, kind in self._types.items():
-            for number in (
-                (values[name] if kind.is_array else (values[name],))
-                if kind.base == "float32"
-                else ()
-            ):
-                if math.isfinite(number) and abs(number) > _FLOAT32_MAX:
-                    yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
+            if kind.base != "float32":
+                continue
+            numbers = values[name] if kind.is_array else (values[name],)
+            for number in numbers:
+                if math.isfinite(number) and abs(number) > _LARGEST_FLOAT32:
+                    yield name, f"is beyond the range of float32 (+-{_LARGEST_FLOAT32:.9g})"
 
 
-def _compile_by_name(
-    types: Mapping[str, FieldType], source: str, **functions: Callable[..., Any]
-) -> ByName:
-    """Return a function that assigns the values of `source`, an expression, to the items of a copied dict.
+def _compile_by_name(types: Mapping[str, FieldType]) -> ByName:
+    """Compile a function that assigns the values of a row to the items of a copied dict.
 
-    This takes half the time of `dict.update`. With `functions`, for the source, its values are flattened.
+    This takes half the time of `dict.update`. For two fields, the source is:
+
+        def by_name(row):
+         values = copy()
+         values['timestamp'], values['q'], = row
+         return values
     """
-    targets, arrays = list[str](), list[str]()
+    targets = [f"values[{name!r}]" for name in types]
+    return _compile_assignment(types, targets, "row", [])
+
+
+def _compile_rounded_by_name(
+    types: Mapping[str, FieldType], flat: str, packed: struct.Struct
+) -> ByName:
+    """Compile a function that rounds the values of a row, and assigns them to the items of a copied dict.
+
+    `flat`: the expression of the flattened values. For a time, an array and a text, the source is:
+
+        def by_name(row):
+         values = copy()
+         values['timestamp'], part1_0, part1_1, values['text'], = unpack(pack(*row[0:1], *row[1], ...))
+         values['q'] = (part1_0, part1_1,)
+         values['text'] = decode_text(values['text'])
+         return values
+    """
+    targets: list[str] = []
+    restored: list[str] = []
     for position, (name, kind) in enumerate(types.items()):
         item = f"values[{name!r}]"
-        parts = (
-            [f"part{position}_{index}" for index in range(kind.values)]
-            if functions and kind.is_array
-            else [item]
-        )
-        targets += parts
-        if functions and kind.length is not None:
-            arrays.append(
-                f" {item} = "
-                + (f"decode_text({item})" if kind.is_text else f"({', '.join(parts)},)")
-            )
-    lines = [
-        "def by_name(row):",
-        " values = copy()",
-        f" {', '.join(targets)}, = {source}",
-        *arrays,
-        " return values",
-    ]
-    texts = {"encode_text": encode_text, "decode_text": decode_text}
-    namespace: dict[str, Any] = {"copy": dict.fromkeys(types).copy, **texts, **functions}
+        if kind.is_array:
+            elements = [f"part{position}_{index}" for index in range(kind.values)]
+            targets += elements
+            restored.append(f" {item} = ({', '.join(elements)},)")
+            continue
+        targets.append(item)
+        if kind.is_text:
+            restored.append(f" {item} = decode_text({item})")
+    source = f"unpack(pack({flat}))"
+    return _compile_assignment(types, targets, source, restored, packed)
+
+
+def _compile_assignment(
+    types: Mapping[str, FieldType],
+    targets: Sequence[str],
+    source: str,
+    restored: Sequence[str],
+    packed: struct.Struct | None = None,
+) -> ByName:
+    lines = ["def by_name(row):", " values = copy()"]
+    lines.append(f" {', '.join(targets)}, = {source}")
+    lines.extend(restored)
+    lines.append(" return values")
+    namespace: dict[str, Any] = {
+        "copy": dict.fromkeys(types).copy,
+        "encode_text": encode_text,
+        "decode_text": decode_text,
+    }
+    if packed is not None:
+        namespace["pack"] = packed.pack
+        namespace["unpack"] = packed.unpack
     exec(compile("\n".join(lines), "<fields>", "exec"), namespace)  # noqa: S102 - names are identifiers, quoted by repr
     by_name: ByName = namespace["by_name"]
     return by_name
@@ -145,7 +173,8 @@ def _compile_by_name(
 
 def positions_of(types: Mapping[str, FieldType]) -> dict[str, int | slice]:
     """Return the position of each field in flattened values, of which each element of an array is one."""
-    positions, count = dict[str, int | slice](), 0
+    positions: dict[str, int | slice] = {}
+    count = 0
     for name, kind in types.items():
         positions[name] = slice(count, count + kind.values) if kind.is_array else count
         count += kind.values
@@ -153,25 +182,49 @@ def positions_of(types: Mapping[str, FieldType]) -> dict[str, int | slice]:
 
 
 def accessors_of(types: Mapping[str, FieldType]) -> dict[str, str]:
-    """Return an expression for each field of flattened values."""
-    found = positions_of(types).items()
-    return {
-        name: f"values[{at}]" if isinstance(at, int) else f"values[{at.start}:{at.stop}]"
-        for name, at in found
-    }
+    """Return an expression for each field of flattened values, such as `values[3]` or `values[4:8]`."""
+    accessors: dict[str, str] = {}
+    for name, position in positions_of(types).items():
+        if isinstance(position, slice):
+            accessors[name] = f"values[{position.start}:{position.stop}]"
+        else:
+            accessors[name] = f"values[{position}]"
+    return accessors
 
 
-def _flat_expressions(kinds: Sequence[FieldType]) -> tuple[str, str]:
-    """Return expressions of the values of a flattened and of a restored `row` with fields of these types."""
-    flat, nested = [], []
-    index = flat_index = 0  # indices of the first value after the last array, in row and flat tuple
+def _flat_values(kinds: Sequence[FieldType]) -> str:
+    """Return the expression of the flattened values of `row`, which has fields of these types.
+
+    For two times, a quaternion and a text: `*row[0:2], *row[2], *row[3:3], encode_text(row[3]), *row[4:]`.
+    """
+    parts: list[str] = []
+    begin = 0  # of the single values after the last array or text
     for position, kind in enumerate(kinds):
         if kind.length is not None:
-            start = flat_index + position - index
-            one, back = f"*row[{position}]", f"row[{start}:{start + kind.values}]"
-            if kind.is_text:
-                one, back = f"encode_text(row[{position}])", f"decode_text(row[{start}])"
-            flat += [f"*row[{index}:{position}]", one]
-            nested += [f"*row[{flat_index}:{start}]", back]
-            index, flat_index = position + 1, start + kind.values
-    return ", ".join([*flat, f"*row[{index}:]"]), ", ".join([*nested, f"*row[{flat_index}:]"])
+            parts.append(f"*row[{begin}:{position}]")
+            value = f"row[{position}]"
+            parts.append(f"encode_text({value})" if kind.is_text else f"*{value}")
+            begin = position + 1
+    parts.append(f"*row[{begin}:]")
+    return ", ".join(parts)
+
+
+def _restored_values(kinds: Sequence[FieldType]) -> str:
+    """Return the expression of the values of fields of these types, of which `row` has the flattened ones.
+
+    For two times, a quaternion and a text: `*row[0:2], row[2:6], *row[6:6], decode_text(row[6]), *row[7:]`.
+    """
+    parts: list[str] = []
+    begin = 0  # of the single values after the last array or text
+    position = 0
+    for kind in kinds:
+        end = position + kind.values
+        if kind.length is not None:
+            parts.append(f"*row[{begin}:{position}]")
+            parts.append(
+                f"decode_text(row[{position}])" if kind.is_text else f"row[{position}:{end}]"
+            )
+            begin = end
+        position = end
+    parts.append(f"*row[{begin}:]")
+    return ", ".join(parts)

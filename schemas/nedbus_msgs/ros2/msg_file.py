@@ -4,9 +4,9 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from itertools import islice
 from typing import Final, NamedTuple
 
+from nedbus_msgs import limits
 from nedbus_msgs.definitions import check_field_name, define
 from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.message import Message
@@ -31,10 +31,6 @@ _LENGTH = re.compile(r"\[([1-9]\d{0,2})\]")  # length of an array of nested mess
 _LIMIT: Final = rf"\s*+(?:({_NUMBER})|[-+]?[A-Za-z]\w*+)?\s*+(?:\([^()]*+\)\s*+)?"
 _RANGE = re.compile(rf"(\[)?@range(?![A-Za-z_])(?:\s{_LIMIT}(?P<comma>,){_LIMIT}(?(1)\]))?")
 _INVALID = re.compile(rf"@invalid\s++({_NUMBER})")
-_MAX_FIELDS: Final = 1000  # including nested ones; the limit of a message is lower
-_MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
-_MAX_LENGTH: Final = 2**18  # characters per file; PX4's longest has 20,000
-_MAX_COMMENT: Final = 2000  # characters; the rest is cut off
 
 
 class MsgError(ValueError):
@@ -62,48 +58,54 @@ def read_msg(text: str) -> list[MsgField]:
     Nested messages follow as in ROS 2 and MCAP, each after a line of = and a line `MSG: package/Name`. Their fields are
     flattened into the message: `current_lat`, `esc_0_esc_rpm`.
     """
-    fields = list(islice(_flatten(_parts(text), "", "", 0), _MAX_FIELDS + 1))
-    if len(fields) > _MAX_FIELDS:
-        raise MsgError(1, 1, f"more than {_MAX_FIELDS} fields, including those of nested messages")
+    fields: list[MsgField] = []
+    for field in _flatten(_parts(text), "", "", 0):
+        if len(fields) == limits.MSG_FIELDS:
+            reason = f"more than {limits.MSG_FIELDS} fields, including those of nested messages"
+            raise MsgError(1, 1, reason)
+        fields.append(field)
     return fields
 
 
 @lru_cache(256)  # a cached definition keeps its codecs
 def define_msg(name: str, text: str) -> Definition[Message]:
     """Define a message from a .msg file, with its `@range` annotations as rules; raise MsgError if it is invalid."""
-    fields, rules = read_msg(text), []
+    fields = read_msg(text)
+    rules: list[InRange] = []
     for field in fields:
         try:
             check_field_name(field.name)
-            rules.append(_range_of(field))
+            rule = _range_of(field)
         except ValueError as exc:
             raise MsgError(field.line, field.column, str(exc)) from None
+        if rule is not None:
+            rules.append(rule)
+    types = [(field.name, field.type) for field in fields]
+    meanings = {field.name: field.comment for field in fields if field.comment}
     try:
-        types = ((field.name, field.type) for field in fields)
-        meanings = {field.name: field.comment for field in fields if field.comment}
-        return define(name, types, meanings=meanings, rules=list(filter(None, rules)))
+        return define(name, types, meanings=meanings, rules=rules)
     except ValueError as exc:
         raise MsgError(1, 1, str(exc)) from None
 
 
 def hash_of_msg(name: str, text: str, *, literal_char: bool = False) -> str:
     """Return the RIHS01 hash of the type in a .msg file, with nested messages; raise MsgError if it is malformed."""
-    parts = _parts(text)
-    types = {
-        part: [_describe(line, parts, literal_char) for line in lines.values()]
-        for part, lines in parts.items()
-    }
-    used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
-    return type_hash(*((f"{PACKAGE}/{each or name}", types[each]) for each in ["", *used]))
+    messages = _parts(text)
+    types: list[tuple[str, list[Mapping[str, object]]]] = []
+    nested = sorted(_bases_of(messages) & messages.keys())
+    for message in ["", *nested]:
+        fields = [_describe(line, messages, literal_char) for line in messages[message].values()]
+        types.append((f"{PACKAGE}/{message or name}", fields))
+    return type_hash(*types)
 
 
 def bases_of_msg(text: str) -> set[str]:
     """Return the names of all field types in a .msg file, both base types and nested messages."""
-    return {line.base for lines in _parts(text).values() for line in lines.values()}
+    return _bases_of(_parts(text))
 
 
 class _Line(NamedTuple):
-    """A field as written in the file; `base`: its type without the array length."""
+    """A field as written in the file; `base`: its type without package and array length, such as `[3]`."""
 
     number: int
     column: int
@@ -116,59 +118,69 @@ class _Line(NamedTuple):
 _Parts = Mapping[str, Mapping[str, _Line]]
 
 
+def _bases_of(parts: _Parts) -> set[str]:
+    bases: set[str] = set()
+    for lines in parts.values():
+        bases.update(line.base for line in lines.values())
+    return bases
+
+
 def _parts(text: str) -> _Parts:
     """Return the fields of the message by name under "", and those of nested messages under their names."""
-    if len(text) > _MAX_LENGTH:
-        raise MsgError(1, 1, f"{len(text)} characters, more than the limit of {_MAX_LENGTH}")
+    if len(text) > limits.MSG_FILE:
+        reason = f"{len(text)} characters, more than the limit of {limits.MSG_FILE}"
+        raise MsgError(1, 1, reason)
     current: dict[str, _Line] = {}
     parts = {"": current}
-    for number, line in enumerate(_LINE_END.split(text.removeprefix("\ufeff")), 1):
-        start = len(line) - len(line.lstrip())
-        if line.startswith("MSG: "):
-            current = parts.setdefault(line.rpartition("/")[2].strip(), {})
-        elif line.strip() and line[start] != "#" and not line.startswith("==="):
-            found = _FIELD.fullmatch(line.strip())
-            if found is None:
-                raise MsgError(
-                    number,
-                    start + 1,
-                    "expected a field, such as 'float32[4] q  # comment', or a constant",
-                )
-            base, bracket, length = found["type"].rpartition("/")[2].partition("[")
-            name, comment = (
-                found["name"],
-                (found["comment"] or "").lstrip("# ")[:_MAX_COMMENT].strip(),
-            )
-            if name in current:
-                raise MsgError(number, start + 1 + found.start("name"), f"duplicate field {name!r}")
-            if not found["equals"]:
-                current[name] = _Line(number, start + 1, base, bracket + length, name, comment)
-            elif base not in BASES and base not in ALIASES and not found["text"]:
-                raise MsgError(number, start + 1, f"unsupported constant type {base!r}")
+    for number, text_line in enumerate(_LINE_END.split(text.removeprefix("\ufeff")), 1):
+        stripped = text_line.strip()
+        if text_line.startswith("MSG: "):
+            nested_name = text_line.rpartition("/")[2].strip()
+            current = parts.setdefault(nested_name, {})
+            continue
+        if not stripped or stripped.startswith("#") or text_line.startswith("==="):
+            continue
+        column = len(text_line) - len(text_line.lstrip()) + 1
+        declaration = _FIELD.fullmatch(stripped)
+        if declaration is None:
+            expected = "expected a field, such as 'float32[4] q  # comment', or a constant"
+            raise MsgError(number, column, expected)
+        name = declaration["name"]
+        if name in current:
+            column += declaration.start("name")
+            raise MsgError(number, column, f"duplicate field {name!r}")
+        without_package = declaration["type"].rpartition("/")[2]
+        base, bracket, length = without_package.partition("[")
+        if not declaration["equals"]:
+            comment = (declaration["comment"] or "").lstrip("# ")
+            comment = comment[: limits.MSG_COMMENT].strip()
+            current[name] = _Line(number, column, base, bracket + length, name, comment)
+        elif base not in BASES and base not in ALIASES and not declaration["text"]:
+            raise MsgError(number, column, f"unsupported constant type {base!r}")
     return parts
 
 
 def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[MsgField]:
     for line in parts[message].values():
-        count = _LENGTH.fullmatch(line.length)
-        if parts.get(line.base) and level < _MAX_NESTING and (count or not line.length):
-            for index in range(int(count[1])) if count else [None]:
-                inner = f"{prefix}{line.name}_"
-                if index is not None:
-                    inner += f"{index}_"
-                yield from _flatten(parts, line.base, inner, level + 1)
-            continue
-        yield MsgField(prefix + line.name, _type_of(line), line.comment, line.number, line.column)
+        is_nested = bool(parts.get(line.base)) and level < limits.MSG_NESTING
+        length = _LENGTH.fullmatch(line.length)
+        name = prefix + line.name
+        if is_nested and length:
+            for index in range(int(length[1])):
+                yield from _flatten(parts, line.base, f"{name}_{index}_", level + 1)
+        elif is_nested and not line.length:
+            yield from _flatten(parts, line.base, f"{name}_", level + 1)
+        else:
+            yield MsgField(name, _type_of(line), line.comment, line.number, line.column)
 
 
 def _describe(line: _Line, parts: Mapping[str, object], literal_char: bool) -> Mapping[str, object]:
-    count = _LENGTH.fullmatch(line.length)
-    if line.base in parts and (count or not line.length):
-        return describe_field(
-            line.name, NESTED, int(count[1]) if count else 0, f"{PACKAGE}/{line.base}"
-        )
-    length = _type_of(line).length or 0
-    return describe_field(line.name, TYPE_IDS[literal_char][line.base], length)
+    length = _LENGTH.fullmatch(line.length)
+    if line.base in parts and (length or not line.length):
+        elements = int(length[1]) if length else 0
+        return describe_field(line.name, NESTED, elements, f"{PACKAGE}/{line.base}")
+    elements = _type_of(line).length or 0
+    return describe_field(line.name, TYPE_IDS[literal_char][line.base], elements)
 
 
 def _type_of(line: _Line) -> FieldType:
@@ -179,20 +191,27 @@ def _type_of(line: _Line) -> FieldType:
 
 
 def _range_of(field: MsgField) -> InRange | None:
-    found, invalid = _RANGE.search(field.comment), _INVALID.search(field.comment)
-    if found and not found["comma"]:
+    annotation = _RANGE.search(field.comment)
+    if annotation is None:
+        return None
+    if not annotation["comma"]:
         raise ValueError(
             f"malformed @range of {field.name}; expected limits, such as [@range 0, 100]"
         )
-    if found is None or field.type.base == "bool" or field.type.is_text:
+    if field.type.base == "bool" or field.type.is_text:
         return None
-    least = float(found[2] or "-inf")
-    greatest = float(found[4] or "inf")
-    or_ = float(invalid[1]) if invalid else None
-    lowest, highest = (-math.inf, math.inf) if field.type.is_float else field.type.limits
-    first, last = max(least, lowest), min(greatest, highest)
-    if first > last or (not field.type.is_float and math.ceil(first) > last):
+    least = float(annotation[2] or "-inf")
+    greatest = float(annotation[4] or "inf")
+    is_empty = least > greatest
+    if not field.type.is_float:
+        lowest, highest = field.type.limits
+        first = max(least, lowest)
+        last = min(greatest, highest)
+        is_empty = first > last or math.ceil(first) > last
+    if is_empty:
         raise ValueError(
             f"no number is in the @range of {field.name}, from {least:.9g} to {greatest:.9g}"
         )
+    invalid = _INVALID.search(field.comment)
+    or_ = float(invalid[1]) if invalid else None
     return InRange(field.name, least, greatest, or_=or_, is_array=field.type.is_array)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from hashlib import sha256
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from nedbus_msgs.model.declaration import Layout
 from nedbus_msgs.model.definition import MESSAGES, Definition
@@ -34,25 +34,31 @@ def dds_type(name: str) -> str:
 @cache
 def ros2_types() -> Mapping[str, Definition[Any]]:
     """Return the definitions of built-in messages by ROS 2 type, including the types of PX4's translation node."""
-    return {name: definition for name, definition, _ in _named_layouts()}
+    return {known.name: known.definition for known in _known_types()}
 
 
-def _named_layouts() -> Iterator[tuple[str, Definition[Any], Layout]]:
-    """Yield the layouts of built-in messages, each with its ROS 2 types."""
+class _KnownType(NamedTuple):
+    """A ROS 2 type of a built-in message, and the layout that it stands for."""
+
+    name: str
+    definition: Definition[Any]
+    layout: Layout
+
+
+def _known_types() -> Iterator[_KnownType]:
     for definition in MESSAGES.values():
         for layout in definition.layouts.values():
-            yield from (
-                (name, definition, layout) for name in (ros2_type(definition), *layout.aliases)
-            )
+            yield _KnownType(ros2_type(definition), definition, layout)
+            for alias in layout.aliases:
+                yield _KnownType(alias, definition, layout)
 
 
 def hash_of(layout: Layout, ros2_type: str, *, literal_char: bool = False) -> str:
     """Return the RIHS01 hash (REP 2016) of a ROS 2 type with the fields of a layout: `RIHS01_` and 64 hex digits."""
     ids = TYPE_IDS[literal_char]
-    fields = [
-        describe_field(name, ids[kind.base], kind.length or 0)
-        for name, kind in layout.types.items()
-    ]
+    fields = []
+    for name, kind in layout.types.items():
+        fields.append(describe_field(name, ids[kind.base], kind.length or 0))
     return type_hash((ros2_type, fields))
 
 
@@ -60,12 +66,14 @@ def type_hash(*types: tuple[str, Sequence[Mapping[str, object]]]) -> str:
     """Return the RIHS01 hash of the first type, as name and fields; its nested types follow, sorted by name."""
     root, *referenced = [{"type_name": name, "fields": fields} for name, fields in types]
     content = {"type_description": root, "referenced_type_descriptions": referenced}
-    return _RIHS01 + sha256(json.dumps(content).encode()).hexdigest()
+    digest = sha256(json.dumps(content).encode())
+    return _RIHS01 + digest.hexdigest()
 
 
 def describe_field(name: str, type_id: int, length: int, nested: str = "") -> Mapping[str, object]:
     """Return a field of a type description; `length`: 0 unless it is an array; `nested`: type of a nested message."""
-    type_id += _ARRAY if length else 0
+    if length:
+        type_id += _ARRAY
     kind = {
         "type_id": type_id,
         "capacity": length,
@@ -77,29 +85,36 @@ def describe_field(name: str, type_id: int, length: int, nested: str = "") -> Ma
 
 def definition_text(definition: Definition[Any], layout: Layout) -> str:
     """Return the .msg definition of a layout, with the unit and meaning of each field."""
-    lines = ((f"{kind} {name}", definition.meaning(name)) for name, kind in layout.types.items())
-    return "".join(
-        f"{field}  # {meaning}\n" if meaning else f"{field}\n" for field, meaning in lines
-    )
+    text = ""
+    for name, kind in layout.types.items():
+        text += f"{kind} {name}"
+        meaning = definition.meaning(name)
+        if meaning:
+            text += f"  # {meaning}"
+        text += "\n"
+    return text
 
 
 def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
     """Return the message and layout with a type hash, given with or without `RIHS01_`; None if unknown."""
-    digits = text.removeprefix(_RIHS01).lower()
+    digits = _digits_of(text)
     return _by_hash(False).get(digits) or _by_hash(True).get(digits)
 
 
 def has_char_hash(text: str) -> bool:
     """Return whether a type hash is known only with `literal_char`."""
-    return message_of_type_hash(text) is not None and text.removeprefix(
-        _RIHS01
-    ).lower() not in _by_hash(False)
+    digits = _digits_of(text)
+    return digits in _by_hash(True) and digits not in _by_hash(False)
+
+
+def _digits_of(text: str) -> str:
+    return text.removeprefix(_RIHS01).lower()
 
 
 @cache
 def _by_hash(literal_char: bool) -> Mapping[str, tuple[Definition[Any], Layout]]:
-    hashes = [
-        (hash_of(at, name, literal_char=literal_char), each, at)
-        for name, each, at in _named_layouts()
-    ]
-    return {text.removeprefix(_RIHS01): (each, layout) for text, each, layout in hashes}
+    layouts: dict[str, tuple[Definition[Any], Layout]] = {}
+    for known in _known_types():
+        text = hash_of(known.layout, known.name, literal_char=literal_char)
+        layouts[_digits_of(text)] = known.definition, known.layout
+    return layouts

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Final
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.client import (
     Histogram,
     LogStreamStatus,
@@ -27,13 +27,7 @@ from nedbus_msgs import Address, Definition, get_topic
 
 _log = logging.getLogger(__name__)
 
-_MAX_ADDRESSES: Final = 1000  # published and stale addresses of one live source
-_MAX_REPLAYED: Final = 10_000  # addresses of one replay, as many as a reader tracks
-_MAX_WARNINGS: Final = 50  # rejections kept and logged, one per origin (`where`)
-_MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
-_MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
 _UNSETTLED: Final = 60.0  # s after which a stream that was stale counts as stable again
-_MAX_RULES: Final = 50  # rules with a separate counter
 _ULOG_STREAM: Final = "mavlink-ulog"  # source of messages before which losses are estimated
 _NO_MESSAGE: Final = "input that is no message"
 TOO_MANY: Final = "too many addresses"
@@ -133,7 +127,7 @@ class SourceOutput:
         for address in run.addresses.keys() - set(self.addresses):
             if address in self._registry.publishers:
                 raise AddressInUseError(address)
-        for address, definition in islice(run.addresses.items(), _MAX_REPLAYED):
+        for address, definition in islice(run.addresses.items(), limits.REPLAYED_ADDRESSES):
             self.claim(address, definition, lossless=lossless)
 
     def claim(
@@ -163,8 +157,8 @@ class SourceOutput:
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
         stream, definition = self._streams.get(message.address), message.definition
-        if stream is None and len(self._streams) >= _MAX_REPLAYED:
-            self._reject_excess(message.address, _MAX_REPLAYED)
+        if stream is None and len(self._streams) >= limits.REPLAYED_ADDRESSES:
+            self._reject_excess(message.address, limits.REPLAYED_ADDRESSES)
             return
         if (
             stream is None
@@ -239,8 +233,12 @@ class SourceOutput:
             or _differs(message.definition, publisher.definition)
         ):
             resumed = stream is not None and stream.last_received is not None
-            if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._evict_stale():
-                self._reject_excess(address, _MAX_ADDRESSES)
+            if (
+                not resumed
+                and len(self._streams) >= limits.LIVE_ADDRESSES
+                and not self._evict_stale()
+            ):
+                self._reject_excess(address, limits.LIVE_ADDRESSES)
                 return
             try:
                 stream = self.claim(address, message.definition)
@@ -311,8 +309,8 @@ class SourceOutput:
     def reject(self, rejection: Rejection, rule: str = _NO_MESSAGE) -> None:
         """Count invalid input, log it once per origin, and publish a rejection report if it has an address."""
         self._count_rejected(rule, rejection.count)
-        where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
-        if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
+        where, reason = rejection.where[: limits.PEER_TEXT], rejection.reason[: limits.PEER_TEXT]
+        if where not in self._warnings and len(self._warnings) < limits.REJECTION_ORIGINS:
             self._warnings[where] = f"{where}: {reason}"
             text = f"{where} rejected: {reason}" if rejection.count else f"{where}: {reason}"
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
@@ -331,7 +329,7 @@ class SourceOutput:
         """Store the unavailable topics of a live source; log each silent address once, up to the address limit."""
         self.unavailable = unavailable
         new = [address for address in unavailable.silent if address not in self._silent]
-        if new := new[: _MAX_ADDRESSES - len(self._silent)]:
+        if new := new[: limits.LIVE_ADDRESSES - len(self._silent)]:
             self._silent.update(new)
             text = f"announced, nothing arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
@@ -371,16 +369,18 @@ class SourceOutput:
     def _count_rejected(self, rule: str, count: int = 1) -> None:
         self.rejected += count
         self.rejections[
-            rule if rule in self.rejections or len(self.rejections) < _MAX_RULES else "other"
+            rule
+            if rule in self.rejections or len(self.rejections) < limits.REJECTION_RULES
+            else "other"
         ] += count
 
     def _reject_invalid(self, message: SourceMessage, rule: str, reason: str) -> None:
         self._count_rejected(rule)
         self._invalid += 1
-        if self._invalid <= _MAX_LOGGED:
+        if self._invalid <= limits.LOGGED_INVALID:
             last = (
                 "; further rejections are counted but not logged"
-                if self._invalid == _MAX_LOGGED
+                if self._invalid == limits.LOGGED_INVALID
                 else ""
             )
             text = f"{message.address} rejected: {reason}{last}"

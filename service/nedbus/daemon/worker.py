@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
 
+from nedbus import limits
 from nedbus.client import Histogram, PositionStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.log_event import about
@@ -36,12 +37,11 @@ from .output import TOO_MANY, SourceOutput
 _log = logging.getLogger(__name__)
 
 # s per run of a loop: a log of one message must not be read thousands of times a second
-_MIN_RUN: Final = 0.1
+_SHORTEST_RUN: Final = 0.1
 # s; a replay that falls further behind shifts its schedule instead of catching up
-_MAX_DELAY: Final = 1.0
+_TOLERATED_DELAY: Final = 1.0
 _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
-_MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
 
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
@@ -157,7 +157,7 @@ class Worker:
         """Measurements of the source for metrics."""
         return SourceMeasures(self.status(None), self._output.durations)
 
-    def status(self, max_streams: int | None = _MAX_STREAMS) -> SourceStatus:
+    def status(self, max_streams: int | None = limits.STATUS_STREAMS) -> SourceStatus:
         """Return the status of the source with at most `max_streams` streams, None for all."""
         run, output = self._run, self._output
         return SourceStatus(
@@ -233,7 +233,7 @@ class Worker:
                     self._end("failed" if self._error else "done", self._error)
                     return
                 failures = 0
-                self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
+                self._clock.wait(max(0.0, start + _SHORTEST_RUN - self._clock.now()))
                 continue
             finally:
                 self._message_start = None
@@ -278,7 +278,7 @@ class Worker:
             due = pace.publish_at(message.at)
             if speed is not None:
                 early = start + due - self._clock.now()
-                if early < -_MAX_DELAY:
+                if early < -_TOLERATED_DELAY:
                     extra = about("replay_late", source=self._name)
                     text = "%s: the replay is %.1f s behind its schedule, so later messages are delayed by as much"
                     _log.warning(text, self._name, -early, extra=extra)

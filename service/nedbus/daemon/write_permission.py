@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+from nedbus import limits
 from nedbus.client import PublisherRegistry
 from nedbus.errors import NedbusError
 from nedbus.log_event import UnexpectedErrors, about
@@ -32,7 +33,6 @@ from nedbus_msgs.text import plural
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 5.0  # s for the thread to end
-_MAX_NAMED: Final = 20  # vehicles named in a log line
 
 
 def watch_permission(
@@ -188,5 +188,11 @@ class WritePermission:
 
 
 def _list_vehicles(vehicles: Sequence[str]) -> str:
-    more = f" and {len(vehicles) - _MAX_NAMED} more" if len(vehicles) > _MAX_NAMED else ""
-    return f"vehicle{plural(len(vehicles))} {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"
+    more = (
+        f" and {len(vehicles) - limits.SHOWN_NAMES} more"
+        if len(vehicles) > limits.SHOWN_NAMES
+        else ""
+    )
+    return (
+        f"vehicle{plural(len(vehicles))} {', '.join(sorted(vehicles)[: limits.SHOWN_NAMES])}{more}"
+    )

@@ -6,14 +6,14 @@ from typing import Final, Literal, NamedTuple
 from .sequence import PacketRate
 
 _MAGIC: Final = b"ULog\x01\x12\x35"  # the first bytes of a ULog file
-_MAX_LENGTH: Final = 249  # bytes of `data` in a message
+_DATA_BYTES: Final = 249  # bytes of `data` in a message
 _NO_RECORD_BEGINS: Final = 255  # first_message_offset
 _MODULUS: Final = 2**16  # modulus of the sequence
-_MAX_STEP: Final = 2**15  # a larger sequence step means a duplicate
+_NEWER_STEP: Final = 2**15  # a larger sequence step means a duplicate
 _MARGIN: Final = 100  # messages that may be lost at once; PX4 loses up to 65 in a burst
 # s of messages that a full buffer on the way may drop without a visible pause
 _BUFFERED: Final = 1.0
-_OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _MAX_STEP
+_OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _NEWER_STEP
 
 Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
 """Classification of a message.
@@ -80,7 +80,7 @@ class Reassembly:
         `now`: time of arrival [s]; without it, each loss is taken as the sequence shows it.
         """
         content = bytes(data[:length]).ljust(length, b"\0")
-        if length > _MAX_LENGTH or (
+        if length > _DATA_BYTES or (
             first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS
         ):
             return Chunk("malformed")
@@ -95,7 +95,7 @@ class Reassembly:
         if self._last is None:
             return Chunk("no_definitions")
         step = (sequence - self._last) % _MODULUS
-        if step == 0 or (step > _MAX_STEP and not self._is_ahead(sequence)):
+        if step == 0 or (step > _NEWER_STEP and not self._is_ahead(sequence)):
             return Chunk("duplicate")
         self._last = sequence
         self._old_run = 0

@@ -31,7 +31,7 @@ _REFERENCE: Final = (47.397742, 8.545594, 488.0)
 _BOOT: Final = 10_000_000  # us since boot at the start
 
 _HEADING_RESET: Final = 15.0  # s into a lap
-_MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
+_VALID_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
 _Z_RESET: Final = 90.0  # s into a lap
 # s into a lap: start of the heading error that the next heading reset corrects
 _HEADING_DISTURBED: Final = _LAP - 5.0
@@ -208,7 +208,7 @@ class Estimator:
             velocity=(*speed, 0.0),
             heading=0.0 if _HEADING_RESET <= lap_time < _HEADING_DISTURBED else self._heading_error,
             dead_reckoning=dead_reckoning,
-            xy_valid=dead_reckoning < _MAX_DEAD_RECKONING,
+            xy_valid=dead_reckoning < _VALID_DEAD_RECKONING,
             counters={"xy": outages, "z": steps, "vxy": outages, "vz": 0, "heading": alignments},
             deltas={
                 "xy": (-corrected[0], -corrected[1]), "vxy": slowed, "vz": 0.0,

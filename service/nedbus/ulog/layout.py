@@ -1,27 +1,28 @@
 """Layouts of logged messages, resolved from the format definitions of a log within size limits."""
 
+from __future__ import annotations
+
 import re
 import struct
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import FieldType, decode_text, field_type
+from nedbus import limits
+from nedbus_msgs import BASES, FieldType, decode_text, field_type
 
 BASIC_TYPES: Final[Mapping[str, FieldType]] = {
-    **{
-        f"{sign}int{bits}_t": field_type(f"{sign}int{bits}")
-        for sign in ("", "u")
-        for bits in (8, 16, 32, 64)
-    },
-    **{
-        c: field_type(px4)
-        for c, px4 in {
-            "float": "float32",
-            "double": "float64",
-            "bool": "bool",
-            "char": "char",
-        }.items()
-    },
+    "int8_t": field_type("int8"),
+    "int16_t": field_type("int16"),
+    "int32_t": field_type("int32"),
+    "int64_t": field_type("int64"),
+    "uint8_t": field_type("uint8"),
+    "uint16_t": field_type("uint16"),
+    "uint32_t": field_type("uint32"),
+    "uint64_t": field_type("uint64"),
+    "float": field_type("float32"),
+    "double": field_type("float64"),
+    "bool": field_type("bool"),
+    "char": field_type("char"),
 }
 """ULog's basic types, by their C names."""
 FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
@@ -29,14 +30,7 @@ FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
 UNSET_BOOLS: Final = "bools of {} whose byte is neither 0 nor 1 are read as true"
 """Warning for a topic with bools that PX4 did not initialize."""
 
-_MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
-_MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
-# fields of all messages, even rejected ones: each costs 45 us; a real log has 1,500
-_MAX_ALL_FIELDS: Final = 8192
-# fields of one message, including nested fields and padding; a real message has 100
-_MAX_FIELDS: Final = 1000
-_MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
-_MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
+_MESSAGE_BYTES: Final = 65_533  # of one message: msg_size is a uint16, and two bytes are msg_id
 
 
 class PayloadField(NamedTuple):
@@ -65,13 +59,14 @@ class PayloadLayout:
         count = 0
         self.bool_mask = 0
         for name, kind, offset in fields:
-            self._indices.append(
-                (name, slice(count, count + kind.values) if kind.is_array else count)
-            )
+            index = slice(count, count + kind.values) if kind.is_array else count
+            self._indices.append((name, index))
+            count += kind.values
             code += f"{offset - end}x{kind.form}"
-            end, count = offset + kind.values * kind.size, count + kind.values
+            end = offset + kind.values * kind.size
             if kind.base == "bool":
-                self.bool_mask |= int.from_bytes(b"\xfe" * kind.values) << 8 * offset
+                mask = int.from_bytes(b"\xfe" * kind.values)
+                self.bool_mask |= mask << 8 * offset
         self.unpack = struct.Struct(code).unpack_from
 
     def decode(self, payload: bytes) -> dict[str, Any]:
@@ -90,18 +85,23 @@ class PayloadLayout:
     def count_unset_bools(self, payload: bytes) -> int:
         """Return the number of bools whose byte is neither 0 nor 1, because PX4 did not initialize it."""
         wrong = int.from_bytes(payload, "little") & self.bool_mask
-        return len(payload) - wrong.to_bytes(len(payload), "little").count(0) if wrong else 0
+        if not wrong:
+            return 0
+        correct_bytes = wrong.to_bytes(len(payload), "little").count(0)
+        return len(payload) - correct_bytes
 
     @property
     def dtype(self) -> Any:
         """Argument for `numpy.dtype` that describes a payload; a bool is a uint8."""
-        types = [
-            f"S{kind.size}"
-            if kind.is_text
-            else (f"<{kind.form.replace('?', 'B')}"[-1], kind.length or ())
-            for _, kind, _ in self.fields
-        ]
-        names, _, offsets = zip(*self.fields, strict=True)
+        types: list[Any] = []
+        for _, kind, _ in self.fields:
+            if kind.is_text:
+                types.append(f"S{kind.size}")
+            else:
+                code = BASES[kind.base].code.replace("?", "B")
+                types.append((f"<{code}", kind.length or ()))
+        names = [field.name for field in self.fields]
+        offsets = [field.offset for field in self.fields]
         return {"names": names, "formats": types, "offsets": offsets, "itemsize": self.size}
 
 
@@ -111,71 +111,111 @@ class Formats:
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}
         self._layouts: dict[str, PayloadLayout] = {}
-        self._free_characters = _MAX_FORMATS
-        self._free_fields = _MAX_ALL_FIELDS
+        self._characters = 0
+        self._fields = 0  # of all messages, even rejected ones
 
     def add(self, name: str, text: str) -> None:
         """Store a format definition; raise ValueError if it contradicts an earlier one, or there are too many."""
-        if self._texts.get(name, text) != text:
-            raise ValueError(f"{name} is defined twice, with different fields")
-        if name not in self._texts:
-            self._free_characters -= len(name) + len(text)
-            if self._free_characters < 0:
-                raise ValueError(f"the format definitions have more than {_MAX_FORMATS} characters")
-            self._texts[name] = text
+        if name in self._texts:
+            if self._texts[name] != text:
+                raise ValueError(f"{name} is defined twice, with different fields")
+            return
+        self._characters += len(name) + len(text)
+        if self._characters > limits.ULOG_FORMATS:
+            raise ValueError(
+                f"the format definitions have more than {limits.ULOG_FORMATS} characters"
+            )
+        self._texts[name] = text
 
     def layout(self, name: str) -> PayloadLayout:
         """Return the layout of a message; raise ValueError if its format is unknown, invalid or too large."""
         if name not in self._layouts:
-            if len(self._layouts) == _MAX_LAYOUTS:
-                raise ValueError(f"the log has more than {_MAX_LAYOUTS} messages")
+            if len(self._layouts) == limits.ULOG_LAYOUTS:
+                raise ValueError(f"the log has more than {limits.ULOG_LAYOUTS} messages")
             self._layouts[name] = self._resolve(name)
         return self._layouts[name]
 
     def _resolve(self, name: str) -> PayloadLayout:
         fields: dict[str, PayloadField] = {}
-        offset = size = 0
-        for number, (field, c_type, length) in enumerate(self._expand(name), 1):
-            base = BASIC_TYPES[c_type]
-            start, offset = offset, offset + base.size * (length or 1)
-            self._free_fields -= 1
-            if self._free_fields < 0:
-                raise ValueError(f"the messages of the log have more than {_MAX_ALL_FIELDS} fields")
-            if number > _MAX_FIELDS or offset > _MAX_SIZE:
-                raise ValueError(f"it has more than {_MAX_FIELDS} fields or {_MAX_SIZE} bytes")
-            if not field.rpartition(".")[2].startswith("_padding"):
-                flat = (
-                    re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_") if "." in field else field
+        end = 0  # of the last field
+        size = 0  # without trailing padding
+        for number, logged in enumerate(self._expand(name), 1):
+            self._fields += 1
+            if self._fields > limits.ULOG_FIELDS:
+                raise ValueError(
+                    f"the messages of the log have more than {limits.ULOG_FIELDS} fields"
                 )
-                if flat in fields:
-                    raise ValueError(
-                        f"two fields are called {flat} after flattening nested messages"
-                    )
-                array = "char" if c_type == "char" else base.base
-                fields[flat] = PayloadField(
-                    flat, field_type(f"{array}[{length}]") if length else base, start
+            offset = end
+            end += logged.size
+            if number > limits.ULOG_MESSAGE_FIELDS or end > _MESSAGE_BYTES:
+                raise ValueError(
+                    f"it has more than {limits.ULOG_MESSAGE_FIELDS} fields or {_MESSAGE_BYTES} bytes"
                 )
-            size = size if field.startswith("_padding") else offset
-        return PayloadLayout(tuple(fields.values()), size, offset - size)
+            if not logged.is_trailing_padding:
+                size = end
+            if logged.is_padding:
+                continue
+            flat = logged.flat_name
+            if flat in fields:
+                raise ValueError(f"two fields are called {flat} after flattening nested messages")
+            fields[flat] = PayloadField(flat, logged.kind, offset)
+        return PayloadLayout(tuple(fields.values()), size, end - size)
 
-    def _expand(
-        self, name: str, prefix: str = "", level: int = 0
-    ) -> Iterator[tuple[str, str, int | None]]:
-        """Yield name, basic type and length of each field one by one, which lets the caller stop at its limits."""
-        if level > _MAX_NESTING:
-            raise ValueError(f"it nests messages more than {_MAX_NESTING} levels deep")
+    def _expand(self, name: str, prefix: str = "", level: int = 0) -> Iterator[_LoggedField]:
+        """Yield the fields of a message one by one, which lets the caller stop at its limits."""
+        if level > limits.ULOG_NESTING:
+            raise ValueError(f"it nests messages more than {limits.ULOG_NESTING} levels deep")
         if not self._texts.get(name):
             raise ValueError(f"the format of {name} is missing, or has no fields")
-        for found in FIELD.finditer(self._texts[name]):
-            kind = found[1]
-            field = prefix + found[3]
-            length = int(found[2]) if found[2] else None
+        for declaration in FIELD.finditer(self._texts[name]):
+            c_type, digits, field_name = declaration.groups()
+            path = prefix + field_name
+            length = int(digits) if digits else None
             if length == 0:
-                raise ValueError(f"the array {field} has length 0")
-            if kind in BASIC_TYPES:
-                yield field, kind, length
-                continue
-            for index in range(length or 1):
-                yield from self._expand(
-                    kind, f"{field}." if length is None else f"{field}[{index}].", level + 1
-                )
+                raise ValueError(f"the array {path} has length 0")
+            if c_type in BASIC_TYPES:
+                yield _LoggedField(path, c_type, length)
+            elif length is None:
+                yield from self._expand(c_type, f"{path}.", level + 1)
+            else:
+                for index in range(length):
+                    yield from self._expand(c_type, f"{path}[{index}].", level + 1)
+
+
+class _LoggedField(NamedTuple):
+    """A field of a basic type; `path`: its name in the log, such as `esc[0].esc_rpm`; `length`: of an array."""
+
+    path: str
+    c_type: str
+    length: int | None
+
+    @property
+    def size(self) -> int:
+        """Its size [bytes]."""
+        return BASIC_TYPES[self.c_type].size * (self.length or 1)
+
+    @property
+    def kind(self) -> FieldType:
+        """PX4's type; ValueError for an array with too many elements."""
+        base = BASIC_TYPES[self.c_type]
+        if not self.length:
+            return base
+        name = "char" if self.c_type == "char" else base.base
+        return field_type(f"{name}[{self.length}]")
+
+    @property
+    def flat_name(self) -> str:
+        """The name after flattening, such as `esc_0_esc_rpm`."""
+        if "." not in self.path:
+            return self.path
+        return re.sub(r"\[(\d+)\]", r"_\1", self.path).replace(".", "_")
+
+    @property
+    def is_padding(self) -> bool:
+        """Whether it only fills up a message, or one that is nested in it."""
+        return self.path.rpartition(".")[2].startswith("_padding")
+
+    @property
+    def is_trailing_padding(self) -> bool:
+        """Whether PX4 does not log it if it is the last field."""
+        return self.path.startswith("_padding")

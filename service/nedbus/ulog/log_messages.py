@@ -11,18 +11,24 @@ import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import islice
 from typing import Any, Final, NamedTuple
 
+from nedbus import limits
 from nedbus_msgs import field_type
 
 from .layout import BASIC_TYPES, PayloadField, PayloadLayout
 from .records import Data, Information, LoggedText, Record, Subscription
 
 _STRUCT: Final = struct.Struct("<QB127s")
-_FIELDS: Final = (("timestamp", "uint64", 0), ("severity", "uint8", 8), ("text", "char[127]", 9))
+_TEXT_BYTES: Final = 127  # of the field `text`
 _LAYOUT: Final = PayloadLayout(
-    tuple(PayloadField(a, field_type(b), c) for a, b, c in _FIELDS), _STRUCT.size, 0
+    (
+        PayloadField("timestamp", field_type("uint64"), 0),
+        PayloadField("severity", field_type("uint8"), 8),
+        PayloadField("text", field_type("char[127]"), 9),
+    ),
+    _STRUCT.size,
+    0,
 )
 LOG_MESSAGE: Final = Subscription(-1, 0, "log_message", _LAYOUT)
 """Subscription of the messages that `LogMessageBuilder` generates."""
@@ -31,24 +37,12 @@ _INFO: Final = 6
 _PROTOCOL: Final = 8  # lowest log level of events meant for ground stations, not for display
 _ALL_MODES: Final = 2**32 - 1
 _WINDOW: Final = 50_000  # us between an event and its logged string; up to 4 ms were observed
-_MAX_PER_SECOND: Final = 100  # messages; PX4 logs 20 at boot
+_REMEMBERED: Final = 100  # events and texts that may still repeat each other
 _SECOND: Final = 1_000_000  # us
-_MAX_RETURNS: Final = 10  # to an earlier time, in one log or stream
-_MAX_BYTES: Final = 127
-_MAX_CHARACTERS: Final = 1000  # characters read, including colour codes
+_BELIEVED_RETURNS: Final = 10  # to an earlier time, in one log or stream
+_CHECKS: Final = ("arming_check", "health")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
-_MAX_PACKED: Final = 2**18  # bytes; PX4's take 17,000
-_MAX_UNPACKED: Final = 2**21  # bytes; PX4's take 170,000
-_MAX_MEMORY: Final = 2**27  # bytes for the xz dictionary
-# components, event groups, enums, mode groups, and modes per group; PX4 has 30
-_MAX_PARTS: Final = 64
-_MAX_EVENTS: Final = 5000  # of all components; PX4 has 400
-_TOO_MANY_ARGUMENTS: Final = 26  # of an event, which has 25 bytes for them; PX4's have up to 6
-_MAX_SEPARATOR: Final = 10  # characters between the names of a bit field
-# characters of a template, or of an argument; PX4's longest template has 120
-_MAX_TEXT: Final = 200
-_CHECKS: Final = ("arming_check", "health")
 _MARKUP = re.compile(
     r"\\(?P<escaped>.)"
     r'|<(?P<tag>[a-z]+)(?: [a-z]+="(?P<value>[^"]*)")?>(?P<content>.*?)</(?P=tag)>'
@@ -68,12 +62,17 @@ _DAMAGED: Final = (
 
 def to_log_text(text: str) -> str:
     """Return a string as one printable line of at most 127 bytes in UTF-8."""
-    short = _COLOUR.sub("", text[:_MAX_CHARACTERS])
-    plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
+    characters: list[str] = []
+    for character in _COLOUR.sub("", text):
+        if character.isprintable():
+            characters.append(character)
+        elif character.isspace():
+            characters.append(" ")
+    plain = "".join(characters).strip()
     data = plain.encode()
-    return (
-        plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
-    )
+    if len(data) <= _TEXT_BYTES:
+        return plain
+    return data[: _TEXT_BYTES - 3].decode(errors="ignore") + "..."
 
 
 class _Event(NamedTuple):
@@ -88,6 +87,11 @@ class _Event(NamedTuple):
     modes: int | None
     lists_checks_of: int
 
+    @property
+    def is_check(self) -> bool:
+        """Whether it reports a failed check."""
+        return self.group in _CHECKS
+
 
 class _ArgumentType(NamedTuple):
     """Type of an argument; `code`: struct format; `names`: of an enum; `separator`: of the names of a bit field."""
@@ -100,13 +104,16 @@ class _ArgumentType(NamedTuple):
         """Return a number as it is, and the name of an enum's value, or of each bit set."""
         if self.names is None:
             return value
-        bits = (
-            [value]
-            if self.separator is None
-            else [1 << bit for bit in range(64) if value >> bit & 1]
-        )
-        names = (self.names.get(str(each), f"(unknown: {value})") for each in bits)
-        return (self.separator or "").join(names)[:_MAX_TEXT]
+        unknown = f"(unknown: {value})"
+        if self.separator is None:
+            return self.names.get(str(value), unknown)
+        bits = [1 << bit for bit in range(64) if value >> bit & 1]
+        names = [self.names.get(str(bit), unknown) for bit in bits]
+        return _cut(self.separator.join(names))
+
+
+def _cut(text: str) -> str:
+    return text[: limits.PEER_TEXT]
 
 
 class _EventMetadata:
@@ -116,113 +123,124 @@ class _EventMetadata:
         self._types = {name: _ArgumentType(kind.form) for name, kind in BASIC_TYPES.items()}
         self._decoders: dict[tuple[str, str], Callable[[bytes], _Event]] = {}  # by component and id
         try:
-            xz = lzma.LZMADecompressor(memlimit=_MAX_MEMORY)
-            unpacked = xz.decompress(packed, _MAX_UNPACKED)
-            if not xz.eof:
-                raise ValueError(f"incomplete, or more than {_MAX_UNPACKED} bytes")
-            components: Mapping[str, Any] = json.loads(unpacked)["components"]
-            groups = [each["event_groups"] for each in components.values()]
-            enums = [each.get("enums", {}) for each in components.values()]
-            if max(map(len, [components, *groups, *enums])) > _MAX_PARTS:
-                raise ValueError(f"more than {_MAX_PARTS} components, event groups or enums")
-            if (
-                sum(len(part["events"]) for group in groups for part in group.values())
-                > _MAX_EVENTS
-            ):
-                raise ValueError(f"more than {_MAX_EVENTS} events")
-            for component, content in zip(components.values(), enums, strict=True):
-                for name, enum in content.items():
+            components = _unpack(packed)
+            for component in components.values():
+                for name, enum in component.get("enums", {}).items():
                     self._add_enum(f"{component['namespace']}::{name}", enum)
             for number, component in components.items():
-                states = _states(component)
-                for group, part in component["event_groups"].items():
-                    for key, event in part["events"].items():
-                        with suppress(*_DAMAGED):
-                            decoder = self._decoder(event, group, component["namespace"], states)
-                            self._decoders.setdefault((number, key), decoder)
+                self._add_events(number, component)
+        except (ValueError, lzma.LZMAError) as exc:
+            raise ValueError(f"the event metadata cannot be read ({exc})") from exc
         except _DAMAGED as exc:
-            reason = (
-                str(exc) if isinstance(exc, ValueError | lzma.LZMAError) else "unexpected structure"
-            )
+            reason = "unexpected structure"
             raise ValueError(f"the event metadata cannot be read ({reason})") from exc
 
     def decode(self, number: int, arguments: bytes) -> _Event | None:
         """Return the event with this id; None if the id is unknown, or the arguments do not match."""
+        component = str(number >> 24)
+        event = str(number & 0xFFFFFF)
         with suppress(*_DAMAGED):
-            return self._decoders[str(number >> 24), str(number & 0xFFFFFF)](arguments)
+            return self._decoders[component, event](arguments)
         return None
 
     def _add_enum(self, name: str, enum: Mapping[str, Any]) -> None:
         with suppress(*_DAMAGED):
-            names = {
-                key: entry["description"][:_MAX_TEXT] for key, entry in enum["entries"].items()
-            }
-            separator = (
-                enum.get("separator", "|")[:_MAX_SEPARATOR] if enum.get("is_bitfield") else None
-            )
-            self._types.setdefault(
-                name, _ArgumentType(BASIC_TYPES[enum["type"]].form, names, separator)
-            )
+            code = BASIC_TYPES[enum["type"]].form
+            names = {key: _cut(entry["description"]) for key, entry in enum["entries"].items()}
+            separator = None
+            if enum.get("is_bitfield"):
+                separator = _cut(enum.get("separator", "|"))
+            self._types.setdefault(name, _ArgumentType(code, names, separator))
+
+    def _add_events(self, number: str, component: Mapping[str, Any]) -> None:
+        states = _states(component)
+        for group, part in component["event_groups"].items():
+            for key, event in part["events"].items():
+                with suppress(*_DAMAGED):
+                    decoder = self._decoder(event, group, component["namespace"], states)
+                    self._decoders.setdefault((number, key), decoder)
 
     def _decoder(
         self, event: Mapping[str, Any], group: str, namespace: str, states: Mapping[Any, int]
     ) -> Callable[[bytes], _Event]:
         """Return the function that decodes the arguments of an event."""
-        names = [each["type"] for each in event.get("arguments", [])[:_TOO_MANY_ARGUMENTS]]
-        types = [self._types.get(name) or self._types[f"{namespace}::{name}"] for name in names]
-        unpack = struct.Struct("<" + "".join(each.code for each in types)).unpack_from
-        masks = [
-            index
-            for index, name in enumerate(names)
-            if "navigation_mode_group_t" in name and group in _CHECKS
-        ]
+        types: list[_ArgumentType] = []
+        code = "<"
+        modes_argument: int | None = None
+        for index, argument in enumerate(event.get("arguments", [])):
+            name = argument["type"]
+            kind = self._types.get(name) or self._types[f"{namespace}::{name}"]
+            types.append(kind)
+            code += kind.code
+            is_modes = "navigation_mode_group_t" in name and group in _CHECKS
+            if is_modes and modes_argument is None:
+                modes_argument = index
+        unpack = struct.Struct(code).unpack_from
         lists_checks = event.get("type") == "append_health_and_arming_messages"
-        template = event["message"][:_MAX_TEXT]
+        template = _cut(event["message"])
 
         def decode(data: bytes) -> _Event:
             values = unpack(data)
-            text = _fill(
-                template, [each.show(value) for each, value in zip(types, values, strict=True)]
-            )
+            shown = [kind.show(value) for kind, value in zip(types, values, strict=True)]
+            text = _fill(template, shown)
+            modes = None if modes_argument is None else values[modes_argument]
             listed = states.get(values[0], 0) if lists_checks else 0
-            return _Event(group, text, values[masks[0]] if masks else None, listed)
+            return _Event(group, text, modes, listed)
 
         return decode
 
 
+def _unpack(packed: bytes) -> Mapping[str, Any]:
+    """Return the components in the metadata; raise ValueError if it is too large."""
+    xz = lzma.LZMADecompressor(memlimit=limits.EVENT_METADATA_DICTIONARY)
+    unpacked = xz.decompress(packed, limits.EVENT_METADATA)
+    if not xz.eof:
+        raise ValueError(f"incomplete, or more than {limits.EVENT_METADATA} bytes")
+    components: Mapping[str, Any] = json.loads(unpacked)["components"]
+    count = 0
+    for component in components.values():
+        for group in component["event_groups"].values():
+            count += len(group["events"])
+    if count > limits.EVENT_DEFINITIONS:
+        raise ValueError(f"more than {limits.EVENT_DEFINITIONS} events")
+    return components
+
+
 def _states(component: Mapping[str, Any]) -> Mapping[int, int]:
     """Return the bit mask of the navigation state of each custom mode."""
-    with suppress(*_DAMAGED):
-        groups = component["navigation_mode_groups"]["groups"].items()
-        return {
-            mode: 1 << int(bit) % 32
-            for bit, modes in islice(groups, _MAX_PARTS)
-            for mode in modes[:_MAX_PARTS]
-        }
-    return {}
+    states: dict[int, int] = {}
+    try:
+        for bit, modes in component["navigation_mode_groups"]["groups"].items():
+            for mode in modes:
+                states[mode] = 1 << int(bit) % 32
+    except _DAMAGED:
+        return {}
+    return states
 
 
 def _fill(template: str, values: Sequence[Any]) -> str:
     """Insert the arguments into a template, and remove its markup."""
 
-    def replaced(found: re.Match[str]) -> str:
-        if found["escaped"] or found["tag"]:
-            # other profiles are for end users
-            shows = {"profile": found["value"] == "dev", "a": True, "param": True}
-            return found["escaped"] or (
-                _fill(found["content"], values) if shows.get(found["tag"]) else ""
-            )
-        if not 0 < int(found["number"]) <= len(values):
-            return found[0]
-        value = values[int(found["number"]) - 1]
-        text = (
-            f"{value:.{found['digits']}f}"
-            if found["digits"] and not isinstance(value, str)
-            else str(value)
-        )
-        return f"{text} {found['unit'].removesuffix('_v')}" if found["unit"] else text
+    def replacement(markup: re.Match[str]) -> str:
+        if markup["escaped"]:
+            return markup["escaped"]
+        if markup["tag"]:
+            is_shown = markup["tag"] in ("a", "param")
+            if markup["tag"] == "profile":  # other profiles are for end users
+                is_shown = markup["value"] == "dev"
+            return _fill(markup["content"], values) if is_shown else ""
+        number = int(markup["number"])
+        if not 0 < number <= len(values):
+            return markup[0]
+        value = values[number - 1]
+        text = str(value)
+        if markup["digits"] and not isinstance(value, str):
+            text = f"{value:.{markup['digits']}f}"
+        if markup["unit"]:
+            text += f" {markup['unit'].removesuffix('_v')}"
+        return text
 
-    return _MARKUP.sub(replaced, template).strip()
+    return _MARKUP.sub(replacement, template).strip()
 
 
 class RateLimit:
@@ -233,19 +251,24 @@ class RateLimit:
     """
 
     def __init__(self) -> None:
-        self.omitted = self._begin = self._count = self._returns = 0
+        self.omitted = 0
+        self._begin = 0  # us, of the newest second
+        self._count = 0  # messages in the newest second
+        self._returns = 0
         self._before: tuple[int, int] | None = None  # begin and count of the second before
 
     def admits(self, time: int) -> bool:
         """Return whether a message at this time [us] is below the limit."""
         if time - self._begin >= _SECOND:
             self._before = self._begin, self._count
-            self._begin, self._count = time, 0
-        elif self._begin - time >= _SECOND and self._returns < _MAX_RETURNS:
+            self._start_at(time)
+        elif self._begin - time >= _SECOND and self._returns < _BELIEVED_RETURNS:
             self._return_to(time)
         self._count += 1
-        self.omitted += self._count > _MAX_PER_SECOND
-        return self._count <= _MAX_PER_SECOND
+        if self._count > limits.LOG_MESSAGES:
+            self.omitted += 1
+            return False
+        return True
 
     def _return_to(self, time: int) -> None:
         """Continue the second before the newest one; after a reboot, continue the count at an earlier time."""
@@ -256,7 +279,32 @@ class RateLimit:
             self._begin, self._count = self._before
             self._before = None
         if time - self._begin >= _SECOND:
-            self._begin, self._count = time, 0
+            self._start_at(time)
+
+    def _start_at(self, time: int) -> None:
+        self._begin = time
+        self._count = 0
+
+
+class _ReportedEvent(NamedTuple):
+    """An event that became a message; `check`: the first words of a failed check, "" for another event."""
+
+    timestamp: int
+    check: str
+
+
+class _ReportedText(NamedTuple):
+    """A logged string that became a message; `checks`: what an event that repeats it may have as `check`."""
+
+    timestamp: int
+    checks: tuple[str, str]
+
+
+class _FailedCheck(NamedTuple):
+    """A failed check in a report; `modes`: bit mask of the navigation states that it blocks."""
+
+    level: int
+    modes: int
 
 
 class LogMessageBuilder:
@@ -277,14 +325,14 @@ class LogMessageBuilder:
         self.problem = ""
         self._packed = b""
         self._metadata: _EventMetadata | None = None
-        # unmatched events: time, first words of a check
-        self._events: deque[tuple[int, str]] = deque(maxlen=100)
-        # unmatched texts: time, and what may match them
-        self._texts: deque[tuple[Any, ...]] = deque(maxlen=100)
-        self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log an event twice
-        # checks in the current report: level, blocked modes
-        self._failed: dict[str, tuple[int, int]] = {}
-        self._earlier: dict[str, tuple[int, int]] = {}
+        # those that no text or event has repeated yet
+        self._events: deque[_ReportedEvent] = deque(maxlen=_REMEMBERED)
+        self._texts: deque[_ReportedText] = deque(maxlen=_REMEMBERED)
+        # PX4 may log an event twice: its time, id and sequence
+        self._seen: deque[tuple[int, int, int]] = deque(maxlen=_REMEMBERED)
+        # checks by text, in the current report and in the one before
+        self._failed: dict[str, _FailedCheck] = {}
+        self._failed_before: dict[str, _FailedCheck] = {}
         self._nav_state = -1
 
     def merge(self, records: Iterable[Record]) -> Iterator[Record]:
@@ -297,69 +345,106 @@ class LogMessageBuilder:
                 continue
             # the topic may have other fields
             with suppress(LookupError, TypeError, ValueError, struct.error):
-                if (text := self._read(record)) and self.limit.admits(text.timestamp):
-                    yield Data(
-                        LOG_MESSAGE,
-                        _STRUCT.pack(text.timestamp, text.level, to_log_text(text.text).encode()),
-                    )
+                text = self._read(record)
+                if text is not None and self.limit.admits(text.timestamp):
+                    data = to_log_text(text.text).encode()
+                    yield Data(LOG_MESSAGE, _STRUCT.pack(text.timestamp, text.level, data))
 
     def _read(self, record: Record) -> LoggedText | None:
         """Return the text that a record completes; None if it completes none, or repeats an event."""
         if isinstance(record, LoggedText):
-            return None if self._is_duplicate(record) else record
-        if (
-            isinstance(record, Information)
-            and record.key == "metadata_events"
-            and isinstance(record.value, bytes)
-        ):
-            if self._metadata is None and not self.problem:  # the first metadata is used
-                self._packed = ((self._packed if record.continued else b"") + record.value)[
-                    :_MAX_PACKED
-                ]
-        elif isinstance(record, Data) and record.subscription.name == "event":
-            return self._read_event(record.subscription.layout.decode(record.payload))
-        elif isinstance(record, Data) and record.subscription.name == "vehicle_status":
-            self._nav_state = int(record.subscription.layout.decode(record.payload)["nav_state"])
+            return None if self._repeats_event(record) else record
+        if isinstance(record, Information) and record.key == "metadata_events":
+            self._add_metadata(record)
+        elif isinstance(record, Data):
+            fields = record.subscription.layout.decode(record.payload)
+            if record.subscription.name == "event":
+                return self._read_event(fields)
+            self._nav_state = int(fields["nav_state"])
         return None
 
+    def _add_metadata(self, record: Information) -> None:
+        """Add a part of the metadata; only the first metadata is used."""
+        is_decided = self._metadata is not None or self.problem
+        if is_decided or not isinstance(record.value, bytes):
+            return
+        if not record.continued:
+            self._packed = b""
+        packed = self._packed + record.value
+        self._packed = packed[: limits.EVENT_METADATA_PACKED]
+
     def _read_event(self, fields: dict[str, Any]) -> LoggedText | None:
-        timestamp = fields["timestamp"]
+        event = self._new_event(fields)
+        if event is None:
+            return None
         level = fields["log_levels"] >> 4
-        key = (fields["id"], fields["event_sequence"])
-        if (timestamp, *key) in self._seen or (
-            event := self._decode(fields["id"], bytes(fields["arguments"]))
-        ) is None:
+        if level >= _PROTOCOL:
+            if event.group == "arming_check":  # starts a new report
+                self._failed_before = self._failed
+                self._failed = {}
             return None
-        self._seen.append((timestamp, *key))
-        is_check = event.group in _CHECKS
-        if level >= _PROTOCOL and event.group == "arming_check":  # starts a new report
-            self._failed, self._earlier = {}, self._failed
-        if level >= _PROTOCOL or not (is_check or event.group == "default"):
-            return None
+        shown_level: int | None = None
         text = event.text
-        if is_check:
-            modes = _ALL_MODES if event.modes is None else event.modes
-            affects_mode = modes == _ALL_MODES or (
-                self._nav_state >= 0 and modes >> self._nav_state & 1
-            )
-            shown = level if affects_mode else max(level, _INFO)
-            known = self._failed.get(text, self._earlier.get(text))
-            if len(self._failed) < _MAX_PER_SECOND:
-                self._failed[text] = shown, modes if level < _INFO else 0
-            if known and known[0] <= shown:
-                return None
-            level = shown
-        elif event.lists_checks_of and text.endswith(":"):
-            text += " " + ", ".join(
-                name for name, (_, modes) in self._failed.items() if modes & event.lists_checks_of
-            )
-        check = _first_words(text) if is_check else ""
-        for time, *words in self._texts:
-            if abs(timestamp - time) <= _WINDOW and check in words:
-                self._texts.remove((time, *words))
-                return None
-        self._events.append((timestamp, check))
-        return LoggedText(level, timestamp, text)
+        if event.is_check:
+            shown_level = self._add_check(event, level)
+        elif event.group == "default":
+            shown_level = level
+            if event.lists_checks_of and text.endswith(":"):
+                text += " " + ", ".join(self._checks_of(event.lists_checks_of))
+        if shown_level is None or self._repeats_text(fields["timestamp"], text, event):
+            return None
+        return LoggedText(shown_level, fields["timestamp"], text)
+
+    def _new_event(self, fields: dict[str, Any]) -> _Event | None:
+        """Decode an event; None if it is unknown, or was logged before."""
+        occurrence = (fields["timestamp"], fields["id"], fields["event_sequence"])
+        if occurrence in self._seen:
+            return None
+        event = self._decode(fields["id"], bytes(fields["arguments"]))
+        if event is not None:
+            self._seen.append(occurrence)
+        return event
+
+    def _add_check(self, event: _Event, level: int) -> int | None:
+        """Add a failed check to the report; return the level to show it with, None if it is not new."""
+        modes = _ALL_MODES if event.modes is None else event.modes
+        affects_mode = modes == _ALL_MODES
+        if self._nav_state >= 0 and modes >> self._nav_state & 1:
+            affects_mode = True
+        shown = level if affects_mode else max(level, _INFO)
+        known = self._failed.get(event.text, self._failed_before.get(event.text))
+        if len(self._failed) < limits.LOG_MESSAGES:
+            blocked = modes if level < _INFO else 0
+            self._failed[event.text] = _FailedCheck(shown, blocked)
+        if known and known.level <= shown:
+            return None
+        return shown
+
+    def _checks_of(self, modes: int) -> list[str]:
+        """Return the failed checks that block one of these navigation states."""
+        return [text for text, check in self._failed.items() if check.modes & modes]
+
+    def _repeats_text(self, timestamp: int, text: str, event: _Event) -> bool:
+        """Return whether a logged string has already reported this event; each string matches one event."""
+        check = _first_words(text) if event.is_check else ""
+        for reported in self._texts:
+            if abs(timestamp - reported.timestamp) <= _WINDOW and check in reported.checks:
+                self._texts.remove(reported)
+                return True
+        self._events.append(_ReportedEvent(timestamp, check))
+        return False
+
+    def _repeats_event(self, record: LoggedText) -> bool:
+        """Return whether an event has already reported this text; each event matches one text."""
+        # Only a text with a trailing tab repeats an event that is no check.
+        other_event = "" if record.text.endswith("\t") else "-"
+        checks = (_first_words(record.text), other_event)
+        for reported in self._events:
+            if abs(reported.timestamp - record.timestamp) <= _WINDOW and reported.check in checks:
+                self._events.remove(reported)
+                return True
+        self._texts.append(_ReportedText(record.timestamp, checks))
+        return False
 
     def _decode(self, number: int, arguments: bytes) -> _Event | None:
         if self._metadata is None and self._packed and not self.problem:
@@ -367,19 +452,12 @@ class LogMessageBuilder:
                 self._metadata = _EventMetadata(self._packed)
             except ValueError as exc:
                 self.problem = str(exc)
-        return self._metadata.decode(number, arguments) if self._metadata else None
-
-    def _is_duplicate(self, record: LoggedText) -> bool:
-        """Return whether an event has already reported this text; each event matches one text."""
-        words = _first_words(record.text), "" if record.text.endswith("\t") else "-"
-        for timestamp, check in self._events:
-            if abs(timestamp - record.timestamp) <= _WINDOW and check in words:
-                self._events.remove((timestamp, check))
-                return True
-        self._texts.append((record.timestamp, *words))
-        return False
+        if self._metadata is None:
+            return None
+        return self._metadata.decode(number, arguments)
 
 
 def _first_words(text: str) -> str:
     """Return the first two words, without the module name and PX4's prefix of failed checks."""
-    return " ".join(_PREFIX.sub("", text).casefold().split()[:2])
+    words = _PREFIX.sub("", text).casefold().split()
+    return " ".join(words[:2])

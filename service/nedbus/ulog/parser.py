@@ -7,6 +7,8 @@ from dataclasses import replace
 from itertools import islice
 from typing import Final, Literal, NamedTuple
 
+from nedbus import limits
+
 from .layout import Formats, PayloadLayout
 from .records import (
     EXACT_SIZES,
@@ -27,15 +29,13 @@ from .records import (
 _START: Final = 16  # bytes before the first record
 _HEADER: Final = 3  # bytes of a record: size and type
 _DATA_HEADER: Final = 5  # bytes: size, type and message id
-_MAX_PADDING: Final = 8  # bytes of trailing padding in a message; PX4 aligns to 8
-# not counting those that continue an earlier one; a real log has 170
-_MAX_SUBSCRIPTIONS: Final = 1000
-_MAX_SKIPPED: Final = 16  # consecutive records of unknown content
+_PADDING: Final = 8  # bytes of trailing padding in a message at most; PX4 aligns to 8
+_SKIPPED: Final = 16  # consecutive records of unknown content that a chain may have
 # bytes of a chain of records before its last one; a record has up to 65,538
-_MAX_CHAIN: Final = 2**16
+_CHAIN: Final = 2**16
 _WINDOW: Final = 2**16  # bytes; damage of up to twice this length is searched completely
 _SAMPLE: Final = 2**12  # bytes searched of each further window
-_MIN_DISTANCE: Final = 64  # bytes per candidate, on average; denser data is searched only in part
+_DISTANCE: Final = 64  # bytes per candidate, on average; denser data is searched only in part
 _VALUE: Final = rb"[\x05-\xff](?:u?int|float|double|bool|char)"
 _CANDIDATE = re.compile(
     rb"(?s)D|S/s\x13 |A...[A-Za-z]|F[A-Za-z]\w|[IP]%b|[MQ].%b|[CL][0-7]" % (_VALUE, _VALUE)
@@ -55,6 +55,12 @@ class _Inspection(NamedTuple):
     record: Record | None = None
 
 
+# What to do with the data messages that begin with some five bytes: their subscription (None: not returned), their
+# length, the length without padding, and the list to which payloads are added instead.
+# A plain tuple, because each message unpacks one, and a NamedTuple is unpacked through an iterator.
+_Route = tuple[Subscription | None, int, int, list[bytes] | None]
+
+
 class UlogParser:
     """Parse a ULog in chunks of any size; between chunks, hold the definitions and less than 257 KiB of data.
 
@@ -66,17 +72,17 @@ class UlogParser:
     """
 
     def __init__(self, *, verify: bool, topics: Collection[str] | None = None) -> None:
-        self.undecodable = self.mismatched = 0
-        self._verify, self._topics = verify, topics
+        self.undecodable = 0
+        self.mismatched = 0
+        self._verify = verify
+        self._topics = topics
         self._is_readable = True
         self._formats = Formats()
         self.subscriptions: dict[int, Subscription] = {}
         self._ended: dict[tuple[str, int], list[Subscription]] = {}  # by topic and instance
         self._collected: dict[str, list[int]] = {}  # message ids with a list of payloads, by topic
         self._count = 0  # of subscriptions that do not continue an ended one
-        self._known: dict[bytes, tuple[Subscription | None, int, int, list[bytes] | None]] = {}
-        """By the first five bytes of a data message: its subscription (None: not returned), its length, the length
-        without padding, and the list to which payloads are added instead."""
+        self._known: dict[bytes, _Route] = {}  # by the first five bytes of a data message
         self._buffer = b""
         # position in the buffer of the next sync, or the end; before the current record if unknown
         self._sync = -1
@@ -101,11 +107,10 @@ class UlogParser:
         This ends with the next subscription to its topic; the messages after that are returned again.
         """
         payloads: list[bytes] = []
-        for message_id in [
-            number for number, each in self.subscriptions.items() if each is subscription
-        ]:
-            self._collected.setdefault(subscription.name, []).append(message_id)
-            self._route(message_id, payloads)
+        for message_id, current in self.subscriptions.items():
+            if current is subscription:
+                self._collected.setdefault(subscription.name, []).append(message_id)
+                self._route(message_id, payloads)
         return payloads
 
     def gap(self) -> None:
@@ -128,38 +133,46 @@ class UlogParser:
                 raise
         while self._boundaries and self._boundaries[0] <= self._offset + len(self._buffer):
             boundary = self._boundaries.pop(0) - self._offset
-            rest, self._buffer = self._buffer[boundary:], self._buffer[:boundary]
+            rest = self._buffer[boundary:]
+            self._buffer = self._buffer[:boundary]
             self._parse_buffer(is_end=True)
-            if self._records and isinstance(last := self._records[-1], Damage) and last.is_end:
+            last = self._records[-1] if self._records else None
+            if isinstance(last, Damage) and last.is_end:
                 self._records.pop()  # the logger was interrupted here
             self._buffer = rest
         if self._boundaries is not None:
             self._parse_buffer(is_end=is_end)
-        records, self._records = self._records, []
+        records = self._records
+        self._records = []
         return records
 
     def _begin(self, *, is_end: bool) -> None:
-        kind, content = self._buffer[_START + 2 : _START + _HEADER], _START + _HEADER
-        stop = (
-            content + int.from_bytes(self._buffer[_START : _START + 2], "little")
-            if kind == b"B"
-            else _START
-        )
-        if is_end or (kind and stop <= len(self._buffer)):
-            header = read_header(self._buffer[:_START])
-            self._records.append(header)
-            if header.version > 1:
-                self._records.append(Damage(f"unknown version {header.version} of the ULog format"))
-            offsets = read_flags(self._buffer[content:stop]) if kind == b"B" else ()
-            self._boundaries = sorted(offset for offset in offsets if offset >= stop)
-            self._drop(min(stop, len(self._buffer)))
+        """Read the header, and the flags that may follow; do nothing if they are incomplete."""
+        kind = self._buffer[_START + 2 : _START + _HEADER]
+        content = _START + _HEADER
+        stop = _START
+        if kind == b"B":
+            stop = content + int.from_bytes(self._buffer[_START : _START + 2], "little")
+        is_complete = kind and stop <= len(self._buffer)
+        if not is_complete and not is_end:
+            return
+        header = read_header(self._buffer[:_START])
+        self._records.append(header)
+        if header.version > 1:
+            self._records.append(Damage(f"unknown version {header.version} of the ULog format"))
+        offsets: tuple[int, ...] = ()
+        if kind == b"B":
+            offsets = read_flags(self._buffer[content:stop])
+        self._boundaries = sorted(offset for offset in offsets if offset >= stop)
+        self._drop(min(stop, len(self._buffer)))
 
     def _drop(self, count: int) -> None:
         self._buffer = self._buffer[count:]
         self._offset += count
 
     def _parse_buffer(self, *, is_end: bool) -> None:
-        at, self._sync = 0, -1
+        self._sync = -1
+        at = 0
         after: int | None = 0
         while after is not None and after < len(self._buffer):
             at = after
@@ -178,23 +191,24 @@ class UlogParser:
         known = self._known
         records = self._records
         make = tuple.__new__  # needs half the time of a NamedTuple's constructor
-        found = known.get(buffer[at : at + _DATA_HEADER])
-        if found and self._sync < at:
+        route = known.get(buffer[at : at + _DATA_HEADER])
+        if route and self._sync < at:
             self._sync = buffer.find(SYNC, at)
             if self._sync < 0:
                 self._sync = len(buffer)
-        mark = self._sync
-        while found is not None:
-            subscription, length, used, payloads = found
+        sync = self._sync
+        while route is not None:
+            subscription, length, used, payloads = route
             stop = at + length
-            found = None if at < mark < stop else known.get(buffer[stop : stop + _DATA_HEADER])
-            if found is not None:
+            if at < sync < stop:  # bytes are missing
+                break
+            route = known.get(buffer[stop : stop + _DATA_HEADER])
+            if route is not None:
                 if payloads is not None:
                     payloads.append(buffer[at + _DATA_HEADER : at + used])
                 elif subscription is not None:
-                    records.append(
-                        make(Data, (subscription, buffer[at + _DATA_HEADER : at + used]))
-                    )
+                    payload = buffer[at + _DATA_HEADER : at + used]
+                    records.append(make(Data, (subscription, payload)))
                 at = stop
         return at
 
@@ -215,18 +229,22 @@ class UlogParser:
 
     def _accept_unknown(self, at: int, *, is_end: bool) -> int | None:
         """Accept records of unknown content if their lengths lead to the next valid chain; otherwise start a search."""
-        start, found = self._find(at + 1, at + 1 + 2 * _WINDOW, is_end=is_end)
-        if found == "incomplete":
+        start, validity = self._find(at + 1, at + 1 + 2 * _WINDOW, is_end=is_end)
+        if validity == "incomplete":
             return None
         passed: list[tuple[int, _Inspection]] = []
-        place, inspected = at, self._inspect(at)
+        place = at
+        inspected = self._inspect(place)
         while place < start and inspected.validity in ("valid", "unknown"):
             passed.append((place, inspected))
-            place, inspected = inspected.stop, self._inspect(inspected.stop)
-        if place == start if found == "valid" else is_end and self._is_tail(place):
-            for each in passed:
-                self._emit(*each)
-            return start if found == "valid" else self._truncate(place)
+            place = inspected.stop
+            inspected = self._inspect(place)
+        leads_to_chain = validity == "valid" and place == start
+        leads_to_end = validity != "valid" and is_end and self._is_tail(place)
+        if leads_to_chain or leads_to_end:
+            for position, passed_record in passed:
+                self._emit(position, passed_record)
+            return start if leads_to_chain else self._truncate(place)
         self._damage = self._offset + at
         return at + 1
 
@@ -235,11 +253,14 @@ class UlogParser:
         begun = (self._damage or 0) - self._offset  # negative if before the buffer
         number = (at - begun - 1) // _WINDOW
         window = begun + 1 + number * _WINDOW
-        start, found = self._find(at, window + (_WINDOW if number < 2 else _SAMPLE), is_end=is_end)
-        if found == "valid":
+        searched = _WINDOW if number < 2 else _SAMPLE
+        start, validity = self._find(at, window + searched, is_end=is_end)
+        if validity == "valid":
             self._end_damage()
             return start
-        return None if found == "incomplete" else min(window + _WINDOW, len(self._buffer))
+        if validity == "incomplete":
+            return None
+        return min(window + _WINDOW, len(self._buffer))
 
     def _end_damage(self) -> None:
         if self._damage is not None:
@@ -248,36 +269,45 @@ class UlogParser:
 
     def _find(self, start: int, stop: int, *, is_end: bool) -> tuple[int, _Validity]:
         """Return the first position in a range where a valid chain of records begins, or may begin (INCOMPLETE)."""
-        limit = 1 + max(0, stop - start) // _MIN_DISTANCE
-        for found in islice(_CANDIDATE.finditer(self._buffer, start + 2, stop + _CONTEXT), limit):
-            at = found.start() - 2
-            validity = self._validate_chain(at, is_end=is_end) if at < stop else "invalid"
+        limit = 1 + max(0, stop - start) // _DISTANCE
+        candidates = _CANDIDATE.finditer(self._buffer, start + 2, stop + _CONTEXT)
+        for candidate in islice(candidates, limit):
+            at = candidate.start() - 2
+            if at >= stop:
+                continue
+            validity = self._validate_chain(at, is_end=is_end)
             if validity != "invalid":
                 return at, validity
-        is_whole = is_end or len(self._buffer) >= stop + _CONTEXT
-        return min(stop, len(self._buffer)), "invalid" if is_whole else "incomplete"
+        end = min(stop, len(self._buffer))
+        if is_end or len(self._buffer) >= stop + _CONTEXT:
+            return end, "invalid"
+        return end, "incomplete"
 
     def _validate_chain(self, at: int, *, is_end: bool) -> _Validity:
         """Check that a valid record begins here and leads to another one; a sync message needs no other."""
         inspected = self._inspect(at)
         if inspected.validity == "incomplete" and not is_end:
             return "incomplete"
-        if inspected.validity != "valid" or isinstance(inspected.record, Sync):
-            return "valid" if isinstance(inspected.record, Sync) else "invalid"
-        for _ in range(_MAX_SKIPPED):
-            place, inspected = inspected.stop, self._inspect(inspected.stop)
+        if isinstance(inspected.record, Sync):
+            return "valid"
+        if inspected.validity != "valid":
+            return "invalid"
+        for _ in range(_SKIPPED):
+            place = inspected.stop
+            inspected = self._inspect(place)
             if inspected.validity == "incomplete" and is_end:
                 return "valid" if self._is_tail(place) else "invalid"
             if inspected.validity != "unknown":
                 return inspected.validity
-            if inspected.stop > at + _MAX_CHAIN:
+            if inspected.stop > at + _CHAIN:
                 break
         return "invalid"
 
     def _inspect(self, at: int) -> _Inspection:
         buffer = self._buffer
-        known = self._known.get(buffer[at : at + _DATA_HEADER])
-        kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
+        route = self._known.get(buffer[at : at + _DATA_HEADER])
+        kind = buffer[at + 2 : at + _HEADER]
+        content = at + _HEADER
         stop = content + int.from_bytes(buffer[at : at + 2], "little")
         is_partial = stop > len(buffer) or not kind
         # Record types are printable characters, also in later versions; without `verify` the length is trusted.
@@ -285,15 +315,16 @@ class UlogParser:
             return _Inspection("invalid", stop)
         if is_partial:
             return _Inspection("incomplete", stop)
-        if known is not None:  # a sync message inside the record means that bytes are missing
-            return _Inspection(
-                "unknown" if self._verify and SYNC in buffer[at:stop] else "valid", stop
-            )
+        if route is not None:
+            # a sync message inside the record means that bytes are missing
+            lacks_bytes = self._verify and SYNC in buffer[at:stop]
+            return _Inspection("unknown" if lacks_bytes else "valid", stop)
         try:
             record = READERS[kind[0]](buffer[content:stop])
         except (ValueError, LookupError, struct.error):
             return _Inspection("unknown", stop)
-        is_valid = EXACT_SIZES.get(kind[0], stop - content) == stop - content
+        size = stop - content
+        is_valid = EXACT_SIZES.get(kind[0], size) == size
         return _Inspection("valid" if is_valid else "unknown", stop, record)
 
     def _is_tail(self, at: int) -> bool:
@@ -311,12 +342,12 @@ class UlogParser:
 
     def _emit(self, at: int, inspected: _Inspection) -> int:
         """Add a record to the result; return the position after it."""
-        kind, reason = self._buffer[at + 2], ""
+        kind = self._buffer[at + 2]
         if inspected.record is not None:
             try:
                 self._apply(inspected.record)
             except ValueError as exc:
-                reason = str(exc)
+                self._records.append(Damage(str(exc)))
         elif inspected.validity == "valid":
             subscription, _, used, payloads = self._known[self._buffer[at : at + _DATA_HEADER]]
             payload = self._buffer[at + _DATA_HEADER : at + used]
@@ -327,10 +358,10 @@ class UlogParser:
         elif kind == ord("D"):
             self.undecodable += 1
             message_id = int.from_bytes(self._buffer[at + _HEADER : at + _DATA_HEADER], "little")
-            self.mismatched += message_id in self.subscriptions
+            if message_id in self.subscriptions:
+                self.mismatched += 1
         elif kind in READERS or inspected.validity == "invalid":
             reason = f"the record at byte {self._offset + at} is damaged"
-        if reason:
             self._records.append(Damage(reason))
         return inspected.stop
 
@@ -347,41 +378,43 @@ class UlogParser:
 
     def _subscribe(self, new: Subscription) -> None:
         """Decode the data messages of an id; add its subscription to the result unless it continues another."""
-        topic, old = (new.name, new.multi_id), self.subscriptions.get(new.message_id)
+        topic = (new.name, new.multi_id)
+        old = self.subscriptions.get(new.message_id)
         if old is not None:
             if (old.name, old.multi_id) != topic:
                 raise ValueError(
                     f"{new.name} is ignored, because its message id belongs to {old.name}"
                 )
             return
-        if ended := self._ended.get(topic):
+        ended = self._ended.get(topic)
+        if ended:
             subscription = ended.pop(0)
         else:
-            try:
-                if self._count == _MAX_SUBSCRIPTIONS:
-                    raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
-                subscription = replace(new, layout=self._formats.layout(new.name))
-            except ValueError as exc:
-                raise ValueError(f"{new.name} cannot be decoded, because {exc}") from exc
+            subscription = self._with_layout(new)
             self._count += 1
             self._records.append(subscription)
         self.subscriptions[new.message_id] = subscription
         for message_id in (new.message_id, *self._collected.pop(new.name, ())):
             self._route(message_id, None)
 
+    def _with_layout(self, new: Subscription) -> Subscription:
+        try:
+            if self._count == limits.ULOG_SUBSCRIPTIONS:
+                raise ValueError(f"the log has more than {limits.ULOG_SUBSCRIPTIONS} subscriptions")
+            return replace(new, layout=self._formats.layout(new.name))
+        except ValueError as exc:
+            raise ValueError(f"{new.name} cannot be decoded, because {exc}") from exc
+
     def _route(self, message_id: int, payloads: list[bytes] | None) -> None:
         """Add the payloads of a message id to a list from now on, or return its messages."""
-        if (subscription := self.subscriptions.get(message_id)) is not None:
-            returned = (
-                subscription if self._topics is None or subscription.name in self._topics else None
-            )
-            for length, head in _heads(message_id, subscription.layout):
-                self._known[head] = (
-                    returned,
-                    length,
-                    subscription.layout.size + _DATA_HEADER,
-                    payloads,
-                )
+        subscription = self.subscriptions.get(message_id)
+        if subscription is None:
+            return
+        is_returned = self._topics is None or subscription.name in self._topics
+        returned = subscription if is_returned else None
+        used = subscription.layout.size + _DATA_HEADER
+        for length, head in _heads(message_id, subscription.layout):
+            self._known[head] = (returned, length, used, payloads)
 
     def _unsubscribe(self, message_id: int) -> None:
         old = self.subscriptions.pop(message_id, None)
@@ -393,5 +426,6 @@ class UlogParser:
 
 def _heads(message_id: int, layout: PayloadLayout) -> Iterator[tuple[int, bytes]]:
     """Yield the possible lengths of a data message, which may include padding, and its first five bytes."""
-    for size in range(layout.size, layout.size + min(layout.padding, _MAX_PADDING) + 1):
+    padding = min(layout.padding, _PADDING)
+    for size in range(layout.size, layout.size + padding + 1):
         yield size + _DATA_HEADER, struct.pack("<HBH", size + 2, ord("D"), message_id)

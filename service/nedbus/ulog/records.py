@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final, NamedTuple
 
+from nedbus import limits
 from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, Encoded, FieldType, define, record_encoder
 
 from .layout import BASIC_TYPES, FIELD, PayloadLayout
 
 SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
-_MAX_TEXT: Final = 1024  # bytes of a logged text; PX4 logs at most 127
+
 _FORMAT = re.compile(rf"([A-Za-z][\w/-]*):((?:{FIELD.pattern})*)", re.ASCII)
 _NAME = re.compile(r"[A-Za-z][\w/-]{0,254}", re.ASCII)
 _KEY = re.compile(rb"(\w+)(\[\d{1,5}\])? (\S[^\0]*)")
@@ -125,31 +126,76 @@ def read_flags(content: bytes) -> tuple[int, ...]:
     incompatible, *offsets = struct.unpack_from("<8xQ3Q", content.ljust(40, b"\0"))
     if incompatible & ~1:
         raise UlogError(f"it has the unknown incompatible flags {incompatible:#x}; update nedbus")
-    return tuple(offsets) if incompatible else ()
+    if not incompatible:
+        return ()
+    return tuple(offsets)
 
 
 def _format(content: bytes) -> Format:
-    found = _FORMAT.fullmatch(content.decode("ascii"))
-    if not found:
+    definition = _FORMAT.fullmatch(content.decode("ascii"))
+    if not definition:
         raise ValueError
-    return Format(found[1], found[2])
+    return Format(definition[1], definition[2])
 
 
 def _key_and_value(content: bytes) -> tuple[str, Value]:
-    found, value = _KEY.fullmatch(content[1 : 1 + content[0]]), content[1 + content[0] :]
-    if not found:
+    end = 1 + content[0]
+    declaration = _KEY.fullmatch(content[1:end])
+    value = content[end:]
+    if not declaration:
         raise ValueError
-    kind, key = BASIC_TYPES.get(found[1].decode()), found[3].decode()
-    if found[2] or kind is None:  # PX4 does not always log the length that it declares
-        return key, value.decode(errors="replace") if found[1] == b"char" else value
-    return key, struct.unpack_from("<" + BASES[kind.base].code, value)[0]
+    c_type, length, name = declaration.groups()
+    key = name.decode()
+    kind = BASIC_TYPES.get(c_type.decode())
+    if kind is not None and not length:
+        (number,) = struct.unpack_from("<" + BASES[kind.base].code, value)
+        return key, number
+    # PX4 does not always log the length that it declares
+    if c_type == b"char":
+        return key, value.decode(errors="replace")
+    return key, value
+
+
+def _information(content: bytes) -> Information:
+    key, value = _key_and_value(content)
+    return Information(key, value)
+
+
+def _multi_information(content: bytes) -> Information:
+    key, value = _key_and_value(content[1:])
+    return Information(key, value, continued=bool(content[0]))
+
+
+def _default_parameter(content: bytes) -> Information:
+    return _information(content[1:])  # without the types of the default
+
+
+def _parameter(content: bytes) -> Parameter:
+    key, value = _key_and_value(content)
+    return Parameter(key, value)
 
 
 def _text(content: bytes, tag: int | None = None) -> LoggedText:
     level, timestamp = struct.unpack_from("<BQ", content)
-    if not 0x30 <= level <= 0x37 or len(content) > _MAX_TEXT:
+    if not 0x30 <= level <= 0x37 or len(content) > limits.ULOG_TEXT:
         raise ValueError
-    return LoggedText(level - 0x30, timestamp, content[9:].decode(errors="replace"), tag)
+    text = content[9:].decode(errors="replace")
+    return LoggedText(level - 0x30, timestamp, text, tag)
+
+
+def _tagged_text(content: bytes) -> LoggedText:
+    (tag,) = struct.unpack_from("<H", content, 1)
+    return _text(content[:1] + content[3:], tag)
+
+
+def _dropout(content: bytes) -> Dropout:
+    (duration,) = struct.unpack_from("<H", content)
+    return Dropout(duration)
+
+
+def _unsubscription(content: bytes) -> Unsubscription:
+    (message_id,) = struct.unpack_from("<H", content)
+    return Unsubscription(message_id)
 
 
 def _subscription(content: bytes) -> Subscription:
@@ -169,17 +215,15 @@ def _sync(content: bytes) -> Sync:
 
 READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
     ord("A"): _subscription,
-    ord("C"): lambda content: _text(
-        content[:1] + content[3:], struct.unpack_from("<H", content, 1)[0]
-    ),
+    ord("C"): _tagged_text,
     ord("F"): _format,
-    ord("I"): lambda content: Information(*_key_and_value(content)),
+    ord("I"): _information,
     ord("L"): _text,
-    ord("M"): lambda content: Information(*_key_and_value(content[1:]), bool(content[0])),
-    ord("O"): lambda content: Dropout(struct.unpack_from("<H", content)[0]),
-    ord("P"): lambda content: Parameter(*_key_and_value(content)),
-    ord("Q"): lambda content: Information(*_key_and_value(content[1:])),
-    ord("R"): lambda content: Unsubscription(struct.unpack_from("<H", content)[0]),
+    ord("M"): _multi_information,
+    ord("O"): _dropout,
+    ord("P"): _parameter,
+    ord("Q"): _default_parameter,
+    ord("R"): _unsubscription,
     ord("S"): _sync,
 }
 """Reader of each record type except data; raises ValueError, LookupError or struct.error.
@@ -200,36 +244,28 @@ class LoggedStream:
     """
 
     def __init__(self, vehicle: str, subscription: Subscription) -> None:
-        topic, layout = subscription.name, subscription.layout
+        topic = subscription.name
+        fields = subscription.layout.fields
         self.subscription = subscription
-        self.names = tuple(field.name for field in layout.fields)  # names in the log
+        self.names = tuple(field.name for field in fields)  # names in the log
         self.definition = BY_TOPIC.get(topic) or _define(
             "".join(part.capitalize() for part in topic.split("_")),
-            tuple((field.name, field.kind) for field in layout.fields),
+            tuple((field.name, field.kind) for field in fields),
         )
         has_number = TOPICS[topic].instances if topic in TOPICS else subscription.multi_id > 0
         self.address = Address(vehicle, topic, subscription.multi_id if has_number else None)
         self.converted: dict[str, FieldType] = {}
         """Target type of each field whose logged type differs, such as an int32 of PX4 1.9 that is now a uint8."""
-        for name, kind, _ in layout.fields:
+        self.timestamp: Callable[[bytes], tuple[int | None]] = self._decode_timestamp
+        """Return the timestamp of a message [us], or None if it has none, in a tuple."""
+        for name, kind, offset in fields:
             known = self.definition.known_types.get(name, {kind})
             if kind not in known:
                 self.converted[name] = self.definition.types.get(name) or next(iter(known))
-        at = next(
-            (
-                each.offset
-                for each in layout.fields
-                if each.name == "timestamp" not in self.converted
-            ),
-            None,
-        )
-        self.timestamp: Callable[[bytes], tuple[int | None]] = lambda payload: (
-            self.decode(payload).get("timestamp"),
-        )
-        """Return the timestamp of a message [us], or None if it has none, in a tuple."""
-        if at is not None:
-            self.timestamp = struct.Struct(f"<{at}xQ").unpack_from
-        self.lacking = self.strict_bools = frozenset[str]()
+            elif name == "timestamp":
+                self.timestamp = struct.Struct(f"<{offset}xQ").unpack_from
+        self.lacking: frozenset[str] = frozenset()
+        self.strict_bools: frozenset[str] = frozenset()
         self.head = b""
         self.omitted: dict[str, str] = {}
         """Warnings for fields left out because a value does not fit the target type, by field name."""
@@ -245,6 +281,9 @@ class LoggedStream:
     def dtype(self) -> Any:
         """Argument for `numpy.dtype` that describes a payload."""
         return self.subscription.layout.dtype
+
+    def _decode_timestamp(self, payload: bytes) -> tuple[int | None]:
+        return (self.decode(payload).get("timestamp"),)
 
     def check(self, _: bytes) -> None:
         """Return None: the parser has checked the size of each message."""

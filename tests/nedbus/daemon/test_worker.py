@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import pytest
 
+from nedbus import limits
 from nedbus.client import PublisherRegistry
 from nedbus.daemon import PlannedSource
 from nedbus.daemon.worker import Clock, Worker
@@ -422,7 +423,7 @@ def test_rejection_warnings_are_bounded(caplog: pytest.LogCaptureFixture) -> Non
 
 def test_addresses_of_a_live_source_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     """A peer cannot make a service publish an unlimited number of addresses; known vehicles are not affected."""
-    monkeypatch.setattr("nedbus.daemon.output._MAX_ADDRESSES", 10)
+    monkeypatch.setattr(limits, "LIVE_ADDRESSES", 10)
     clock = FakeClock(stop_at=100.0)
     script: Script = [at(0.0, Address(str(number), VLP)) for number in range(15)]
     status = run(FakeLive(clock, [*script, *script[:10]]), clock).status

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from nedbus.samples import Batch
 from nedbus_msgs import DEFAULT, Provenance, codec_of, provenance_of
-from nedbus_msgs.arrays import MAX_FEW, arrays_of
+from nedbus_msgs.arrays import FEW_PAYLOADS, arrays_of
 
 from .arrival import Arrival, encoding_of
 from .decoder import Decoder
@@ -57,7 +57,7 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> R
     definition = codec.definition if codec else DEFAULT
     arrays = arrays_of(definition)
     payloads = [arrival.payload for arrival in arrivals]
-    messages = arrays.decode_few(payloads) if codec and len(payloads) <= MAX_FEW else None
+    messages = arrays.decode_few(payloads) if codec and len(payloads) <= FEW_PAYLOADS else None
     if messages is None:
         own, blank = codec_of(definition).size, bytes(codec_of(definition).size)
         # Payloads of other layouts are replaced by an invalid placeholder, and decoded below.

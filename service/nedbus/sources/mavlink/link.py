@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
-from nedbus import clock
+from nedbus import clock, limits
 from nedbus.errors import ConfigError, SourceError
 
 Peer = Any  # remote address, as returned by the socket
@@ -25,17 +25,15 @@ _CHANGES: Final = 5
 _WINDOW: Final = 5.0  # s
 _PEER_TIMEOUT: Final = 3.0  # s without a message from an address until another one replaces it
 _PEER_RUN: Final = 20  # messages in a row from another address that replace it earlier
-_MAX_DATAGRAMS: Final = 100  # per read
-_MAX_READ: Final = 65535  # bytes
-# bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
-_MAX_UNSENT: Final = 4096
+_READ_DATAGRAMS: Final = 100  # per read
+_READ_BYTES: Final = 65535  # bytes
 # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
 _RECEIVE_BUFFER: Final = 2**22
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _TIMESTAMPS: Final = 35  # Linux's SO_TIMESTAMPNS: the arrival of a datagram
 _DROPS: Final = 40  # Linux's SO_RXQ_OVFL: the number of datagrams dropped before it
 _TIME: Final = struct.Struct("qq")  # s and ns since the epoch
-_MAX_CONTROL: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
+_CONTROL_BYTES: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
 _LINK: Final = re.compile(
     r"(udpin|tcp):(.+):(\d{1,5})|(udpout):(.+):(\d{1,5})(?:@(\d{1,5}))?|(serial):(/.+)"
 )
@@ -96,8 +94,8 @@ class _UdpLink:
             self._drained = time.monotonic()
             return
         with suppress(BlockingIOError, ConnectionError):  # ICMP: the peer is not listening yet
-            for _ in range(_MAX_DATAGRAMS):
-                data, control, _, peer = self._socket.recvmsg(_MAX_READ, _MAX_CONTROL)
+            for _ in range(_READ_DATAGRAMS):
+                data, control, _, peer = self._socket.recvmsg(_READ_BYTES, _CONTROL_BYTES)
                 now = time.monotonic()
                 yield Packet(data, peer, max(self._drained, now - self._read_control(control)))
             return
@@ -144,7 +142,7 @@ class _StreamLink:
             self._flush()
         if ready & ~select.POLLOUT:
             with suppress(BlockingIOError):
-                data = os.read(self._file.fileno(), _MAX_READ)
+                data = os.read(self._file.fileno(), _READ_BYTES)
                 if not data:
                     raise ConnectionResetError(None, "the peer closed the connection")
                 yield Packet(data, self.peer, time.monotonic())
@@ -152,7 +150,7 @@ class _StreamLink:
     def send(self, frame: bytes, _: Peer) -> bool:
         """Send or queue a whole frame without blocking; return False if the queue is full. Raises OSError."""
         with self._sending:
-            if len(self._unsent) + len(frame) > _MAX_UNSENT:
+            if len(self._unsent) + len(frame) > limits.MAVLINK_UNSENT:
                 return False
             self._unsent += frame
         self._flush()

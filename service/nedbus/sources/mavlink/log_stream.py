@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from nedbus import clock, ulog
+from nedbus import clock, limits, ulog
 from nedbus.errors import OutputError
 from nedbus.log_event import about
 from nedbus.mavlink import Chunk
@@ -30,17 +30,13 @@ _SOURCE: Final = "mavlink-ulog"
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
-_MAX_REQUESTS: Final = 10  # TIMESYNC requests that may be unanswered
 _FILE_HEADER: Final = 16  # bytes
 _RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
 _DROPOUT: Final = struct.Struct("<HBH")  # a record of type O: duration [ms]
-_MAX_DROPOUT: Final = 2**16 - 1  # ms
-_MAX_SAME_NAME: Final = 100
-_MAX_REASONS: Final = 100  # different ones for damaged records of a stream
+_LONGEST_DROPOUT: Final = 2**16 - 1  # ms
 _FILE_INTERVAL: Final = 5.0  # s between two files of a vehicle
 _MIN_SIZES: Final = 100  # messages until their mean size can be known
-_MAX_ERROR: Final = 0.02  # of the mean size
-_MAX_PENDING: Final = 2**22  # bytes of a stream that wait for its file
+_TOLERANCE: Final = 0.02  # of the mean size
 
 
 class LogStream:
@@ -77,7 +73,7 @@ class LogStream:
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
         # times of unanswered TIMESYNC requests [ns]
-        self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)
+        self._requests: deque[int] = deque(maxlen=limits.TIMESYNC_REQUESTS)
         self._window_start = self._rate = self._delays = 0.0
         self._window_bytes = self._delayed = 0
         self._delay: float | None = None
@@ -171,7 +167,7 @@ class LogStream:
 
     def _reject(self, reason: str) -> Rejection:
         """Return the rejection of a damaged record; all beyond the first 100 reasons have the same one."""
-        if len(self._damages) < _MAX_REASONS:
+        if len(self._damages) < limits.DAMAGE_REASONS:
             self._damages.add(reason)
         return Rejection(
             f"{self._name} ULog stream", reason if reason in self._damages else "further damage"
@@ -349,9 +345,9 @@ class LogStream:
         if self._is_pending:
             self._pending.append((gap, chunk.data))
             self._pending_size += len(chunk.data)
-            if self._pending_size > _MAX_PENDING:
+            if self._pending_size > limits.LOG_STREAM_PENDING:
                 self._stop_saving(
-                    f"the stream has more than {_MAX_PENDING} bytes before its first message"
+                    f"the stream has more than {limits.LOG_STREAM_PENDING} bytes before its first message"
                 )
         elif self._file is not None:
             self._write(self._file, [(gap, chunk.data)])
@@ -433,7 +429,7 @@ class _MeanSize:
             self._squares = self._squares + size * size
         if not self.is_known and self._count >= _MIN_SIZES:
             variance = max(0.0, self._squares / self._count - self.mean**2)
-            self.is_known = math.sqrt(variance / self._count) <= _MAX_ERROR * self.mean
+            self.is_known = math.sqrt(variance / self._count) <= _TOLERANCE * self.mean
 
     @property
     def mean(self) -> float:
@@ -474,7 +470,7 @@ class LogFile:
         self._partial.clear()
         if not self._begins:
             self._append(
-                _DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000))))
+                _DROPOUT.pack(2, ord("O"), max(1, min(_LONGEST_DROPOUT, round(seconds * 1000))))
             )
 
     def _append(self, records: bytes) -> None:
@@ -498,7 +494,7 @@ def _create(folder: Path, vehicle: str) -> tuple[Path, BinaryIO]:
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{vehicle}_{clock.now():%Y-%m-%d_%H-%M-%S}"
     path = folder / f"{name}.ulg"
-    for number in range(2, _MAX_SAME_NAME):
+    for number in range(2, limits.SAME_NAMES):
         with suppress(FileExistsError):
             return path, path.open("xb", buffering=0)
         path = folder / f"{name}_{number}.ulg"

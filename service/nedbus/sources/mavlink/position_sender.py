@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from typing import Final, NamedTuple, cast
 
+from nedbus import limits
 from nedbus.errors import ClosedError, DecodeError, NedbusError
 from nedbus.log_event import UnexpectedErrors, about
 from nedbus.mavlink import ExternalPosition
@@ -29,7 +30,6 @@ TIMESYNC_TOPIC: Final = "timesync_status"
 
 _CONNECT_TIMEOUT: Final = 0.5  # s
 _DOWNSAMPLED: Final = "rate"  # kind of refusal that is no fault of the publisher
-_MAX_ENCODING: Final = 512  # characters of an encoding; those of nedbus have at most 250
 # s between two looks for the vehicle, whose address changes after 3 s of silence
 _TARGET_INTERVAL: Final = 0.1
 _SHORT_ID: Final = 8  # characters of the id of a session
@@ -237,7 +237,7 @@ class SenderName:
         publisher = None if raw.source_info is None else entity_name(raw.source_info.source_id)
         if publisher != self._publisher or not self._name:
             self._publisher = publisher
-            source = provenance_of(self._definition, str(raw.encoding)[:_MAX_ENCODING]).source
+            source = provenance_of(self._definition, str(raw.encoding)[: limits.ENCODING]).source
             self._name = source or "a publisher"
             if publisher is not None:
                 self._name += f" (session {publisher[:_SHORT_ID]})"

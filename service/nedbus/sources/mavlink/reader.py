@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus import limits
 from nedbus.mavlink import (
     AUTOPILOT,
     Chunk,
@@ -32,7 +33,6 @@ from .saved_stream import read_stream, state_path
 SYSTEM: Final = 245
 COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
-_MAX_VEHICLES: Final = 100  # per link
 # s without a message until a vehicle can be removed in favour of another one
 _MIN_SILENCE: Final = 5.0
 _TICK: Final = 0.05  # s, the longest wait of the thread
@@ -143,8 +143,8 @@ class LogReceiver:
         system, now = received.system, received.time
         vehicle = self.vehicles.get(system)
         if vehicle is None:
-            if len(self.vehicles) == _MAX_VEHICLES and not self._evict(now):
-                reason = f"a link has up to {_MAX_VEHICLES}; give the others a link of their own"
+            if len(self.vehicles) == limits.MAVLINK_VEHICLES and not self._evict(now):
+                reason = f"a link has up to {limits.MAVLINK_VEHICLES}; give the others a link of their own"
                 return Rejection(f"{self._reader.name} further vehicles", reason)
             ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
             client = LogStreamClient(options.log, **ids, header=options.header)

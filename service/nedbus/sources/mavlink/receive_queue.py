@@ -8,21 +8,19 @@ from operator import attrgetter
 from threading import Condition
 from typing import Final
 
+from nedbus import limits
 from nedbus.mavlink import Chunk, Received
 from nedbus.sources.source import LinkLoad, Rejection
 from nedbus.timings import TIMINGS
 
-# messages of all vehicles; beyond it the oldest of the longest queue is dropped
-_MAX_WAITING: Final = 16_384
 # s; of the messages behind one that waited too long, those that waited longer are dropped, too
 _FRESH: Final = 0.2
 _LATE: Final = 0.5  # s; a longer wait means that the host is overloaded
 _MEMORY: Final = 5.0  # s without a late or dropped message until the overload has ended
-_MAX_READ: Final = 100  # messages per call of `read`
-_MAX_READ_TIME: Final = 0.1  # s per call of `read`
-_MAX_REJECTIONS: Final = 1000  # different ones that wait; further ones count as one of `_FURTHER`
+_READ_MESSAGES: Final = 100  # messages per call of `read`
+_READ_TIME: Final = 0.1  # s per call of `read`
 _FURTHER: Final = Rejection(
-    "further places", f"the limit is {_MAX_REJECTIONS} different rejections at a time"
+    "further places", f"the limit is {limits.WAITING_REJECTIONS} different rejections at a time"
 )
 
 
@@ -123,7 +121,10 @@ class ReceiveQueue:
         with self._changed:
             for item in items:
                 if isinstance(item, Rejection):
-                    is_known = item in self._rejections or len(self._rejections) < _MAX_REJECTIONS
+                    is_known = (
+                        item in self._rejections
+                        or len(self._rejections) < limits.WAITING_REJECTIONS
+                    )
                     self._rejections[item if is_known else _FURTHER] += item.count
                     continue
                 vehicle = self._vehicles.setdefault(item.system, _VehicleQueue())
@@ -131,7 +132,7 @@ class ReceiveQueue:
                     vehicle.used = max(vehicle.used, self._turn)
                 vehicle.waiting.append(item)
                 self._count += item.parts
-                while self._count > _MAX_WAITING:
+                while self._count > limits.MAVLINK_WAITING:
                     longest = max(self._vehicles.values(), key=lambda each: len(each.waiting))
                     self._drop(longest, longest.waiting.popleft())
             self._changed.notify()
@@ -155,7 +156,7 @@ class ReceiveQueue:
         for rejection, count in rejections.items():
             yield replace(rejection, count=count)
         start = now = self._now()
-        for _ in range(_MAX_READ):
+        for _ in range(_READ_MESSAGES):
             vehicle, received = self._take(now)
             load = self._measure(
                 0.0 if received is None else now - received.time, lost_by_host, now
@@ -170,7 +171,7 @@ class ReceiveQueue:
             yield received
             before, now = now, self._now()
             vehicle.used += now - before
-            if now - start > _MAX_READ_TIME:
+            if now - start > _READ_TIME:
                 return
 
     def _take(self, now: float) -> tuple[_VehicleQueue | None, Received | None]:

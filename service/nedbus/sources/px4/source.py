@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import zenoh
 
-from nedbus import transport
+from nedbus import limits, transport
 from nedbus.endpoints import check_endpoints
 from nedbus.errors import AddressError, ConfigError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
@@ -38,16 +38,13 @@ _log = logging.getLogger(__name__)
 
 _CONNECT_TIMEOUT: Final = 0.5  # s; short, because the service must stop within 1 s, and it retries
 _REPORT_INTERVAL: Final = 1.0  # s between reports of unavailable topics
-_MAX_PENDING: Final = 4096  # samples waiting to be decoded
-_MAX_PENDING_BYTES: Final = 4096  # bytes per payload
 _RING_SIZE: Final = 16_384  # samples waiting for the receiving thread
-_MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
 _INPUT: Final = "px4-zenoh-input"  # `sample.source` of messages to a vehicle
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
 _TOO_LARGE: Final = (
     "size",
-    f"a payload of more than {_MAX_PENDING_BYTES} bytes, or a key that is too long",
+    f"a payload of more than {limits.PX4_PAYLOAD} bytes, or a key that is too long",
 )
 
 
@@ -225,7 +222,7 @@ class Px4ZenohNode:
             return  # messages on its key are rejected
         if alive and not token.node.startswith("nedbus_"):
             key = token.key
-            if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
+            if key in self._subscriptions or len(self._subscriptions) >= limits.PX4_SUBSCRIPTIONS:
                 return
             if key.domain not in self._nodes:
                 self._nodes[key.domain] = self._declare(
@@ -253,10 +250,10 @@ class Px4ZenohNode:
         try:
             while True:
                 sample = handler.recv()
-                if self._pending.qsize() >= _MAX_PENDING:
+                if self._pending.qsize() >= limits.PX4_PENDING:
                     self._dropped[_TOO_FAST] += 1
                 elif (
-                    len(sample.payload) > _MAX_PENDING_BYTES
+                    len(sample.payload) > limits.PX4_PAYLOAD
                     or len(str(sample.key_expr)) > transport.LONGEST_TOKEN
                 ):
                     self._dropped[_TOO_LARGE] += 1

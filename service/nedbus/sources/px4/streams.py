@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final, NamedTuple
 
+from nedbus import limits
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import UnavailableTopics
 from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
@@ -23,16 +24,13 @@ from nedbus_msgs import (
     split_ros2_topic,
 )
 
-_MAX_STREAMS: Final = 10_000  # keys; a vehicle has a few dozen
-_MAX_PUBLISHERS: Final = 64  # per key
-_MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a gap
+_PLAUSIBLE_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a gap
 _TIMEOUT: Final = 3.0  # s without messages after which another publisher may use the address
 _EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
 # s during which messages may still arrive after a publisher's token is gone
 _SETTLE_TIME: Final = 1.0
 # s, or periods of the nominal rate if longer, after which a topic without messages is silent
 _SILENCE: Final = 5.0
-_MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each vehicle its own namespace or domain"
 
 # Supplied by the user, by DDS type and ROS 2 type hash, the latter also with `literal_char`.
@@ -127,7 +125,7 @@ class StreamRegistry:
             stream.ambiguous_until = -math.inf
         if not stream.tokens:
             stream.since = now
-        if len(stream.tokens) < _MAX_PUBLISHERS:
+        if len(stream.tokens) < limits.PX4_PUBLISHERS:
             stream.tokens[token.text] = token
             stream.ambiguous_until = math.inf if stream.is_ambiguous() else stream.ambiguous_until
 
@@ -187,7 +185,7 @@ class StreamRegistry:
                 if is_repeated:
                     reason = f"sequence numbers go back and forth, as if two vehicles shared this key; {_HINT}"
                     raise NotAcceptedError(reason)
-            elif step <= _MAX_LOSS:
+            elif step <= _PLAUSIBLE_LOSS:
                 lost = step - 1
             stream.sequence = attachment.sequence
         stream.last_accepted, stream.restarted = now, False
@@ -226,15 +224,16 @@ class StreamRegistry:
         }
         unsupported = {stream.unsupported for stream, own in nodes if own and stream.unsupported}
         return UnavailableTopics(
-            tuple(sorted(unsupported)[:_MAX_NAMES]), tuple(sorted(silent)[:_MAX_NAMES])
+            tuple(sorted(unsupported)[: limits.REPORTED_TOPICS]),
+            tuple(sorted(silent)[: limits.REPORTED_TOPICS]),
         )
 
     def _find(self, key: TopicKey) -> Px4Stream:
         stream = self._streams.get(str(key))
         if stream is None:
-            if len(self._streams) >= _MAX_STREAMS:
+            if len(self._streams) >= limits.PX4_KEYS:
                 raise NotAcceptedError(
-                    f"more than {_MAX_STREAMS} keys; choose a domain, as in px4-zenoh:?domain=0"
+                    f"more than {limits.PX4_KEYS} keys; choose a domain, as in px4-zenoh:?domain=0"
                 )
             namespace, topic, instance = split_ros2_topic(key.topic)
             address = Address(self._vehicle_of(key.domain, namespace), topic, instance)

@@ -11,8 +11,8 @@ from contextlib import closing, suppress
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus import limits
 from nedbus.errors import ConfigError, SourceError
-from nedbus.sources.mavlink import link as links
 from nedbus.sources.mavlink.link import Link, LinkAddress, open_link, parse_link
 from tests.peers.live_source import Listener
 from tests.peers.ports import free_port
@@ -77,7 +77,7 @@ def test_dropped_frames_are_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The number of messages that the link did not accept is logged; the source continues to receive."""
-    monkeypatch.setattr(links, "_MAX_UNSENT", 10)
+    monkeypatch.setattr(limits, "MAVLINK_UNSENT", 10)
     position = dialect.MAVLink_local_position_ned_message(1000, 0, 0, 0, 0, 0, 0).pack(
         dialect.MAVLink(None, 9, 1)
     )

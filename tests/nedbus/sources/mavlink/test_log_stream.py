@@ -18,10 +18,10 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 from pyulog import ULog
 
+from nedbus import limits
 from nedbus.client import LogStreamStatus
 from nedbus.mavlink.log_reassembly import Chunk, Reassembly
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
-from nedbus.sources.mavlink import receive_queue
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
@@ -64,7 +64,7 @@ def long_timeouts(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Lengthen queues and timeouts, because a flight is sent as fast as it is read."""
     timings.log_answer, timings.log_link, timings.log_header = DEADLINE, DEADLINE, 10 * DEADLINE
     timings.link_wait = DEADLINE
-    monkeypatch.setattr(receive_queue, "_MAX_WAITING", 1_000_000)
+    monkeypatch.setattr(limits, "MAVLINK_WAITING", 1_000_000)
 
 
 Attack = Callable[[bytes, int], None]

@@ -12,9 +12,10 @@ from typing import Any, Self
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus import limits
 from nedbus.mavlink.parser import new_parser, parse
 from nedbus.sources import Rejection
-from nedbus.sources.mavlink import reader, receive_queue
+from nedbus.sources.mavlink import reader
 from nedbus.sources.mavlink.link import PeerChoice, open_link
 from nedbus.sources.mavlink.reader import LinkReader
 from nedbus.sources.mavlink.receive_queue import Received
@@ -122,7 +123,7 @@ def test_source_that_was_blocked_continues_with_the_newest_messages(
     monkeypatch: pytest.MonkeyPatch, autopilot: Autopilot
 ) -> None:
     """While the source does not read, the oldest messages are dropped beyond a limit, and counted as lost."""
-    monkeypatch.setattr(receive_queue, "_MAX_WAITING", WAITING)
+    monkeypatch.setattr(limits, "MAVLINK_WAITING", WAITING)
     with Listener(f"mavlink:{autopilot.link}?log=1&topics=vehicle_local_position") as listener:
         autopilot.send(
             *autopilot.pack(
@@ -187,7 +188,7 @@ def test_removed_vehicle_has_no_state(
     monkeypatch: pytest.MonkeyPatch, timings: Timings, autopilot: Autopilot
 ) -> None:
     """A vehicle that was removed and returns is a new one, on both threads: its stream is requested again."""
-    monkeypatch.setattr(reader, "_MAX_VEHICLES", 1)
+    monkeypatch.setattr(limits, "MAVLINK_VEHICLES", 1)
     monkeypatch.setattr(reader, "_MIN_SILENCE", 0.0)
     timings.log_answer = DEADLINE  # no retransmission of START
     with Listener(f"mavlink:{autopilot.link}?log=1&state=0") as listener:

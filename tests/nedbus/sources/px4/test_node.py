@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
+from nedbus import limits
 from nedbus.errors import SourceError
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.options import Px4ZenohOptions
@@ -82,7 +83,7 @@ def test_messages_beyond_the_queue_are_counted_as_rejected(
     source: Source, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Messages that arrive faster than they are decoded are not queued without limit, but counted as rejected."""
-    monkeypatch.setattr("nedbus.sources.px4.source._MAX_PENDING", 3)
+    monkeypatch.setattr(limits, "PX4_PENDING", 3)
     source.step_until(lambda: True)
     for domain in range(10):
         put(zenoh_session, domain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from nedbus import limits
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import NotAcceptedError, Px4Stream, StreamRegistry
 from nedbus.transport import Attachment, PublisherToken, TopicKey
@@ -186,7 +187,7 @@ def test_number_of_keys_is_limited(
     monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry
 ) -> None:
     """The number of keys is limited; keys of withdrawn publishers without an accepted message do not count."""
-    monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
+    monkeypatch.setattr(limits, "PX4_KEYS", 3)
     streams.add_publisher(px4("a"), 0.0)
     for domain in (1, 2):
         streams.on_message(str(key(domain=domain)), 0.0)

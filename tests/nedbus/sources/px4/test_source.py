@@ -17,6 +17,7 @@ import zenoh
 from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 
 import nedbus
+from nedbus import limits
 from nedbus.errors import ConfigError
 from nedbus.sources import SourceMessage, parse_source
 from nedbus.transport import NO_HASH, Attachment, Session, TopicKey
@@ -575,7 +576,7 @@ def test_panic_in_the_receiving_thread_fails_the_source(
     """A panic of Zenoh on the receiving thread fails the source, which the service then restarts."""
     key = f"0/a/{dds_type(ROS2_TYPE)}/hash"
     wait_for_matching(zenoh_session, key)
-    monkeypatch.setattr("nedbus.sources.px4.source._MAX_PENDING_BYTES", Panics())
+    monkeypatch.setattr(limits, "PX4_PAYLOAD", Panics())
     zenoh_session.put(key, bytes(300))
     with pytest.raises(BaseException, match="panic"):
         listener.step_until(lambda: False, what="the error")

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus import limits
 from nedbus.mavlink import Received
 from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import LinkLoad, Rejection
-from nedbus.sources.mavlink import receive_queue
 from nedbus.sources.mavlink.receive_queue import ReceiveQueue, join_data
 from tests.waits import DEADLINE
 
@@ -105,7 +105,7 @@ def test_datagrams_that_the_system_dropped_are_an_overload(host: Host) -> None:
 
 def test_messages_that_wait_are_limited(monkeypatch: pytest.MonkeyPatch, host: Host) -> None:
     """Beyond the limit, the oldest message of the vehicle with most messages is dropped, and counted as lost."""
-    monkeypatch.setattr(receive_queue, "_MAX_WAITING", 10)
+    monkeypatch.setattr(limits, "MAVLINK_WAITING", 10)
     host.put(0, system=2)
     for number in range(12):
         host.put(number)
@@ -191,7 +191,7 @@ def test_stream_whose_beginning_was_dropped_is_not_decoded(
     monkeypatch: pytest.MonkeyPatch, host: Host
 ) -> None:
     """Without the first message of a stream nothing is delivered until the next stream."""
-    monkeypatch.setattr(receive_queue, "_MAX_WAITING", 3)
+    monkeypatch.setattr(limits, "MAVLINK_WAITING", 3)
     host.put(0, Chunk("delivered", b"header", begins=True), message=ACKED)
     host.put(1, Chunk("delivered", b"one"))
     host.put(2, Chunk("delivered", b"two"))
@@ -266,7 +266,7 @@ def test_rejections_beyond_the_limit_are_counted_apart(
     host: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beyond the limit of different rejections, further ones are counted together, and not for an unrelated place."""
-    monkeypatch.setattr(receive_queue, "_MAX_REJECTIONS", 3)
+    monkeypatch.setattr(limits, "WAITING_REJECTIONS", 3)
     host.queue.put(*(Rejection(f"{number} x", "bad") for number in range(3)))
     host.queue.put(
         *(Rejection("99 y", "worse", count=2) for _ in range(5)), Rejection("1 x", "bad")
