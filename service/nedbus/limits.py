@@ -188,7 +188,7 @@ PX4_PENDING: Final = 4096
 PX4_PAYLOAD: Final = 4096
 """Bytes of a sample, as of a message. A larger sample is rejected before it waits."""
 
-REPORTED_TOPICS: Final = 100
+UNREADABLE_TOPICS: Final = 100
 """Unsupported messages, and silent topics, in one report of a source. The rest is left out."""
 
 # --- MAVLink ---

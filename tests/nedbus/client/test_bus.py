@@ -196,7 +196,7 @@ def test_vehicles_are_listed_again_after_an_overflow(
     endpoint: str, bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If too many tokens change between calls, all are listed again: the list is complete, without closed vehicles."""
-    monkeypatch.setattr(liveliness, "_MAX_CHANGES", 20)
+    monkeypatch.setattr("nedbus.limits.TOKEN_CHANGES", 20)
     gone = zenoh_session.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first vehicle")
     gone.undeclare()

@@ -173,7 +173,7 @@ def test_batches_have_at_most_max_messages(mode: Mode) -> None:
     put(inbox, [raw(None, key=f"nedbus/{vehicle}/{VLP}") for vehicle in "12345"])
     read = [
         [each.vehicle for each in batch.addresses]
-        for batch in iter(lambda: inbox.pop_batch(2), None)
+        for batch in iter(lambda: inbox.pop_batch(max_messages=2), None)
     ]
     assert read == [["1", "2"], ["3", "4"], ["5"]]
 

@@ -28,7 +28,7 @@ from nedbus.errors import ConnectError
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
-from nedbus.transport import NO_HASH, Session, TopicKey, fleet_tokens, open_client, open_router
+from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router
 from nedbus_msgs import TOPICS, Address, dds_type, status_key
 from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
@@ -265,7 +265,7 @@ def test_truncated_list_of_streams_is_reported(
     bus: nedbus.Bus, endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle with too many liveliness tokens is left out with a finding; the others are examined."""
-    monkeypatch.setattr(fleet_tokens, "_MAX_TOKENS", 20)
+    monkeypatch.setattr("nedbus.limits.TOKENS_OF_VEHICLE", 20)
     keys = [f"nedbus/flood/@alive/{each:x}/{VLP}" for each in range(21)]
     tokens = [zenoh_session.liveliness().declare_token(key) for key in keys]
     with publishing(bus, "drone-7"):

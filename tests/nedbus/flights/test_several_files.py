@@ -167,7 +167,7 @@ def test_page_shows_several_files(swarm: list[str]) -> None:
     assert recording.name == "a 1.ulg, b.ulg, c.ulg"
     assert recording.timeline.clock_offset is not None
     assert math.isclose(recording.timeline.clock_offset, EPOCH / 1e6 + 58, abs_tol=0.01)
-    assert {address.vehicle for address, _ in recording.entries} == {"a_1", "b", "c"}
+    assert {entry.address.vehicle for entry in recording.entries} == {"a_1", "b", "c"}
     assert math.isclose(recording.length, 11.9, abs_tol=0.01)
 
 

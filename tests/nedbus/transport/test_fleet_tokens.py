@@ -33,7 +33,7 @@ def limits(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> Timings:
     """Lower the limit of tokens; a router is slow if it has not listed all tokens when they are first polled."""
-    monkeypatch.setattr(fleet_tokens, "_MAX_TOKENS", LIMIT)
+    monkeypatch.setattr("nedbus.limits.TOKENS_OF_VEHICLE", LIMIT)
     timings.slow_list = request.param
     return timings
 
@@ -91,7 +91,7 @@ def test_number_of_excluded_vehicles_is_bounded(
     endpoint: str, zenoh_session: Session, limits: Timings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A further vehicle above the limit stays listed if its exclusion would take too many key expressions."""
-    monkeypatch.setattr(fleet_tokens, "_MAX_KEY_EXPRS", 2 * 64)
+    monkeypatch.setattr("nedbus.limits.EXCLUDING_KEY_EXPRS", 2 * 64)
     tokens = declare(zenoh_session, "a", LIMIT + 1) + declare(zenoh_session, "7", 1)
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: list(bus.vehicles()) == ["7"], what="the exclusion of the first vehicle")

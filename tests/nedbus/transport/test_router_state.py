@@ -209,7 +209,7 @@ def test_number_and_size_of_state_replies_are_limited(
             what="the replies of the impostor",
         )
         assert real.zid in {state.zid for state in query_routers(zenoh_session, timeout=5.0)}
-        monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
+        monkeypatch.setattr("nedbus.limits.ROUTERS", 5)
         assert len(query_routers(zenoh_session, timeout=5.0)) == 5
 
 

@@ -224,8 +224,8 @@ class StreamRegistry:
         }
         unsupported = {stream.unsupported for stream, own in nodes if own and stream.unsupported}
         return UnavailableTopics(
-            tuple(sorted(unsupported)[: limits.REPORTED_TOPICS]),
-            tuple(sorted(silent)[: limits.REPORTED_TOPICS]),
+            tuple(sorted(unsupported)[: limits.UNREADABLE_TOPICS]),
+            tuple(sorted(silent)[: limits.UNREADABLE_TOPICS]),
         )
 
     def _find(self, key: TopicKey) -> Px4Stream:
