@@ -205,9 +205,6 @@ WAITING_REJECTIONS: Final = 1000
 MAVLINK_UNSENT: Final = 4096
 """Bytes that a TCP or serial link may queue; more would be too old when they arrive. A frame beyond it is not sent."""
 
-ENCODING: Final = 512
-"""Characters of an encoding of a position from the bus; those of nedbus have at most 250. The rest is not parsed."""
-
 TIMESYNC_REQUESTS: Final = 10
 """TIMESYNC requests that may be unanswered. Beyond it the oldest is forgotten, and its answer ignored."""
 

@@ -237,7 +237,9 @@ class SenderName:
         publisher = None if raw.source_info is None else entity_name(raw.source_info.source_id)
         if publisher != self._publisher or not self._name:
             self._publisher = publisher
-            source = provenance_of(self._definition, str(raw.encoding)[: limits.ENCODING]).source
+            source = provenance_of(
+                self._definition, str(raw.encoding)[: limits.ENCODING_TEXT]
+            ).source
             self._name = source or "a publisher"
             if publisher is not None:
                 self._name += f" (session {publisher[:_SHORT_ID]})"
