@@ -6,7 +6,7 @@ import itertools
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
-from io import BytesIO
+from io import DEFAULT_BUFFER_SIZE, BytesIO
 from pathlib import Path
 
 import pytest
@@ -404,6 +404,39 @@ def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
     bag_in_sqlite(tmp_path / "a_0.db3")
     with pytest.raises(SourceError, match="an SQLite bag; convert it"):
         nedbus.read(tmp_path)
+
+
+def test_compressed_sqlite_bag_raises_with_remedy(tmp_path: Path) -> None:
+    """An SQLite bag with compression of files, as a file or a folder, raises; the error names the remedy."""
+    bag = tmp_path / "bag_0.db3"
+    bag_in_sqlite(bag)
+    compressed = tmp_path / "bag_0.db3.zstd"
+    compressed.write_bytes(zstandard.compress(bag.read_bytes()))
+    bag.unlink()
+    for path in (tmp_path, compressed):
+        with pytest.raises(SourceError, match="an SQLite bag; convert it"):
+            nedbus.read(path)
+
+
+def test_compressed_recording_that_fits_in_a_buffer_is_read(tmp_path: Path) -> None:
+    """A compressed file is read to its end, also the bytes that do not fill the buffer of the temporary file.
+
+    Found with a bag of five short messages from rosbags 0.11.9.
+    """
+    definition = "uint64 timestamp\n"
+    path = tmp_path / "a.mcap.zstd"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("px4_msgs/msg/Probe", "ros2msg", definition.encode())
+        channel = writer.register_channel("/fmu/out/probe", "cdr", schema)
+        for stamp in range(1, 6):
+            writer.add_message(channel, stamp, b"\0\1\0\0" + stamp.to_bytes(8, "little"), stamp)
+        writer.finish()
+    data = path.read_bytes()
+    assert len(data) < DEFAULT_BUFFER_SIZE
+    path.write_bytes(zstandard.compress(data))
+    assert nedbus.read(path, "probe")["timestamp"].tolist() == [1, 2, 3, 4, 5]
 
 
 def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

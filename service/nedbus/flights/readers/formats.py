@@ -11,12 +11,13 @@ from nedbus_msgs import DEFAULT, RELEASES
 
 from .reader import FlightReader, ReadOptions
 
+_SQLITE: Final = b"SQLite format 3"
 _UNREADABLE: Final = {
     b"ULogKey": "an encrypted log; decrypt it with PX4's Tools/decrypt_ulog.py and the private key first",
     b"PK\x03\x04": "a zip archive; unpack it first",
     b"\x1f\x8b": "a gzip file; unpack it first",
     b"version https://git-lfs": "a Git LFS pointer instead of the file; fetch the file with 'git lfs pull'",
-    b"SQLite format 3": "an SQLite bag; convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
+    _SQLITE: "an SQLite bag; convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
     b"": "an empty file; copy it again, or look for another log of this flight",
 }  # by first bytes
 
@@ -58,6 +59,8 @@ def format_of(path: str | PurePath) -> str:
     if by_suffix is not None:
         return by_suffix
     reason = _why_unreadable(head)
+    if not reason and str(path).lower().endswith(".db3.zstd"):
+        reason = _UNREADABLE[_SQLITE]
     if reason:
         raise SourceError(str(path), reason)
     suffixes = " or ".join(SUFFIXES)
@@ -132,6 +135,8 @@ def _why_no_recording(folder: Path) -> str:
         reason = _why_unreadable(_head_of(bag))
         if reason:
             return reason
+    if any(folder.glob("*.db3.zstd")):
+        return _UNREADABLE[_SQLITE]
     return "no .mcap file in this folder"
 
 

@@ -182,6 +182,7 @@ class ChunkFile:
                         raise ZstdError(f"more than {limit} bytes")
             except ZstdError as exc:
                 self.warn(f"the compressed file is damaged ({exc})", lost=True)
+            unpacked.flush()  # the size of the file counts what is written
             on_error.pop_all()
         return unpacked
 
