@@ -356,7 +356,7 @@ TABLE_ROWS: Final = 200
 """Rows of a table, and services in `nedbus info`, as any peer may claim to be one. The others are counted."""
 
 LIVE_ROWS: Final = 50
-"""Rows of a table that is printed each second, as nobody reads more. The others are counted."""
+"""Rows of a table that is printed each second, to stay readable. The others are counted."""
 
 LOG_KINDS: Final = 1000
 """Kinds of log lines with an own rate limit; nedbus itself has about 40. Further kinds share one."""

@@ -131,7 +131,7 @@ class EventLog:
             self._update_link(link, time)
             self._update_overload(dropped, time, is_behind=is_behind)
             if present is not None:
-                # nobody is gone while the link is down
+                # without a link, no vehicle counts as gone
                 self._see(self.vehicles if link else present, time)
                 self._most_present = max(self._most_present, len(present))
                 self._forget_gone(time)
