@@ -140,7 +140,9 @@ class Arrays(Generic[M]):
         """Encode messages as concatenated payloads, without validating them."""
         native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
         wire = native.take(self._to_wire, axis=1)
-        return (wire & self._value_mask | self._tags).tobytes()
+        wire &= self._value_mask  # in place: two more arrays would take half of the time
+        wire |= self._tags
+        return wire.tobytes()
 
     def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the messages that pass the rules."""

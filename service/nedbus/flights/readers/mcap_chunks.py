@@ -208,8 +208,12 @@ class ChunkFile:
         footer = self._read(end, _FOOTER.size - len(MCAP0_MAGIC) - 4)
         if checksum and crc32(footer, crc32(summary)) != checksum:
             raise ValueError(checksum)
-        indexes = [record for record in records_of(summary) if isinstance(record, ChunkIndex)]
-        chunks = sorted(map(_place_of, indexes))
+        chunks = []
+        for record in records_of(summary):
+            # Only the place is kept: an index also lists the messages of each channel.
+            if isinstance(record, ChunkIndex):
+                chunks.append(_place_of(record))
+        chunks.sort()
         previous = len(MCAP0_MAGIC)
         for chunk in chunks:
             if chunk.start < previous:
