@@ -47,11 +47,11 @@ from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .receiving import (
     Decoder,
+    Downsampled,
     Inbox,
     LayoutLookup,
-    MaxRateInbox,
-    MaxRateReceiver,
     Receiver,
+    Throttle,
     find_schemas,
 )
 from .subscription import Subscription
@@ -417,15 +417,18 @@ class Bus(AbstractContextManager["Bus"]):
             return Inbox(
                 mode, decoder, key_exprs=selection.key_exprs(prefix=self.prefix), limit=limit
             )
-        return MaxRateInbox(mode, decoder, selection, max_rate=max_rate, limit=limit)
+        throttle = Throttle(max_rate, selection, prefix=self.prefix)
+        return Inbox(mode, decoder, key_exprs=throttle.key_exprs, limit=limit, throttle=throttle)
 
     def _open_receiver(self, inbox: Inbox) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
         session = self._session
-        if isinstance(inbox, MaxRateInbox):
-            receiver: Receiver = MaxRateReceiver(session, inbox, self._reopen)
-        else:
-            receiver = Receiver(session, inbox)
+        downsampled = None
+        if inbox.throttle is not None:
+            downsampled = Downsampled(
+                session, inbox, inbox.throttle, prefix=self.prefix, open_session=self._reopen
+            )
+        receiver = Receiver(session, inbox, downsampled)
         self._receivers.add(receiver)
         if self.closed:  # closed by another thread in the meantime
             receiver.close()

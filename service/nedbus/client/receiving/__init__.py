@@ -1,7 +1,8 @@
 """The receiving side: from Zenoh's ring to the application, with every message counted."""
 
 from .decoder import Decoder
+from .downsampled import Downsampled
 from .inbox import Inbox, check_count
 from .layout_lookup import LayoutLookup, find_schemas
-from .max_rate import MaxRateInbox, MaxRateReceiver
 from .receiver import Receiver
+from .throttle import Throttle

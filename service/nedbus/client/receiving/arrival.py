@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -10,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import zenoh
 
 from nedbus import limits
-from nedbus.client.rate_gate import RateGate
 from nedbus.transport import RawSample
 from nedbus_msgs import Address, Codec, Provenance
 
 if TYPE_CHECKING:
+    from .throttle import Throttled
     from .writer_proxy import WriterProxy
 
 
@@ -41,9 +40,7 @@ class Stream:
     gap: int = 0  # messages lost before the next delivery
     # messages lost before one that was dropped or invalid; the next sample read reports them
     unreported: int = 0
-    gate: RateGate | None = None  # set with a maximum rate, once a downsampled message has arrived
-    # with a maximum rate, time of sending of the retained message [ns]
-    last_sent: float = -math.inf
+    throttled: Throttled | None = None  # of a reader with a maximum rate
 
 
 class DetachedSample(NamedTuple):

@@ -23,10 +23,10 @@ from nedbus.errors import ArgumentError, ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
 from nedbus.samples import Counts, Mode, Sample
 from nedbus.transport import RawSample
-from nedbus_msgs import AddressError, DecodeError
+from nedbus_msgs import Address, AddressError, DecodeError
 
 from . import streams
-from .arrival import NO_LAYOUTS, Arrival, Stream
+from .arrival import NO_LAYOUTS, Arrival, Stream, detach
 from .decoder import WAKE_UP, Decoder
 from .reorder import Reorder
 from .unread import Unread
@@ -34,6 +34,8 @@ from .writer_proxy import LossCounters, WriterProxy
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
+
+    from .throttle import Throttle
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +59,7 @@ class Inbox:
     """The messages of a subscription, from Zenoh's ring to the reader; thread-safe.
 
     `key_exprs`: what to subscribe to. `limit`: unread messages, None for the default.
+    `throttle`: the maximum rate of each stream, if there is one.
     `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
@@ -67,6 +70,7 @@ class Inbox:
         *,
         key_exprs: Sequence[str] = (),
         limit: int | None = None,
+        throttle: Throttle | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if mode not in get_args(Mode):
@@ -82,6 +86,7 @@ class Inbox:
         self.key_exprs = key_exprs
         self.name = ", ".join(key_exprs)
         self.decoder = decoder
+        self.throttle = throttle
         self._warned: set[str] = set()
         self._clock = clock
         self._lock = threading.RLock()  # reentrant, because log handlers may read the counts
@@ -146,7 +151,8 @@ class Inbox:
         with self._lock:
             opened = self.gaps.opened
             arrivals = self._reorder.accept([sample])
-            if len(arrivals) == 1 and not self._unread and not self._discards:
+            is_next = len(arrivals) == 1 and not self._unread and not self._discards
+            if is_next and self.throttle is None:
                 self._unread.arrived += 1
                 taken = self._start_reading(arrivals[0])
             else:
@@ -160,6 +166,36 @@ class Inbox:
         if self._ack_requests:
             self.acknowledge(drained=True)
         return taken
+
+    def put_last(self, batch: Sequence[RawSample]) -> None:
+        """Queue the last messages of streams that have delivered none yet; only with a throttle."""
+        if self.throttle is None:
+            raise ValueError("without a throttle")
+        received = clock.utc_ns()
+        last: list[Arrival] = []
+        with self._lock:
+            for raw in batch:
+                arrival = self._admit(raw, received)
+                if arrival is None or not arrival.payload:
+                    continue
+                key = self.throttle.key_of(arrival.stream.address)
+                stream = self.streams.open(key, self._clock())
+                if stream.throttled is None:
+                    stream.throttled = self.throttle.new_state()
+                if self.throttle.takes_last(stream.throttled, arrival):
+                    last.append(detach(arrival, retained=True))
+            self._add(last)
+        self.wake()
+
+    def has_downsampled(self, address: Address) -> bool:
+        """Return True if a downsampled message of a stream has arrived; only with a throttle."""
+        if self.throttle is None:
+            return False
+        with self._lock:
+            stream = self.streams.get(self.throttle.key_of(address))
+            if stream is None or stream.throttled is None:
+                return False
+            return stream.throttled.has_arrived
 
     def on_link_change(self) -> None:
         """Handle a link that broke or came back."""
@@ -348,7 +384,12 @@ class Inbox:
         return Arrival(stream, payload, raw, codec, 0, received, newer)
 
     def _queue(self, arrivals: list[Arrival]) -> None:
-        """Make messages readable."""
+        """Make messages readable that pass the throttle."""
+        if self.throttle is not None:
+            arrivals = self.throttle.passing(arrivals)
+        self._add(arrivals)
+
+    def _add(self, arrivals: list[Arrival]) -> None:
         if self._unread.add(arrivals):
             self._warn_once(self._limited)
         if self._discards:

@@ -26,6 +26,7 @@ from nedbus_msgs import ack_key
 
 from .arrival import Arrival
 from .decoder import WAKE_UP
+from .downsampled import Downsampled
 from .inbox import AckRequest, Inbox
 from .retransmission import Retransmission
 
@@ -59,10 +60,12 @@ class Receiver:
     """Declare advanced subscribers on an Inbox's key expressions, and put samples into the inbox until closed.
 
     In mode `every` it also requests retransmissions and answers acknowledgement requests.
-    With `history` the first samples are the last message of each publisher.
+    The first samples are the last message of each publisher; `downsampled` asks for them if there is a maximum rate.
     """
 
-    def __init__(self, session: Session, inbox: Inbox, *, history: bool = True) -> None:
+    def __init__(
+        self, session: Session, inbox: Inbox, downsampled: Downsampled | None = None
+    ) -> None:
         self._session, self._inbox = session, inbox
         self._errors = UnexpectedErrors(
             _log, "%s: unexpected error, discarded a batch (logged once)", inbox.name
@@ -70,9 +73,11 @@ class Receiver:
         self._changing = threading.Lock()
         self._closed = False
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
-        last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
+        last = zenoh.ext.HistoryConfig(max_samples=1) if downsampled is None else None
         self._rings: list[_Ring] = []
         self._undeclares: list[Callable[[], object]] = []
+        if downsampled is not None:
+            self._undeclares.append(downsampled.close)
         # this and the next two: mode `every` only
         self._take_queries: list[Callable[[], zenoh.Query | None]] = []
         self._take_link: Callable[[], zenoh.TransportEvent | None] = lambda: None
@@ -107,6 +112,8 @@ class Receiver:
             undo.pop_all()
         self._job = Job(self._poll)
         self._inbox.on_gap = self._job.wake
+        if downsampled is not None:
+            self.pump()  # last messages bypass the ring, so no reader may block on it
 
     def receive(self) -> bool:
         """Drain the rings into the inbox, except those that other threads drain; return True if all were empty then."""

@@ -12,7 +12,7 @@ from hypothesis import given
 
 from nedbus import Counts, Mode
 from nedbus.client.rate_gate import RATES, RateGate, rate_step
-from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateInbox
+from nedbus.client.receiving import Decoder, Inbox, LayoutLookup, Throttle
 from nedbus.errors import ArgumentError
 from nedbus.transport import RawSample
 from nedbus_msgs import Address, Selection, check_max_rate
@@ -22,11 +22,11 @@ from .raw_samples import KEY, drain, put, raw, timestamps
 DOWNSAMPLED = f"{KEY}/@rate/5"
 
 
-def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateInbox:
+def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> Inbox:
     """Return an empty queue."""
-    return MaxRateInbox(
-        mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate
-    )
+    throttle = Throttle(max_rate, Selection(), prefix="nedbus")
+    decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
+    return Inbox(mode, decoder, key_exprs=throttle.key_exprs, throttle=throttle)
 
 
 class Clock:
@@ -42,7 +42,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Use a fake clock for downsampling."""
     clock = Clock()
-    monkeypatch.setattr("nedbus.client.receiving.max_rate.time", clock)
+    monkeypatch.setattr("nedbus.client.receiving.throttle.time", clock)
     return clock
 
 
@@ -84,7 +84,8 @@ def test_gap_in_a_downsampled_stream_counts_as_lost() -> None:
 def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> None:
     """At half the lowest rate the reader omits every second message; each sample reports the losses before it."""
     queue = make_queue(mode, max_rate=0.5)
-    assert queue.rate == 1
+    assert queue.throttle is not None
+    assert queue.throttle.rate == 1
     taken = []
     for number in (0, 1, 2, 4, 5, 6, 7, 8):
         clock.now = number * 10**9
