@@ -2,7 +2,6 @@
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, cast
 
 from pydantic import (
@@ -54,11 +53,9 @@ class Message(BaseModel):
             definition = self.DEFINITION
             validation = definition.validation
             # A subclass may have its own validators, which only Pydantic runs.
-            row = validation.row_of(fields) if type(self) is definition.model else None
             values = None
-            if row is not None:
-                with suppress(OverflowError):
-                    values = validation.rounded_by_name(row)
+            if type(self) is definition.model:
+                values = validation.rounded(fields)
             if values is None:
                 super().__init__(**fields)
             elif len(fields) == len(values):

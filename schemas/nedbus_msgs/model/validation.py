@@ -57,10 +57,6 @@ class Validation:
             restored = _restored_values(kinds)
             self.flatten = compile_lambda(f"lambda row: ({self._flat},)", encode_text=encode_text)
             self.unflatten = compile_lambda(f"lambda row: ({restored},)", decode_text=decode_text)
-        steps = f"(values := validate(values)) and {passes} and values or None"
-        self._valid_row: Callable[[Values], Values | None] = compile_lambda(
-            f"lambda values: {steps}", validate=self.validate
-        )
 
     @cached_property
     def rounded_by_name(self) -> ByName:
@@ -70,9 +66,10 @@ class Validation:
     def check_row(self, values: Values) -> Values | None:
         """Validate the values of all fields without rounding; return None to let the model decide."""
         try:
-            return self._valid_row(values)
+            row: Values = self.validate(values)
         except ValidationError:
             return None
+        return row if self.passes_rules(row) else None
 
     def row_of(self, fields: Mapping[str, object]) -> Values | None:
         """Validate named fields, and return the values of all fields in order, as `check_row` does.
@@ -84,8 +81,19 @@ class Validation:
         if len(fields) != len(self._types):
             return None
         try:
-            return self._valid_row(self.values_of(fields))
-        except (ValidationError, KeyError):  # KeyError: an unknown field in place of a missing one
+            values = self.values_of(fields)
+        except KeyError:  # an unknown field in place of a missing one
+            return None
+        return self.check_row(values)
+
+    def rounded(self, fields: Mapping[str, object]) -> dict[str, object] | None:
+        """Validate named fields, and return the values of all fields, rounded to float32, as `row_of` does."""
+        row = self.row_of(fields)
+        if row is None:
+            return None
+        try:
+            return self.rounded_by_name(row)
+        except OverflowError:
             return None
 
     def unpack(self, packed: bytes) -> Values:

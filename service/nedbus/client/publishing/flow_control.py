@@ -62,47 +62,62 @@ class SharedWindow:
             return max(_MIN_WINDOW, WINDOW // len(self._unread), WINDOW - others)
 
 
-class ReaderProxies:
-    """A publisher's readers: matched, or disconnected and awaited until a deadline; closed ones are removed. No I/O."""
+class Readers:
+    """A publisher's readers, each with the time until which it is awaited [s]. No I/O.
+
+    A reader that replies is awaited without end, and one that closes is forgotten. One that is missing lost its link,
+    ended without closing, or is suspended: it is awaited for a limited time.
+    """
 
     def __init__(self) -> None:
-        self._matched: set[str] = set()
-        self.away: dict[str, float] = {}  # deadline of each reader that the publisher waits for
-        # readers that replied to the last request, in which an unknown reader froze
-        self._suspects: set[str] = set()
+        self._until: dict[str, float] = {}
 
     @property
     def is_empty(self) -> bool:
         """True if no reader is known."""
-        return not (self._matched or self.away)
+        return not self._until
+
+    @property
+    def is_one_missing(self) -> bool:
+        """True while a missing reader is awaited."""
+        return any(until != math.inf for until in self._until.values())
 
     def update(self, replies: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Update from all replies to a request. `replies`: whether each reader is closed. `now` in seconds.
 
         `froze`: the request ended long after its last reply, when the lease of a silent reader expired.
         """
-        if replies.keys() - self._matched - self.away.keys():
-            self.away.pop(_UNKNOWN, None)
-        gone = self._matched - replies.keys()
-        until = now + (TIMINGS.frozen_wait if froze else TIMINGS.return_wait)
-        if gone & self._suspects:  # it replied, but froze before Zenoh finalized its reply
-            until = self.away.pop(_UNKNOWN, until)
-        self._suspects = set()
-        if froze and not gone:
-            gone, self._suspects = {_UNKNOWN}, set(replies)
-        self._matched = {reader for reader, is_closed in replies.items() if not is_closed}
-        self.away = {
-            reader: end for reader, end in self.away.items() if end > now and reader not in replies
+        until = now + TIMINGS.return_wait
+        if froze:
+            until = now + TIMINGS.frozen_wait
+        if any(self._until.get(reader) != math.inf for reader in replies):
+            self._until.pop(_UNKNOWN, None)  # it is known now
+        missing = [
+            reader
+            for reader, end in self._until.items()
+            if end == math.inf and reader not in replies
+        ]
+        if missing:  # one may have frozen after a reply, before Zenoh finalized it
+            until = max(until, self._until.pop(_UNKNOWN, now))
+        elif froze:
+            missing = [_UNKNOWN]
+        self._until = {
+            reader: end
+            for reader, end in self._until.items()
+            if now < end < math.inf and reader not in replies
         }
-        self.away |= dict.fromkeys(gone, until)
+        for reader in missing:
+            self._until[reader] = until
+        for reader, is_closed in replies.items():
+            if not is_closed:
+                self._until[reader] = math.inf
 
     def wait_for_link(self, now: float) -> None:
-        """Extend all deadlines while the publisher has no router, or after its routers change. `now` in seconds."""
+        """Wait longer while the publisher has no router, or after its routers change. `now` in seconds."""
         if self.is_empty:
-            self.away[_UNKNOWN] = now
-        self.away = {
-            reader: max(until, now + TIMINGS.return_wait) for reader, until in self.away.items()
-        }
+            self._until[_UNKNOWN] = now
+        for reader, until in self._until.items():
+            self._until[reader] = max(until, now + TIMINGS.return_wait)
 
 
 class _Request:
@@ -152,7 +167,7 @@ class FlowControl:
         self._listener = listener
         self.cancelled = threading.Event()  # set to end a wait with ClosedError
         self._lock = threading.RLock()  # reentrant, because a signal handler may publish or close
-        self._readers = ReaderProxies()
+        self._readers = Readers()
         self._request: _Request | None = None
         self._next_request = self._polled = 0.0  # monotonic times [s]
         # number of messages received (False) and read by scripts (True)
@@ -248,7 +263,7 @@ class FlowControl:
         if self._needs_router and (not routers or routers != request.routers):
             self._readers.wait_for_link(now)
         self._request, self._next_request = None, now
-        if self._readers.away:
+        if self._readers.is_one_missing:
             # at once, before the frozen reader can return
             self._next_request += 0.0 if froze else _AWAY_PAUSE
         else:

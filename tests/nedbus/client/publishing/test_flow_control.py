@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from nedbus import limits
-from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, SharedWindow
+from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, Readers, SharedWindow
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
 from tests.waits import DEADLINE
@@ -323,6 +323,20 @@ def test_reader_suspended_while_replying_is_recognized(
     session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
     assert WINDOW / 2 < measure_lead(session, control, reader, TIMINGS.lease + back - 0.01) < LIMIT
     assert session.now < TIMINGS.lease + back + 20_000 / 10_000.0
+
+
+def test_change_of_routers_shortens_no_wait() -> None:
+    """A reader that replies stays known when routers change, and a suspended one is awaited for its full 90 s."""
+    readers = Readers()
+    readers.update({"a": False}, froze=False, now=0.0)
+    readers.wait_for_link(1.0)
+    assert not readers.is_one_missing
+    readers.update({}, froze=True, now=10.0)
+    readers.wait_for_link(11.0)
+    readers.update({}, froze=False, now=10.0 + TIMINGS.frozen_wait - 0.1)
+    assert readers.is_one_missing
+    readers.update({}, froze=False, now=10.0 + TIMINGS.frozen_wait)
+    assert readers.is_empty
 
 
 def test_reader_that_closes_while_another_is_stuck_does_not_delay_the_publisher(
