@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from nedbus.samples import Batch
-from nedbus_msgs import DEFAULT, Provenance, codec_of, provenance_of
-from nedbus_msgs.arrays import FEW_PAYLOADS, arrays_of
+from nedbus_msgs import DEFAULT, Definition, Message, Provenance, codec_of, provenance_of
+from nedbus_msgs.arrays import FEW_PAYLOADS, MessageArray, arrays_of
 
 from .arrival import Arrival, encoding_of
 from .decoder import Decoder
@@ -54,29 +55,46 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> R
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
     arrivals = decoder.define(arrivals)
     codec = arrivals[0].codec
-    definition = codec.definition if codec else DEFAULT
-    arrays = arrays_of(definition)
-    payloads = [arrival.payload for arrival in arrivals]
-    messages = arrays.decode_few(payloads) if codec and len(payloads) <= FEW_PAYLOADS else None
+    model: type[Message] = DEFAULT.model
+    messages = None
+    if codec is not None:
+        model = codec.definition.model
+        if len(arrivals) <= FEW_PAYLOADS:
+            payloads = [arrival.payload for arrival in arrivals]
+            messages = arrays_of(codec.definition).decode_few(payloads)
     if messages is None:
-        own, blank = codec_of(definition).size, bytes(codec_of(definition).size)
-        # Payloads of other layouts are replaced by an invalid placeholder, and decoded below.
-        messages, valid = arrays.decode(
-            b"".join([payload if len(payload) == own and codec else blank for payload in payloads])
-        )
-        if not valid.all():
-            for index in np.flatnonzero(~valid).tolist():
-                sample = decoder.decode(arrivals[index], rows=True)
-                if sample is not None:
-                    messages[index] = arrays.to_element(sample.message)
-                    valid[index] = True
-            messages = messages[valid]
-            arrivals = [arrivals[index] for index in np.flatnonzero(valid).tolist()]
+        messages, arrivals = _decode(arrivals, model.DEFINITION, decoder)
     streams = {arrival.stream.key: arrival.stream for arrival in arrivals}
-    if len(streams) == 1:
-        address_index = np.zeros(len(arrivals), np.intp)
-    else:
+    address_index = np.zeros(len(arrivals), np.intp)
+    if len(streams) > 1:
         indices = {key: index for index, key in enumerate(streams)}
-        address_index = np.array([indices[arrival.stream.key] for arrival in arrivals], np.intp)
+        address_index[:] = [indices[arrival.stream.key] for arrival in arrivals]
     addresses = tuple([stream.address for stream in streams.values()])
-    return ReceivedBatch(messages, definition.model, addresses, address_index, lost, arrivals)
+    return ReceivedBatch(messages, model, addresses, address_index, lost, arrivals)
+
+
+def _decode(
+    arrivals: Sequence[Arrival], definition: Definition[Any], decoder: Decoder
+) -> tuple[MessageArray, Sequence[Arrival]]:
+    """Decode arrivals; return the valid messages and their arrivals.
+
+    An invalid placeholder stands for a payload of another layout, which is decoded alone.
+    """
+    arrays = arrays_of(definition)
+    size = codec_of(definition).size
+    placeholder = bytes(size)
+    payloads = [
+        arrival.payload
+        if arrival.codec is not None and len(arrival.payload) == size
+        else placeholder
+        for arrival in arrivals
+    ]
+    messages, valid = arrays.decode(b"".join(payloads))
+    if valid.all():
+        return messages, arrivals
+    for index in np.flatnonzero(~valid).tolist():
+        sample = decoder.decode(arrivals[index], rows=True)
+        if sample is not None:
+            messages[index] = arrays.to_element(sample.message)
+            valid[index] = True
+    return messages[valid], [arrivals[index] for index in np.flatnonzero(valid).tolist()]

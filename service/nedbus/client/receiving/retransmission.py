@@ -4,6 +4,7 @@ The reasons for not using Zenoh's own recovery are in docs/explanation/decisions
 """
 
 import logging
+import math
 from contextlib import suppress
 from typing import Final
 
@@ -47,27 +48,35 @@ class Retransmission:
         # Unless the ring was drained, messages that heartbeats announce may still be in it.
         if drained and now >= self._next_heartbeat_poll:
             self._next_heartbeat_poll = now + _POLL
-            for (key, publisher), number in self._heartbeats.items():
-                self._inbox.on_heartbeat(key, publisher, number)
-            self._heartbeats = {
-                at: number for take, _ in self._followed for at, number in take().items()
-            }
+            self._poll_heartbeats()
         recovered_key = ""
         for writer, answers in list(self._open.items()):
-            recovered_key = self._take_answers(writer, answers, now) or recovered_key
+            if self._take_answers(writer, answers, now):
+                recovered_key = writer.stream.wire_key
         if self._inbox.may_recover:
             for writer in list(self._inbox.gaps.requesting):  # copied: other threads add to it
-                if len(self._open) >= limits.REQUESTS:
-                    break
-                if writer in self._open or not self._may_open(writer):
-                    continue
-                if (numbers := self._inbox.next_request(writer, now)) is not None:
-                    key, name = writer.stream.wire_key, writer.name
-                    with suppress(NedbusError):  # the session is closed
-                        self._open[writer] = RetransmitRequest(
-                            self._session, key, name, numbers, timeout=_TIMEOUT
-                        )
-        return recovered_key, _ANSWER_POLL if self._open else _POLL
+                if self._may_open(writer):
+                    self._request(writer, now)
+        pause = _ANSWER_POLL if self._open else _POLL
+        return recovered_key, pause
+
+    def _poll_heartbeats(self) -> None:
+        """Handle the heartbeats of the previous poll, whose messages have arrived by now, and take new ones."""
+        for (key, publisher), number in self._heartbeats.items():
+            self._inbox.on_heartbeat(key, publisher, number)
+        self._heartbeats = {}
+        for take, _ in self._followed:
+            self._heartbeats.update(take())
+
+    def _request(self, writer: WriterProxy, now: float) -> None:
+        numbers = self._inbox.next_request(writer, now)
+        if numbers is None:
+            return
+        key = writer.stream.wire_key
+        with suppress(NedbusError):  # the session is closed
+            self._open[writer] = RetransmitRequest(
+                self._session, key, writer.name, numbers, timeout=_TIMEOUT
+            )
 
     def close(self) -> None:
         """Drop all requests: an answer channel left full would block the session."""
@@ -76,30 +85,32 @@ class Retransmission:
             with suppress(zenoh.ZError):  # the session is already closed
                 undeclare()
 
-    def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
+    def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> bool:
+        """Put the answers to a request into the inbox; return True if messages became readable."""
         samples = {
             number: raw
             for number, raw in answers.poll().items()
             if len(raw.payload) <= PAYLOAD_LIMIT
         }
-        ended, key = answers.ended, writer.stream.wire_key
+        ended = answers.ended
         if ended:
             del self._open[writer]
         elif not samples:
-            return ""
+            return False
         with self._errors:
-            return (
-                key if self._inbox.on_retransmission(writer, samples, ended=ended, now=now) else ""
-            )
+            return self._inbox.on_retransmission(writer, samples, ended=ended, now=now)
+        # after an unexpected error
         self._open.pop(writer, None)
-        return (
-            key if self._inbox.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
-        )
+        return self._inbox.on_retransmission(writer, {}, ended=True, now=math.inf)
 
     def _may_open(self, writer: WriterProxy) -> bool:
-        share = [
-            other for other in self._open if bool(other.history_end) == bool(writer.history_end)
-        ]
+        """Return True if a further request is allowed: of all publishers, of its kind, and of its key."""
+        if writer in self._open or len(self._open) >= limits.REQUESTS:
+            return False
         if writer.history_end:
-            return len(share) < limits.HISTORY_REQUESTS
-        return sum(other.stream is writer.stream for other in share) < limits.REQUESTS_OF_KEY
+            histories = [other for other in self._open if other.history_end]
+            return len(histories) < limits.HISTORY_REQUESTS
+        of_key = [
+            other for other in self._open if other.stream is writer.stream and not other.history_end
+        ]
+        return len(of_key) < limits.REQUESTS_OF_KEY
