@@ -135,7 +135,8 @@ class _Errors(NamedTuple):
 class Estimator:
     """Estimator whose error wanders, drifts without GPS, and is reset.
 
-    `noise`: amplitude of the position error [m]; `aided`: position aiding never fails, and there are no resets.
+    `noise`: amplitude of the position error [m], 0 for the ground truth; `aided`: position aiding never fails, and
+    there are no resets.
     """
 
     def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
@@ -151,11 +152,23 @@ class Estimator:
     def fields(self, truth: Truth) -> Values:
         """Return the local position; its limits are infinite, as EKF2 sends them."""
         errors = self._errors(truth.time)
-        position = _add(truth.position, errors.position)
-        velocity = _add(truth.velocity, errors.velocity)
-        return {
-            **_motion(position, velocity, truth, has_origin=truth.has_origin),
+        x, y, z = _add(truth.position, errors.position)
+        vx, vy, vz = _add(truth.velocity, errors.velocity)
+        ax, ay, az = truth.acceleration
+        distance = max(0.1, -z)  # of the distance sensor, above flat ground
+        fields = {
             **self._deviations(errors),
+            "timestamp_sample": truth.sampled,
+            "x": x,
+            "y": y,
+            "z": z,
+            "vx": vx,
+            "vy": vy,
+            "vz": vz,
+            "z_deriv": vz,
+            "ax": ax,
+            "ay": ay,
+            "az": az,
             "xy_valid": errors.xy_valid,
             "v_xy_valid": errors.xy_valid,
             "z_valid": True,
@@ -181,7 +194,24 @@ class Estimator:
             "hagl_min": math.inf,
             "hagl_max_z": math.inf,
             "hagl_max_xy": math.inf,
+            "dist_bottom_valid": distance < _SENSOR_RANGE,
+            "dist_bottom": distance,
+            "dist_bottom_var": 0.01,
+            "delta_dist_bottom": 0.0,
         }
+        if distance < _SENSOR_RANGE:
+            fields["dist_bottom_sensor_bitfield"] = VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE
+        if truth.has_origin:
+            latitude, longitude, altitude = truth.origin
+            fields |= {
+                "xy_global": True,
+                "z_global": True,
+                "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6),
+                "ref_lat": latitude,
+                "ref_lon": longitude,
+                "ref_alt": altitude,
+            }
+        return fields
 
     def attitude(self, truth: Truth) -> Values:
         """Return the attitude of a multicopter whose thrust causes the acceleration, without wind."""
@@ -321,63 +351,6 @@ def _to_global(position: Vector, truth: Truth) -> tuple[float, float, float]:
     return *MapProjection(latitude, longitude).reproject(north, east), altitude - down
 
 
-def truth_fields(truth: Truth) -> Values:
-    """Return the groundtruth message: variances and limits are 0, as simulators send them."""
-    zeros: Values = {}
-    for name, kind in VehicleLocalPosition.DEFINITION.types.items():
-        zeros[name] = 0.0 if kind.is_float else 0
-    return {
-        **zeros,
-        **_motion(truth.position, truth.velocity, truth, has_origin=True),
-        "xy_valid": True,
-        "z_valid": True,
-        "v_xy_valid": True,
-        "v_z_valid": True,
-        "heading_good_for_control": True,
-        "dead_reckoning": False,
-        "delta_xy": (0.0, 0.0),
-        "delta_vxy": (0.0, 0.0),
-        "heading": truth.heading,
-        "unaided_heading": truth.heading,
-    }
-
-
-def _motion(position: Vector, velocity: Vector, truth: Truth, *, has_origin: bool) -> Values:
-    """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
-    x, y, z = position
-    vx, vy, vz = velocity
-    ax, ay, az = truth.acceleration
-    distance = max(0.1, -z)
-    fields: Values = {
-        "timestamp_sample": truth.sampled,
-        "x": x,
-        "y": y,
-        "z": z,
-        "vx": vx,
-        "vy": vy,
-        "vz": vz,
-        "z_deriv": vz,
-        "ax": ax,
-        "ay": ay,
-        "az": az,
-        "xy_global": has_origin,
-        "z_global": has_origin,
-        "dist_bottom_valid": distance < _SENSOR_RANGE,
-        "dist_bottom": distance,
-        "dist_bottom_var": 0.01,
-        "delta_dist_bottom": 0.0,
-    }
-    if distance < _SENSOR_RANGE:
-        fields["dist_bottom_sensor_bitfield"] = VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE
-    if has_origin:
-        latitude, longitude, altitude = truth.origin
-        fields["ref_timestamp"] = _BOOT + round(_ORIGIN_SET * 1e6)
-        fields["ref_lat"] = latitude
-        fields["ref_lon"] = longitude
-        fields["ref_alt"] = altitude
-    return fields
-
-
 def land_detected(truth: Truth) -> Values:
     """Return the land detector's output: landed until take-off."""
     vx, vy, vz = truth.velocity
@@ -511,11 +484,12 @@ def _streams(vehicle: str, seed: int, end: int) -> dict[Address, _Stream]:
     """Return all streams until tick `end`, in the order of their messages in one tick."""
     first = Estimator("ekf 0", seed, 0.3)
     second = Estimator("ekf 1", seed, 0.5)
+    groundtruth = Estimator("groundtruth", seed, 0.0, aided=True)
     ins = Estimator("ins", seed, 0.05, aided=True)
     origin = round(_ORIGIN_SET / _TICK)
     at = partial(Address, vehicle)
     return {
-        at("vehicle_local_position_groundtruth"): _Stream(range(0, end, 2), truth_fields),
+        at("vehicle_local_position_groundtruth"): _Stream(range(0, end, 2), groundtruth.fields),
         at("external_ins_local_position"): _Stream(range(1, end, 2), ins.fields),
         at("estimator_local_position", 0): _Stream(range(0, end, 50), first.fields),
         at("estimator_local_position", 1): _Stream(range(0, end, 50), second.fields),

@@ -202,6 +202,7 @@ def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPositi
             assert abs(message.x - true.x) < 3
             assert abs(message.z - true.z) < 3
     positions = streams["vehicle_local_position_groundtruth"]
+    assert {(message.eph, message.evh, message.xy_valid) for message in positions} == {(0, 0, True)}
     for before, after in itertools.pairwise(positions):
         mean = (before.vx + after.vx) / 2
         assert (after.x - before.x) / 0.02 == pytest.approx(mean, abs=0.01)

@@ -29,7 +29,7 @@ _TIMEOUT: Final = 3.0  # s without messages after which another publisher may us
 _EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
 # s during which messages may still arrive after a publisher's token is gone
 _SETTLE_TIME: Final = 1.0
-# s, or periods of the nominal rate if longer, after which a topic without messages is silent
+# s after which a topic without messages is silent; all nominal rates are 1 Hz or more
 _SILENCE: Final = 5.0
 _HINT: Final = "give each vehicle its own namespace or domain"
 
@@ -111,13 +111,9 @@ class Px4Stream:
 
     def is_silent(self, now: float) -> bool:
         """Return whether messages are overdue; never for topics without a nominal rate, which may pause."""
-        if self.unsupported is not None:
+        if self.unsupported is not None or not get_topic(self.address.topic).rate:
             return False
-        rate = get_topic(self.address.topic).rate
-        if rate <= 0:
-            return False
-        silence = now - max(self.since, self.last_message)
-        return silence >= max(_SILENCE, _SILENCE / rate)
+        return now - max(self.since, self.last_message) >= _SILENCE
 
     def is_expired(self, now: float) -> bool:
         """Return whether the key has no publisher, and no recent message that could be decoded."""
