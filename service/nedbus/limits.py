@@ -209,7 +209,8 @@ TIMESYNC_REQUESTS: Final = 10
 """TIMESYNC requests that may be unanswered. Beyond it the oldest is forgotten, and its answer ignored."""
 
 LOG_STREAM_PENDING: Final = 2**22
-"""Bytes of a ULog stream that wait for its file, until its first message. Beyond it no file is written."""
+"""Bytes of a ULog stream before its first message, 68,000 to 170,000 in real ones: they wait for its file, and are \
+kept in its state file. Beyond it neither is written."""
 
 DAMAGE_REASONS: Final = 100
 """Different reasons for damaged records of a ULog stream that are kept. Further ones count as "further damage"."""

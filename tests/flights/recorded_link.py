@@ -15,6 +15,7 @@ from nedbus.client import Health, PublisherRegistry, stream_state
 from nedbus.daemon.output import SourceOutput
 from nedbus.mavlink.parser import Received, new_parser, parse
 from nedbus.sources import Rejection, SourceMessage
+from nedbus.sources.mavlink.position_sender import BusAccess
 from nedbus.sources.mavlink.reader import LogReceiver
 from nedbus.sources.mavlink.source import _LinkSession
 from nedbus.sources.options import MavlinkOptions
@@ -60,6 +61,7 @@ def play(
         cast("Any", SimpleNamespace(send=lambda *_: None, peer=None, baud=None)),
         options,
         name="udp",
+        access=BusAccess(None, (), None, "nedbus"),
     )
     session._receiver = receiver = Receiver(options)
     checked = math.nan

@@ -144,6 +144,6 @@ def _describe_clients(name: str, system: SystemTraffic) -> Finding:
         f"system {client} component {component}" for client, component in system.log_clients
     )
     seen = f"sends its ULog stream to {list_names(clients)}"
-    advice = "PX4 streams to one client: it refuses 'nedbus serve' while another one receives, unless log=take"
+    advice = "PX4 streams to one client: it refuses 'nedbus serve' while another one receives"
     state: State = "ok" if system.sends_log_to_nedbus else "warning"
     return Finding("mavlink", name, state, seen, advice)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, cast
+from typing import TYPE_CHECKING, Final, cast
 from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 from pydantic import ValidationError
@@ -26,6 +26,9 @@ from .options import (
 )
 from .source import LiveSource, ReplaySource, Source
 
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
 
 @dataclass(frozen=True, slots=True)
 class SourceKind:
@@ -43,11 +46,9 @@ class SourceKind:
 
     def accepts(self, target: str) -> bool:
         """Return whether this target is allowed; "" means no target."""
-        return (
-            self.target is not None
-            if target
-            else self.target is None or self.target.startswith("[")
-        )
+        if target:
+            return self.target is not None
+        return self.target is None or self.target.startswith("[")
 
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
@@ -62,6 +63,8 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
         MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"
     ),
 }
+_KNOWN_KINDS: Final = f"choose from {', '.join(SOURCE_KINDS)}"
+_ESCAPED: Final = re.compile("%(3F|25)", re.IGNORECASE)  # in a path
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +85,13 @@ class SourceSpec:
         prefix: str = DEFAULT_PREFIX,
     ) -> Source:
         """Create the source for a service; raise ConfigError for an invalid target or file, or a missing extra."""
-        kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
-        # A pipe, socket or device may block forever, and cannot be read twice.
-        if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
-            raise ConfigError(
-                f"source {self.text!r}",
-                f"{path} is not a regular file; save the data to a file first",
-            )
+        kind = SOURCE_KINDS[self.kind]
+        if kind.target == "FILE":
+            path = Path(self.target).expanduser()
+            # A pipe, socket or device may block forever, and cannot be read twice.
+            if path.exists() and not path.is_file() and not path.is_dir():
+                reason = f"{path} is not a regular file; save the data to a file first"
+                raise ConfigError(f"source {self.text!r}", reason)
         make = getattr(import_optional(kind.extra, kind.module), kind.name)
         if isinstance(self.options, RecordedOptions | SimulatorOptions):
             return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
@@ -104,84 +107,95 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
     Raises ConfigError for an unknown kind, a missing target, or an unknown or invalid option.
     """
     text = source if isinstance(source, str) else _text_of_table(source)
-    kind_name, _, rest = text.partition(":")
-    kind = SOURCE_KINDS.get(kind_name)
+    where = f"source {text!r}"
+    name, _, rest = text.partition(":")
+    kind = SOURCE_KINDS.get(name)
     if kind is None:
-        path = rest if rest and "/" not in kind_name else text
-        kind_of_file = find_format(path.partition("?")[0])
-        hint = (
-            f"write {kind_of_file}:{path}"
-            if kind_of_file
-            else f"choose from {', '.join(SOURCE_KINDS)}"
-        )
-        raise ConfigError(f"source {text!r}", f"unknown kind {kind_name!r}; {hint}")
-    target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
+        raise ConfigError(where, f"unknown kind {name!r}; {_suggest(text)}")
+    target = rest
+    query = ""
+    if "?" in rest:
+        target, _, query = rest.rpartition("?")
     if not kind.accepts(target):
-        form = f"{kind_name}:{kind.target}" if kind.target else f"{kind_name}:?OPTION=VALUE"
-        raise ConfigError(f"source {text!r}", f"the target is missing or not allowed; write {form}")
+        form = f"{name}:{kind.target}" if kind.target else f"{name}:?OPTION=VALUE"
+        raise ConfigError(where, f"the target is missing or not allowed; write {form}")
+    options = _parse_options(kind, query, where)
+    if kind.target == "FILE":
+        target = _ESCAPED.sub(lambda match: unquote(match[0]), target)
+    return SourceSpec(text, name, target, options)
+
+
+def _suggest(text: str) -> str:
+    """Return what to write instead of a text of unknown kind: the kind of a file by its name, or a known kind."""
+    kind, _, rest = text.partition(":")
+    path = rest if rest and "/" not in kind else text
+    kind_of_file = find_format(path.partition("?")[0])
+    if kind_of_file:
+        return f"write {kind_of_file}:{path}"
+    return _KNOWN_KINDS
+
+
+def _parse_options(kind: SourceKind, query: str, where: str) -> Options:
+    """Parse OPTION=VALUE&OPTION=VALUE; raise ConfigError, which begins with `where`."""
     try:
         # Unlike in an HTML form, a plus is not a space.
-        pairs = parse_qsl(
-            query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query)
-        )
-        options = kind.options.model_validate(dict(pairs))
+        escaped = query.replace("+", "%2B")
+        pairs = parse_qsl(escaped, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError:
+        hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
+        reason = f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}"
+        raise ConfigError(where, reason) from None
+    values = dict(pairs)
+    try:
+        options = kind.options.model_validate(values)
     except ValidationError as exc:
         detail = exc.errors()[0]
         name = str(detail["loc"][0])
-        if (field := kind.options.model_fields.get(name)) is None:
-            reason = f"unknown option {name!r}; choose from {', '.join(kind.options.model_fields)}"
-        elif (
-            isinstance(cause := detail.get("ctx", {}).get("error"), AddressError)
-            and name == "topics"
-        ):
-            reason = str(cause)
-        else:
-            reason = f"{name}={detail['input']} is invalid; expected {field.description}"
-        raise ConfigError(f"source {text!r}", reason, key=name) from exc
-    except ValueError:
-        hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
-        raise ConfigError(
-            f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}"
-        ) from None
-    if len(dict(pairs)) < len(pairs):
-        raise ConfigError(f"source {text!r}", "an option occurs twice; remove one")
-    if kind.target == "FILE":
-        target = re.sub("%(3F|25)", lambda found: unquote(found[0]), target, flags=re.IGNORECASE)
-    return SourceSpec(text, kind_name, target, options)
+        raise ConfigError(where, _explain(kind, name, detail), key=name) from exc
+    if len(values) < len(pairs):
+        raise ConfigError(where, "an option occurs twice; remove one")
+    return options
+
+
+def _explain(kind: SourceKind, name: str, detail: "ErrorDetails") -> str:
+    """Return why the value of an option is invalid."""
+    fields = kind.options.model_fields
+    if name not in fields:
+        return f"unknown option {name!r}; choose from {', '.join(fields)}"
+    cause = detail.get("ctx", {}).get("error")
+    if name == "topics" and isinstance(cause, AddressError):
+        return str(cause)
+    return f"{name}={detail['input']} is invalid; expected {fields[name].description}"
 
 
 def _text_of_table(table: Mapping[str, object]) -> str:
     """Convert a table to the text of a source; raise ConfigError if the kind or target is missing or invalid."""
-    options = dict(table)
-    name = options.pop("kind", None)
+    values = dict(table)
+    if "kind" not in values:
+        raise ConfigError("source", f"kind is missing; {_KNOWN_KINDS}", key="")
+    name = values.pop("kind")
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        problem, key = (
-            ("kind is missing", "") if name is None else (f"unknown kind {name!r}", "kind")
-        )
-        raise ConfigError("source", f"{problem}; choose from {', '.join(SOURCE_KINDS)}", key=key)
+        raise ConfigError("source", f"unknown kind {name!r}; {_KNOWN_KINDS}", key="kind")
     target_name = (kind.target or "").strip("[]").lower()
-    target = options.pop(target_name, "")
+    target = values.pop(target_name, "")
     if not isinstance(target, str) or not kind.accepts(target):
         raise ConfigError(f"source {name!r}", f'it needs {target_name} = "..."', key=target_name)
-    return _join(str(name), target, {key: _text_of_value(value) for key, value in options.items()})
+    if kind.target == "FILE":
+        target = target.replace("%", "%25").replace("?", "%3F")
+    text = f"{name}:{target}"
+    if values:
+        options = {option: _text_of_value(value) for option, value in values.items()}
+        text += "?" + urlencode(options, safe=":,/+", quote_via=quote)
+    return text
 
 
 def _text_of_value(value: object) -> str:
     """Format the value of an option: 1 for true, NAME:VEHICLE,NAME:VEHICLE for a table."""
     if isinstance(value, Mapping):
-        return ",".join(f"{name}:{each}" for name, each in value.items())
+        return ",".join(f"{name}:{vehicle}" for name, vehicle in value.items())
     if isinstance(value, list | tuple):
         return ",".join(map(_text_of_value, value))
-    return str(int(value)) if isinstance(value, bool) else str(value)
-
-
-def _join(kind: str, target: str, options: Mapping[str, str]) -> str:
-    """Return the text of a source, with % and ? escaped in a path."""
-    path = (
-        target.replace("%", "%25").replace("?", "%3F")
-        if SOURCE_KINDS[kind].target == "FILE"
-        else target
-    )
-    query = urlencode(options, safe=":,/+", quote_via=quote)
-    return f"{kind}:{path}?{query}" if query else f"{kind}:{path}"
+    if isinstance(value, bool):
+        return str(int(value))
+    return str(value)

@@ -13,19 +13,22 @@ from nedbus_msgs.messages import VehicleLocalPosition, VehicleOdometry
 
 def _parse_vehicles(text: str) -> Mapping[str, str]:
     """Parse `NAME:VEHICLE,NAME:VEHICLE`."""
-    parts = [part.strip().rpartition(":") for part in text.split(",")]
-    vehicles = {name.strip("/"): vehicle for name, _, vehicle in parts}
-    for vehicle in vehicles.values():
-        check_vehicle(vehicle)
-    if "" in vehicles or len(vehicles) < len(parts):
-        raise ValueError(text)
+    vehicles: dict[str, str] = {}
+    for part in text.split(","):
+        name, _, vehicle = part.strip().rpartition(":")
+        name = name.strip("/")
+        if not name or name in vehicles:
+            raise ValueError(text)
+        vehicles[name] = check_vehicle(vehicle)
     return vehicles
 
 
 def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
     """Raise ValueError unless all names are MAVLink system ids and no vehicle occurs twice."""
-    is_valid = all(name.isdecimal() and 0 < int(name) < 256 for name in vehicles)
-    if not is_valid or len(set(vehicles.values())) < len(vehicles):
+    for name in vehicles:
+        if not name.isdecimal() or not 0 < int(name) < 256:
+            raise ValueError(vehicles)
+    if len(set(vehicles.values())) < len(vehicles):
         raise ValueError(vehicles)
     return vehicles
 
@@ -34,19 +37,28 @@ def _parse_topics(text: object) -> object:
     return parse_topics(text) if isinstance(text, str) else text
 
 
-_Origin = tuple[
-    Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
-    Annotated[float, Field(ge=-500, le=1e4)],
-]  # fmt: skip
-POSITION_TOPICS: Final = (
-    "vehicle_visual_odometry",
-    *(
-        topic.name
-        for topic in VehicleOdometry.TOPICS
-        if topic.name != "vehicle_visual_odometry" and not topic.instances
-    ),
-    *(topic.name for topic in VehicleLocalPosition.TOPICS if not topic.instances),
-)
+def _parse_speed(text: object) -> object:
+    return None if text == "max" else text
+
+
+def _parse_origin(text: object) -> object:
+    return text.split(",") if isinstance(text, str) else text
+
+
+def _parse_log(text: object) -> object:
+    return "" if text == "0" else text
+
+
+_Latitude = Annotated[float, Field(ge=-90, le=90)]
+_Longitude = Annotated[float, Field(ge=-180, le=180)]
+_Speed = Annotated[float, Field(ge=0.001, le=1000)]
+_Altitude = Annotated[float, Field(ge=-500, le=1e4)]
+_POSITIONS: Final = [
+    topic.name
+    for topic in (*VehicleOdometry.TOPICS, *VehicleLocalPosition.TOPICS)
+    if not topic.instances
+]
+POSITION_TOPICS: Final = tuple(dict.fromkeys(("vehicle_visual_odometry", *_POSITIONS)))
 """Topics of positions that can be sent into a vehicle."""
 
 _LAYOUTS: Final = tuple(dict.fromkeys((*RELEASES, *DEFAULT.layouts)))
@@ -74,10 +86,9 @@ class ReplayOptions(Options):
     """Options shared by all replays."""
 
     vehicle: Vehicle | None = Field(None, description="1 to 64 characters of A-Z a-z 0-9 _ -")
-    speed: Annotated[
-        Annotated[float, Field(ge=0.001, le=1000)] | None,
-        BeforeValidator(lambda text: None if text == "max" else text),
-    ] = Field(1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive")
+    speed: Annotated[_Speed | None, BeforeValidator(_parse_speed)] = Field(
+        1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive"
+    )
     wait: bool = Field(False, description="1 to wait for a subscriber before the start, or 0")
 
 
@@ -103,11 +114,11 @@ class SimulatorOptions(ReplayOptions):
     duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
         None, description="seconds, 0.01 to 1e8 (default: endless)"
     )
-    origin: Annotated[_Origin | None, BeforeValidator(lambda text: text and text.split(","))] = (
-        Field(
-            None,
-            description="LATITUDE,LONGITUDE,ALTITUDE of the take-off, degrees and metres (default: Zurich, as in PX4)",
-        )
+    origin: Annotated[
+        tuple[_Latitude, _Longitude, _Altitude] | None, BeforeValidator(_parse_origin)
+    ] = Field(
+        None,
+        description="LATITUDE,LONGITUDE,ALTITUDE of the take-off, degrees and metres (default: Zurich, as in PX4)",
     )
 
 
@@ -160,15 +171,9 @@ class MavlinkOptions(Options):
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"
     )
-    log: Annotated[
-        frozenset[Literal["1", "armed", "take"]],
-        BeforeValidator(
-            lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text
-        ),
-    ] = Field(
-        frozenset(),
-        description="1 to request the ULog stream of each PX4 on the link, armed to start it in flight as well, take"
-        " to end the stream of another client, or armed,take",
+    log: Annotated[Literal["", "1", "armed"], BeforeValidator(_parse_log)] = Field(
+        "",
+        description="1 to request the ULog stream of each PX4 on the link, armed to start it in flight as well, or 0",
     )
     header: Annotated[float, Field(ge=1, le=600)] | None = Field(
         None,
@@ -197,4 +202,6 @@ class MavlinkOptions(Options):
     @property
     def chosen_topics(self) -> Collection[str] | None:
         """The topics to deliver; all of them if `log` is set and `topics` is not."""
-        return None if self.log and not self.topics else super().chosen_topics
+        if self.log and not self.topics:
+            return None
+        return super().chosen_topics

@@ -9,11 +9,10 @@ The vehicle takes off and flies figures of eight at 20 m; each lap of 120 s has 
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from itertools import count
 from random import Random
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from nedbus.errors import SourceError
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, MESSAGES, Address, VehicleLocalPosition
@@ -23,6 +22,7 @@ from .options import SimulatorOptions
 from .source import ReplayRun, SourceMessage
 
 _TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
+_ENDLESS: Final = sys.maxsize  # ticks of a flight without an end: 2.9 billion years
 _LAP: Final = 120.0  # s
 _OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
 _ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
@@ -68,18 +68,32 @@ class Truth(NamedTuple):
     heading: float
     origin: tuple[float, float, float]
 
+    @property
+    def has_origin(self) -> bool:
+        """Whether the vehicle knows the origin."""
+        return self.time >= _ORIGIN_SET
+
+    @property
+    def sampled(self) -> int:
+        """Time of the sensor data of an estimate [us]."""
+        return self.timestamp - _DELAY
+
 
 def truth_at(time: float, direction: float, origin: tuple[float, float, float]) -> Truth:
     """Return the ground truth at a time since the start [s]; `direction` rotates the figures [rad]."""
-    positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
-    axes = list(zip(*positions, strict=True))
-    velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
-    acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
-    moving = math.hypot(velocity[0], velocity[1]) > 0.5
-    heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(direction + math.pi / 4)
-    return Truth(
-        time, _BOOT + round(time * 1e6), positions[1], velocity, acceleration, heading, origin
+    before = _position(time - _STEP, direction)
+    position = _position(time, direction)
+    after = _position(time + _STEP, direction)
+    velocity = tuple((new - old) / (2 * _STEP) for old, new in zip(before, after, strict=True))
+    acceleration = tuple(
+        (new - 2 * now + old) / _STEP**2
+        for old, now, new in zip(before, position, after, strict=True)
     )
+    heading = wrap(direction + math.pi / 4)
+    if math.hypot(velocity[0], velocity[1]) > 0.5:
+        heading = math.atan2(velocity[1], velocity[0])
+    timestamp = _BOOT + round(time * 1e6)
+    return Truth(time, timestamp, position, velocity, acceleration, heading, origin)
 
 
 def _position(time: float, direction: float) -> Vector:
@@ -89,196 +103,291 @@ def _position(time: float, direction: float) -> Vector:
     # The phase starts slowly near the end of the climb, and then advances by one figure per minute.
     late = max(0.0, time - 8.0)
     phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
-    along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
-    cos, sin = math.cos(direction), math.sin(direction)
+    along = _SIZE * math.sin(phase)
+    across = _SIZE / 2 * math.sin(2 * phase)
+    cos = math.cos(direction)
+    sin = math.sin(direction)
     down = -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2)
     return along * cos - across * sin, along * sin + across * cos, down
 
 
-class _State(NamedTuple):
-    """State of an estimate: errors [SI units], time in dead reckoning [s], validity, counts and deltas of resets."""
+class _Errors(NamedTuple):
+    """Errors of an estimate [SI units], time in dead reckoning [s], and number and last delta of each kind of reset."""
 
-    position: tuple[float, float, float]
-    velocity: tuple[float, float, float]
-    heading: float
-    dead_reckoning: float
-    xy_valid: bool
-    counters: Mapping[str, int]
-    deltas: Mapping[str, Any]
+    position: Vector
+    velocity: Vector = (0.0, 0.0, 0.0)
+    heading: float = 0.0
+    dead_reckoning: float = 0.0
+    xy_resets: int = 0  # of position and velocity
+    delta_xy: Vector = (0.0, 0.0)
+    delta_vxy: Vector = (0.0, 0.0)
+    z_resets: int = 0
+    delta_z: float = 0.0
+    heading_resets: int = 0
+    delta_heading: float = 0.0
+
+    @property
+    def xy_valid(self) -> bool:
+        """Whether the horizontal estimate is valid."""
+        return self.dead_reckoning < _VALID_DEAD_RECKONING
 
 
 class Estimator:
     """Estimator whose error wanders, drifts without GPS, and is reset.
 
-    `noise`: amplitude of the position error [m]; `aided`: position aiding never fails, and there are no resets.
+    `noise`: amplitude of the position error [m], 0 for the ground truth; `aided`: position aiding never fails, and
+    there are no resets.
     """
 
     def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
         random = Random(f"{seed}/{name}")
-        self._noise, self._aided = noise, aided
+        self._noise = noise
+        self._aided = aided
         self._phases = [random.uniform(0.0, math.tau) for _ in range(3)]
-        direction = random.uniform(-math.pi, math.pi)
-        self._north, self._east = math.cos(direction), math.sin(direction)  # direction of the drift
-        self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
+        direction = random.uniform(-math.pi, math.pi)  # of the drift
+        self._north = math.cos(direction)
+        self._east = math.sin(direction)
+        self._heading_error = random.choice((-1, 1)) * random.uniform(0.1, 0.3)
 
     def fields(self, truth: Truth) -> Values:
         """Return the local position; its limits are infinite, as EKF2 sends them."""
-        state = self._at(truth.time)
-        position = [
-            value + error for value, error in zip(truth.position, state.position, strict=True)
-        ]
-        velocity = [
-            value + error for value, error in zip(truth.velocity, state.velocity, strict=True)
-        ]
-        return {
-            **_motion(position, velocity, truth, has_origin=truth.time >= _ORIGIN_SET),
-            **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
-            **{f"delta_{name}": delta for name, delta in state.deltas.items()},
-            **{f"{name}_reset_counter": count for name, count in state.counters.items()},
-            "heading": wrap(truth.heading + state.heading), "heading_var": 0.001 + state.heading**2,
+        errors = self._errors(truth.time)
+        x, y, z = _add(truth.position, errors.position)
+        vx, vy, vz = _add(truth.velocity, errors.velocity)
+        ax, ay, az = truth.acceleration
+        distance = max(0.1, -z)  # of the distance sensor, above flat ground
+        fields = {
+            **self._deviations(errors),
+            "timestamp_sample": truth.sampled,
+            "x": x,
+            "y": y,
+            "z": z,
+            "vx": vx,
+            "vy": vy,
+            "vz": vz,
+            "z_deriv": vz,
+            "ax": ax,
+            "ay": ay,
+            "az": az,
+            "xy_valid": errors.xy_valid,
+            "v_xy_valid": errors.xy_valid,
+            "z_valid": True,
+            "v_z_valid": True,
+            "xy_reset_counter": errors.xy_resets,
+            "delta_xy": errors.delta_xy,
+            "vxy_reset_counter": errors.xy_resets,
+            "delta_vxy": errors.delta_vxy,
+            "z_reset_counter": errors.z_resets,
+            "delta_z": errors.delta_z,
+            "delta_vz": 0.0,
+            "heading_reset_counter": errors.heading_resets,
+            "delta_heading": errors.delta_heading,
+            "heading": wrap(truth.heading + errors.heading),
+            "heading_var": 0.001 + errors.heading**2,
             "unaided_heading": truth.heading,
-            "heading_good_for_control": state.counters["heading"] > 0 or self._aided, "tilt_var": 1e-4,
-            **self._deviations(state),
-            "evh": self._noise / 2 + 0.05 * state.dead_reckoning, "evv": self._noise / 2,
-            **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
-        }  # fmt: skip
+            "heading_good_for_control": self._aided or errors.heading_resets > 0,
+            "tilt_var": 1e-4,
+            "evh": self._noise / 2 + 0.05 * errors.dead_reckoning,
+            "evv": self._noise / 2,
+            "vxy_max": math.inf,
+            "vz_max": math.inf,
+            "hagl_min": math.inf,
+            "hagl_max_z": math.inf,
+            "hagl_max_xy": math.inf,
+            "dist_bottom_valid": distance < _SENSOR_RANGE,
+            "dist_bottom": distance,
+            "dist_bottom_var": 0.01,
+            "delta_dist_bottom": 0.0,
+        }
+        if distance < _SENSOR_RANGE:
+            fields["dist_bottom_sensor_bitfield"] = VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE
+        if truth.has_origin:
+            latitude, longitude, altitude = truth.origin
+            fields |= {
+                "xy_global": True,
+                "z_global": True,
+                "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6),
+                "ref_lat": latitude,
+                "ref_lon": longitude,
+                "ref_alt": altitude,
+            }
+        return fields
 
     def attitude(self, truth: Truth) -> Values:
         """Return the attitude of a multicopter whose thrust causes the acceleration, without wind."""
-        state, (ax, ay, az) = self._at(truth.time), truth.acceleration
-        cos, sin = math.cos(truth.heading), math.sin(truth.heading)
+        errors = self._errors(truth.time)
+        ax, ay, az = truth.acceleration
+        cos = math.cos(truth.heading)
+        sin = math.sin(truth.heading)
         forward = ax * cos + ay * sin
         right = ay * cos - ax * sin
         up = _GRAVITY - az
         roll = math.atan2(right, math.hypot(forward, up))
-        q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + state.heading)
-        delta = euler_to_quaternion(0.0, 0.0, state.deltas["heading"])
+        pitch = math.atan2(-forward, up)
         return {
-            "timestamp_sample": truth.timestamp - _DELAY,
-            "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"],
-        }  # fmt: skip
+            "timestamp_sample": truth.sampled,
+            "q": euler_to_quaternion(roll, pitch, truth.heading + errors.heading),
+            "delta_q_reset": euler_to_quaternion(0.0, 0.0, errors.delta_heading),
+            "quat_reset_counter": errors.heading_resets,
+        }
 
     def global_fields(self, truth: Truth) -> Values:
         """Return the global position, which the vehicle publishes only after the origin is known."""
-        state = self._at(truth.time)
-        x, y, z = (
-            value + error for value, error in zip(truth.position, state.position, strict=True)
-        )
-        (latitude, longitude) = MapProjection(*truth.origin[:2]).reproject(x, y)
-        altitude = truth.origin[2]
+        errors = self._errors(truth.time)
+        position = _add(truth.position, errors.position)
+        latitude, longitude, altitude = _to_global(position, truth)
         return {
-            "timestamp_sample": truth.timestamp - _DELAY,
-            "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
-            "lat_lon_valid": state.xy_valid, "alt_valid": True, "delta_alt": -state.deltas["z"], "delta_terrain": 0.0,
-            "lat_lon_reset_counter": state.counters["xy"], "alt_reset_counter": state.counters["z"],
-            **self._deviations(state),
-            "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
-        }  # fmt: skip
+            **self._deviations(errors),
+            "timestamp_sample": truth.sampled,
+            "lat": latitude,
+            "lon": longitude,
+            "alt": altitude,
+            "alt_ellipsoid": altitude,
+            "lat_lon_valid": errors.xy_valid,
+            "alt_valid": True,
+            "delta_alt": -errors.delta_z,
+            "delta_terrain": 0.0,
+            "lat_lon_reset_counter": errors.xy_resets,
+            "alt_reset_counter": errors.z_resets,
+            "terrain_alt": truth.origin[2],
+            "terrain_alt_valid": -position[2] < _SENSOR_RANGE,
+        }
 
     def status(self, truth: Truth) -> Values:
         """Return the status: take-off, then a mission; while the position is invalid, a failsafe in altitude mode."""
-        failsafe, is_mission = not self._at(truth.time).xy_valid, truth.time >= _CLIMB
-        flown = (
-            _Status.NAVIGATION_STATE_AUTO_MISSION
-            if is_mission
-            else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
-        )
-        mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
+        intended = _Status.NAVIGATION_STATE_AUTO_MISSION
+        if truth.time < _CLIMB:
+            intended = _Status.NAVIGATION_STATE_AUTO_TAKEOFF
+        failsafe = not self._errors(truth.time).xy_valid
+        mode = intended
+        if failsafe:
+            mode = _Status.NAVIGATION_STATE_ALTCTL
         return {
-            "armed_time": _BOOT - 1_000_000, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
-            "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
-            "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
-            "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
-        }  # fmt: skip
+            "armed_time": _BOOT - 1_000_000,
+            "takeoff_time": _BOOT,
+            "arming_state": _Status.ARMING_STATE_ARMED,
+            "nav_state": mode,
+            "nav_state_display": mode,
+            "nav_state_user_intention": intended,
+            "failsafe": failsafe,
+            "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING,
+            "system_type": 2,
+            "system_id": 1,
+            "component_id": 1,
+            "safety_off": True,
+            "power_input_valid": True,
+            "pre_flight_checks_pass": True,
+        }
 
-    def _at(self, time: float) -> _State:
-        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + _TICK / 2, _LAP)
-        outages, steps, alignments = (
-            int(lap) + (lap_time >= end) for end in (_OUTAGE[1], _Z_RESET, _HEADING_RESET)
-        )
-        dead_reckoning = lap_time - _OUTAGE[0] if _OUTAGE[0] <= lap_time < _OUTAGE[1] else 0.0
-        moved, speed = self._drift(dead_reckoning)
-        corrected, slowed = self._drift(_OUTAGE[0] - _OUTAGE[1] if outages else 0.0)
+    def _errors(self, time: float) -> _Errors:
+        """Return the errors at a time since the start [s]; without aiding, with the events of each lap."""
         x, y, z = (
-            self._noise * (math.sin(time / 7.0 + each) + math.sin(time / 2.3 - each))
-            for each in self._phases
+            self._noise * (math.sin(time / 7.0 + phase) + math.sin(time / 2.3 - phase))
+            for phase in self._phases
         )
-        return _State(
-            position=(x + moved[0], y + moved[1], z + _Z_STEP * (steps % 2)),
-            velocity=(*speed, 0.0),
-            heading=0.0 if _HEADING_RESET <= lap_time < _HEADING_DISTURBED else self._heading_error,
+        if self._aided:
+            return _Errors((x, y, z))
+        lap, lap_time = divmod(time + _TICK / 2, _LAP)
+        xy_resets = int(lap) + (lap_time >= _OUTAGE[1])
+        z_resets = int(lap) + (lap_time >= _Z_RESET)
+        heading_resets = int(lap) + (lap_time >= _HEADING_RESET)
+
+        dead_reckoning = 0.0
+        if _OUTAGE[0] <= lap_time < _OUTAGE[1]:
+            dead_reckoning = lap_time - _OUTAGE[0]
+        distance, speed = _drift(dead_reckoning)
+        corrected_distance = corrected_speed = 0.0
+        if xy_resets:
+            corrected_distance, corrected_speed = _drift(_OUTAGE[1] - _OUTAGE[0])
+
+        delta_z = 0.0
+        if z_resets:
+            delta_z = -_Z_STEP
+        if z_resets % 2:
+            z += _Z_STEP
+            delta_z = _Z_STEP
+
+        heading = self._heading_error
+        if _HEADING_RESET <= lap_time < _HEADING_DISTURBED:
+            heading = 0.0
+        delta_heading = 0.0
+        if heading_resets:
+            delta_heading = -self._heading_error
+        return _Errors(
+            position=(x + distance * self._north, y + distance * self._east, z),
+            velocity=(speed * self._north, speed * self._east, 0.0),
+            heading=heading,
             dead_reckoning=dead_reckoning,
-            xy_valid=dead_reckoning < _VALID_DEAD_RECKONING,
-            counters={"xy": outages, "z": steps, "vxy": outages, "vz": 0, "heading": alignments},
-            deltas={
-                "xy": (-corrected[0], -corrected[1]), "vxy": slowed, "vz": 0.0,
-                "z": _Z_STEP * (1 if steps % 2 else -1) if steps else 0.0,
-                "heading": -self._heading_error if alignments else 0.0,
-            },
-        )  # fmt: skip
+            xy_resets=xy_resets,
+            delta_xy=(-corrected_distance * self._north, -corrected_distance * self._east),
+            delta_vxy=(-corrected_speed * self._north, -corrected_speed * self._east),
+            z_resets=z_resets,
+            delta_z=delta_z,
+            heading_resets=heading_resets,
+            delta_heading=delta_heading,
+        )
 
-    def _drift(self, seconds: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the errors of position and velocity after `seconds` of dead reckoning."""
-        moved, speed = _DRIFT * seconds**2, 2 * _DRIFT * seconds
-        return (moved * self._north, moved * self._east), (speed * self._north, speed * self._east)
-
-    def _deviations(self, state: _State) -> Values:
+    def _deviations(self, errors: _Errors) -> Values:
         return {
-            "eph": self._noise * 2 + _DRIFT * state.dead_reckoning**2, "epv": self._noise * 3,
-            "dead_reckoning": state.dead_reckoning > 0,
-        }  # fmt: skip
+            "eph": self._noise * 2 + _DRIFT * errors.dead_reckoning**2,
+            "epv": self._noise * 3,
+            "dead_reckoning": errors.dead_reckoning > 0,
+        }
 
 
-def truth_fields(truth: Truth) -> Values:
-    """Return the groundtruth message: variances and limits are 0, as simulators send them."""
-    return {
-        **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
-        **_motion(truth.position, truth.velocity, truth, has_origin=True),
-        **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
-        "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
-        "heading": truth.heading, "unaided_heading": truth.heading,
-    }  # fmt: skip
+def _add(true: Vector, error: Vector) -> Vector:
+    return tuple(value + deviation for value, deviation in zip(true, error, strict=True))
 
 
-def _motion(
-    position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool
-) -> Values:
-    """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
-    latitude, longitude, altitude = truth.origin if has_origin else (math.nan,) * 3
-    names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
-    in_range = distance < _SENSOR_RANGE
-    return {
-        "timestamp_sample": truth.timestamp - _DELAY,
-        **dict(zip(names, (*position, *velocity, *truth.acceleration), strict=True)), "z_deriv": velocity[2],
-        "xy_global": has_origin, "z_global": has_origin,
-        "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6) if has_origin else 0,
-        "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
-        "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
-        "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
-        "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,
-    }  # fmt: skip
+def _drift(seconds: float) -> tuple[float, float]:
+    """Return the errors of position [m] and velocity [m/s] after `seconds` of dead reckoning."""
+    return _DRIFT * seconds**2, 2 * _DRIFT * seconds
+
+
+def _to_global(position: Vector, truth: Truth) -> tuple[float, float, float]:
+    """Return latitude, longitude [deg] and altitude [m] of a local position."""
+    north, east, down = position
+    latitude, longitude, altitude = truth.origin
+    return *MapProjection(latitude, longitude).reproject(north, east), altitude - down
 
 
 def land_detected(truth: Truth) -> Values:
     """Return the land detector's output: landed until take-off."""
-    (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
+    vx, vy, vz = truth.velocity
+    landed = truth.position[2] > -0.1
     return {
-        **dict.fromkeys(("landed", "maybe_landed", "ground_contact", "at_rest"), landed),
-        "vertical_movement": abs(vz) > 0.5, "horizontal_movement": math.hypot(vx, vy) > 1.5,
+        "landed": landed,
+        "maybe_landed": landed,
+        "ground_contact": landed,
+        "at_rest": landed,
+        "vertical_movement": abs(vz) > 0.5,
+        "horizontal_movement": math.hypot(vx, vy) > 1.5,
         "close_to_ground_or_skipped_check": truth.position[2] > -1.0,
-    }  # fmt: skip
+    }
 
 
 def home(truth: Truth) -> Values:
     """Return the home position, with global coordinates once the origin is known."""
-    known = truth.time >= _ORIGIN_SET
-    latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
-    return {
-        "lat": latitude, "lon": longitude, "alt": altitude,
-        "x": 0.0, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": truth.heading,
-        "valid_hpos": known, "valid_alt": known, "valid_lpos": True, "valid_attitude": True,
-        "update_count": 1 + known,
-    }  # fmt: skip
+    fields: Values = {
+        "x": 0.0,
+        "y": 0.0,
+        "z": 0.0,
+        "roll": 0.0,
+        "pitch": 0.0,
+        "yaw": truth.heading,
+        "valid_lpos": True,
+        "valid_attitude": True,
+        "update_count": 1,
+    }
+    if truth.has_origin:
+        latitude, longitude, altitude = truth.origin
+        fields["lat"] = latitude
+        fields["lon"] = longitude
+        fields["alt"] = altitude
+        fields["valid_hpos"] = True
+        fields["valid_alt"] = True
+        fields["update_count"] = 2
+    return fields
 
 
 def battery(truth: Truth) -> Values:
@@ -286,101 +395,134 @@ def battery(truth: Truth) -> Values:
     discharged = _CURRENT * (truth.time % _ENDURANCE) / 3.6
     remaining = 1.0 - discharged / _CAPACITY
     return {
-        "connected": True, "id": 1, "scale": 1.0,
-        "voltage_v": 14.0 + 2.8 * remaining, "current_a": _CURRENT, "current_average_a": _CURRENT,
-        "discharged_mah": discharged, "remaining": remaining, "capacity": round(_CAPACITY),
-        "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0, "cell_count": 4,
-    }  # fmt: skip
+        "connected": True,
+        "id": 1,
+        "scale": 1.0,
+        "voltage_v": 14.0 + 2.8 * remaining,
+        "current_a": _CURRENT,
+        "current_average_a": _CURRENT,
+        "discharged_mah": discharged,
+        "remaining": remaining,
+        "capacity": round(_CAPACITY),
+        "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT,
+        "temperature": 30.0,
+        "cell_count": 4,
+    }
 
 
 def gps(truth: Truth) -> Values:
     """Return a noisy GNSS fix, or no fix before the origin is set and during a GPS outage."""
-    time, is_started = truth.time, truth.time >= _ORIGIN_SET
-    fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
-    noise = [0.3 * math.sin(time * rate) for rate in (1.7, 2.3, 3.1)]
-    north, east, down = (value + error for value, error in zip(truth.position, noise, strict=True))
-    latitude, longitude = (
-        MapProjection(*truth.origin[:2]).reproject(north, east) if fix else (math.nan, math.nan)
-    )
-    altitude = truth.origin[2] - down if fix else math.nan
-    vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
-    return {
-        "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
-        "latitude_deg": latitude, "longitude_deg": longitude,
-        "altitude_msl_m": altitude, "altitude_ellipsoid_m": altitude,
-        "eph": 0.9 if fix else 100.0, "epv": 1.8 if fix else 100.0, "s_variance_m_s": 0.4 if fix else 100.0,
-        "hdop": 0.7 if fix else 100.0, "vdop": 1.1 if fix else 100.0, "satellites_used": 14 if fix else 0,
-        "vel_ned_valid": fix, "vel_n_m_s": vx, "vel_e_m_s": vy, "vel_d_m_s": vz,
-        "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
-        "time_utc_usec": _BOOT_UTC + truth.timestamp if is_started else 0,
-    }  # fmt: skip
+    fields: Values = {"device_id": 1}
+    if truth.has_origin:
+        fields["time_utc_usec"] = _BOOT_UTC + truth.timestamp
+    is_outage = _OUTAGE[0] <= truth.time % _LAP < _OUTAGE[1]
+    if is_outage or not truth.has_origin:
+        deviations = dict.fromkeys(("eph", "epv", "s_variance_m_s", "hdop", "vdop"), 100.0)
+        return {**fields, **deviations, "fix_type": _Gps.FIX_TYPE_NONE}
+
+    noise = tuple(0.3 * math.sin(truth.time * rate) for rate in (1.7, 2.3, 3.1))
+    latitude, longitude, altitude = _to_global(_add(truth.position, noise), truth)
+    vx, vy, vz = truth.velocity
+    return fields | {
+        "fix_type": _Gps.FIX_TYPE_3D,
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "altitude_msl_m": altitude,
+        "altitude_ellipsoid_m": altitude,
+        "eph": 0.9,
+        "epv": 1.8,
+        "s_variance_m_s": 0.4,
+        "hdop": 0.7,
+        "vdop": 1.1,
+        "satellites_used": 14,
+        "vel_ned_valid": True,
+        "vel_n_m_s": vx,
+        "vel_e_m_s": vy,
+        "vel_d_m_s": vz,
+        "vel_m_s": math.hypot(vx, vy),
+        "cog_rad": math.atan2(vy, vx),
+    }
 
 
-Fields = Callable[[Truth], Values]  # except `timestamp`
-Streams = dict[Address, tuple[range, Fields]]  # the ticks and the fields of the messages
+class _Stream(NamedTuple):
+    """Ticks at which a message is sent, and its fields that differ from "not provided", without `timestamp`."""
+
+    ticks: range
+    fields: Callable[[Truth], Values]
 
 
 def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
     """Start a flight, endless without `duration`; raise SourceError if no requested topic is simulated."""
-    vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
-    ticks = None if options.duration is None else round(options.duration / _TICK)
-    streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)
-    chosen = {
-        at: each
-        for at, each in streams.items()
-        if each[0] and (topics is None or at.topic in topics)
-    }
+    vehicle = options.vehicle or default_vehicle
+    end = _ENDLESS
+    if options.duration is not None:
+        end = round(options.duration / _TICK)
+    streams = _streams(vehicle, options.seed, end)
+    topics = options.chosen_topics
+    chosen = {}
+    for address, stream in streams.items():
+        if stream.ticks and (topics is None or address.topic in topics):
+            chosen[address] = stream
     if not chosen:
         asked = ", ".join(sorted(topics or ()))
         known = ", ".join(sorted({address.topic for address in streams}))
         raise SourceError("sim", f"a simulated vehicle has no {asked}; choose from {known}")
-    total = None if ticks is None else sum(len(ticks) for ticks, _ in chosen.values())
-    length = "endless" if ticks is None else f"{total} messages, {ticks * _TICK:g} s"
+    total = None
+    length = "endless"
+    if options.duration is not None:
+        total = sum(len(stream.ticks) for stream in chosen.values())
+        length = f"{total} messages, {end * _TICK:g} s"
     return ReplayRun(
-        messages=_messages(chosen, options.seed, ticks, options.origin or _REFERENCE),
+        messages=_messages(chosen, end, options),
         addresses=dict.fromkeys(sorted(chosen, key=lambda address: address.topic != DEFAULT_TOPIC)),
         total=total,
         summary=f"vehicle {vehicle}, seed {options.seed}, {length}",
     )
 
 
-def _streams(vehicle: str, seed: int, end: int) -> Streams:
-    """Return the ticks and the fields of all streams, in the order of their messages in one tick."""
-    first, second = (Estimator(f"ekf {each}", seed, noise) for each, noise in enumerate((0.3, 0.5)))
+def _streams(vehicle: str, seed: int, end: int) -> dict[Address, _Stream]:
+    """Return all streams until tick `end`, in the order of their messages in one tick."""
+    first = Estimator("ekf 0", seed, 0.3)
+    second = Estimator("ekf 1", seed, 0.5)
+    groundtruth = Estimator("groundtruth", seed, 0.0, aided=True)
     ins = Estimator("ins", seed, 0.05, aided=True)
     origin = round(_ORIGIN_SET / _TICK)
     at = partial(Address, vehicle)
     return {
-        at("vehicle_local_position_groundtruth"): (range(0, end, 2), truth_fields),
-        at("external_ins_local_position"): (range(1, end, 2), ins.fields),
-        at("estimator_local_position", 0): (range(0, end, 50), first.fields),
-        at("estimator_local_position", 1): (range(0, end, 50), second.fields),
-        at("vehicle_local_position"): (range(end), first.fields),
-        at("vehicle_attitude"): (range(0, end, 2), first.attitude),
-        at("vehicle_global_position"): (range(origin, end, 10), first.global_fields),
-        at("sensor_gps", 0): (range(0, end, 10), gps),
-        at("vehicle_status"): (range(0, end, 50), first.status),
-        at("vehicle_land_detected"): (range(0, end, 100), land_detected),
-        at("battery_status", 0): (range(0, end, 100), battery),
-        at("home_position"): (range(0, min(end, origin + 1), origin), home),
+        at("vehicle_local_position_groundtruth"): _Stream(range(0, end, 2), groundtruth.fields),
+        at("external_ins_local_position"): _Stream(range(1, end, 2), ins.fields),
+        at("estimator_local_position", 0): _Stream(range(0, end, 50), first.fields),
+        at("estimator_local_position", 1): _Stream(range(0, end, 50), second.fields),
+        at("vehicle_local_position"): _Stream(range(end), first.fields),
+        at("vehicle_attitude"): _Stream(range(0, end, 2), first.attitude),
+        at("vehicle_global_position"): _Stream(range(origin, end, 10), first.global_fields),
+        at("sensor_gps", 0): _Stream(range(0, end, 10), gps),
+        at("vehicle_status"): _Stream(range(0, end, 50), first.status),
+        at("vehicle_land_detected"): _Stream(range(0, end, 100), land_detected),
+        at("battery_status", 0): _Stream(range(0, end, 100), battery),
+        at("home_position"): _Stream(range(0, min(end, origin + 1), origin), home),
     }
 
 
 def _messages(
-    chosen: Streams, seed: int, ticks: int | None, origin: tuple[float, float, float]
+    streams: Mapping[Address, _Stream], end: int, options: SimulatorOptions
 ) -> Iterator[SourceMessage]:
-    direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
-    absent = {}  # fields of PX4's newest layout, with values that mean "not provided"
-    for address in chosen:
-        layout = BY_TOPIC[address.topic].layout_of_release("main")
-        absent[address] = (
-            {name: kind.absent for name, kind in layout.types.items()} if layout else {}
-        )
-    for tick in count() if ticks is None else range(ticks):
+    direction = Random(f"{options.seed}/turn").uniform(-math.pi, math.pi)
+    origin = options.origin or _REFERENCE
+    not_provided = {address: _not_provided(address.topic) for address in streams}
+    for tick in range(end):
         time = tick * _TICK
-        now = truth_at(time, direction, origin)
-        for address, (when, fields) in chosen.items():
-            if tick in when:
-                yield SourceMessage(
-                    time, address, absent[address] | fields(now) | {"timestamp": now.timestamp}
-                )
+        truth = truth_at(time, direction, origin)
+        for address, stream in streams.items():
+            if tick in stream.ticks:
+                fields = not_provided[address] | stream.fields(truth)
+                fields["timestamp"] = truth.timestamp
+                yield SourceMessage(time, address, fields)
+
+
+def _not_provided(topic: str) -> Values:
+    """Return all fields of PX4's newest layout, with values that mean "not provided"."""
+    layout = BY_TOPIC[topic].layout_of_release("main")
+    if layout is None:
+        return {}
+    return {name: kind.absent for name, kind in layout.types.items()}

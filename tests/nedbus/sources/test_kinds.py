@@ -1,5 +1,6 @@
 """Sources as texts and as TOML tables."""
 
+import os
 import re
 from pathlib import Path
 
@@ -66,9 +67,20 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
             {"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}},
             "vehicles=x:a is invalid",
         ),
+        (
+            {"kind": "mavlink", "link": "udpin::14540", "log": "take"},
+            "log=take is invalid; expected 1 to request the ULog stream",
+        ),
+        ("sim:?seed=1&seed=2", "an option occurs twice"),
+        ("ulg:a/b.ulg", "unknown kind 'ulg'; write ulog:a/b.ulg"),
+        ("mavlink:udpin::1?vehicles=256:a", "vehicles=256:a is invalid"),
+        ("mavlink:udpin::1?vehicles=1:a,2:a", "vehicles=1:a,2:a is invalid"),
+        ("mavlink:udpin::1?save=logs", "save=logs is invalid"),
+        ("mavlink:udpin::1?log=0&save=logs", "save=logs is invalid"),
+        ("px4-zenoh:?vehicles=a:b,/a:c", "vehicles=a:b,/a:c is invalid"),
     ],
 )
-def test_invalid_source_table_raises(source: dict[str, object], reason: str) -> None:
+def test_invalid_source_raises(source: str | dict[str, object], reason: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(reason)):
         parse_source(source)
 
@@ -87,3 +99,21 @@ def test_plus_in_source_text_is_literal(text: str, value: str) -> None:
     """A plus is not a space; %XX is decoded in options, and in a path only %3F and %25 are."""
     spec = parse_source(text)
     assert value in (spec.target, *spec.options.model_dump().values())
+
+
+def test_pipe_is_no_file(tmp_path: Path) -> None:
+    """A pipe raises when it is opened: it may block forever, and cannot be read twice."""
+    os.mkfifo(tmp_path / "flight.ulg")
+    spec = parse_source(f"ulog:{tmp_path}/flight.ulg")
+    with pytest.raises(ConfigError, match="is not a regular file"):
+        spec.open_source(vehicle="1")
+
+
+@pytest.mark.parametrize(("log", "has_all"), [("1", True), ("armed", True), ("0", False)])
+def test_ulog_stream_delivers_all_topics(log: str, has_all: bool) -> None:
+    """With `log=`, all topics of the ULog stream are delivered by default, otherwise the built-in ones."""
+    options = parse_source(f"mavlink:udpin::1?log={log}").options
+    assert (options.chosen_topics is None) is has_all
+    chosen = parse_source(f"mavlink:udpin::1?log={log}&topics=sensor_gps").options.chosen_topics
+    assert chosen is not None
+    assert [*chosen] == ["sensor_gps"]

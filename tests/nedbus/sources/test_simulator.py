@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import SourceMessage
+from nedbus.sources.simulator import Estimator, truth_at
 from nedbus_msgs import (
     BY_TOPIC,
     DEFAULT,
@@ -200,9 +202,25 @@ def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPositi
             assert abs(message.x - true.x) < 3
             assert abs(message.z - true.z) < 3
     positions = streams["vehicle_local_position_groundtruth"]
+    assert {(message.eph, message.evh, message.xy_valid) for message in positions} == {(0, 0, True)}
     for before, after in itertools.pairwise(positions):
         mean = (before.vx + after.vx) / 2
         assert (after.x - before.x) / 0.02 == pytest.approx(mean, abs=0.01)
+        if math.hypot(after.vx, after.vy) > 1:
+            course = math.atan2(after.vy, after.vx)
+            assert math.remainder(after.heading - course, math.tau) == pytest.approx(0, abs=1e-3)
+
+
+def test_z_resets_alternate() -> None:
+    """The first z reset steps down by 1 m, the second, a lap later, back up; each delta equals the step."""
+    estimator = Estimator("ekf 0", seed=0, noise=0.3)
+    for number, time, delta in ((1, 90.0, 1.0), (2, 210.0, -1.0)):
+        before, after = (
+            estimator.fields(truth_at(at, 0.0, (0.0, 0.0, 0.0))) for at in (time - 0.01, time)
+        )
+        assert (before["z_reset_counter"], after["z_reset_counter"]) == (number - 1, number)
+        assert after["delta_z"] == delta
+        assert after["z"] - before["z"] == pytest.approx(delta, abs=0.05)  # type: ignore[operator]  # floats
 
 
 def test_origin_is_set_in_flight(streams: dict[str, list[VehicleLocalPosition]]) -> None:
@@ -287,7 +305,10 @@ def test_status_and_gps_are_consistent_with_outage(
         assert message.failsafe is not estimate.xy_valid
         assert (message.nav_state == message.nav_state_user_intention) is estimate.xy_valid
         assert message.arming_state == message.ARMING_STATE_ARMED
-    assert {message.nav_state for message in others["vehicle_status"]} == {17, 3, 1}
+    modes = [
+        mode for mode, _ in itertools.groupby(others["vehicle_status"], lambda each: each.nav_state)
+    ]
+    assert modes == [17, 3, 1, 3]  # take-off, mission, failsafe to altitude mode, mission
     for message in others["sensor_gps/0"]:
         seconds = message.timestamp / 1e6 - 10
         has_fix = 2 <= seconds % 120 < 60 or seconds % 120 >= 75 or seconds >= 120
@@ -295,7 +316,8 @@ def test_status_and_gps_are_consistent_with_outage(
             has_fix,
         ) * 3
         assert message.vel_ned_valid is has_fix
-        assert (message.time_utc_usec > 0) is (seconds >= 2)
+        boot = datetime(2026, 1, 1, tzinfo=UTC).timestamp() * 1e6
+        assert message.time_utc_usec == (boot + message.timestamp if seconds >= 2 else 0)
         if has_fix:
             truth = to_global(estimates[message.timestamp])
             assert truth
@@ -311,6 +333,8 @@ def test_battery_home_and_land_detection_are_consistent(others: dict[str, list[A
         after.remaining < before.remaining for before, after in itertools.pairwise(batteries)
     )
     assert all(0.8 < each.remaining <= 1 and 14 < each.voltage_v < 17 for each in batteries)
+    for before, after in itertools.pairwise(batteries):  # at a constant current
+        assert after.time_remaining_s == pytest.approx(before.time_remaining_s - 1, abs=0.01)
     homes = others["home_position"]
     assert [(each.timestamp, each.valid_hpos, each.update_count) for each in homes] == [
         (10_000_000, False, 1),

@@ -30,7 +30,7 @@ LogReason = Literal[
 _TEXTS: Final[Mapping[LogReason, str]] = {
     "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
     "armed": "the vehicle is armed; the ULog stream starts after disarming, or in flight with log=armed",
-    "taken": "PX4 rejected the ULog stream, because {} already receives it (log=take ends that client's stream)"
+    "taken": "PX4 rejected the ULog stream, because {} already receives it (stop it there, or reboot the vehicle)"
     " or PX4 logs to files only (set SDLOG_BACKEND to 3 and reboot the vehicle)",
     "bandwidth": "PX4 denied the ULog stream, because the rate of this MAVLink instance is below 5000 B/s; raise"
     " MAV_x_RATE, or option -r of `mavlink start`",
@@ -94,15 +94,15 @@ class LogStreamClient:
     Pass every event to its method, call `tick` several times a second, and send the returned commands at once.
     Log `status` when it changes; repeated attempts with the same outcome do not change it.
 
-    `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
-    Without "take", a rejected client stops only a stream addressed to its own ids, left by an earlier process.
+    `log`: "armed" allows START in flight.
+    A rejected client stops only a stream addressed to its own ids, left by an earlier process, once until a reboot.
     `system`, `component`: the MAVLink ids of this client. `header`: the longest header [s]; None for the default.
     `header_seconds`: duration of the last header; None until it is complete.
     """
 
     def __init__(
         self,
-        log: Set[Literal["1", "armed", "take"]],
+        log: Set[Literal["", "1", "armed"]],
         *,
         system: int,
         component: int,
@@ -206,7 +206,11 @@ class LogStreamClient:
             self._awaited = None
             self._enter("streaming", None, now)
         elif reason == "taken" and self._may_start() and not self._took_over:
-            commands += self._take_over(now)
+            # the stream of an earlier process
+            self._took_over = True
+            self._has_header = False
+            self._enter("starting", None, now)
+            commands += self._send("stop", now)
         return commands
 
     def on_command_ack(
@@ -377,12 +381,6 @@ class LogStreamClient:
         self._enter("stopped" if state == "stopping" else state, reason, now)
         self._due = max(self._due, now + TIMINGS.log_timeout)
 
-    def _take_over(self, now: float) -> list[Command]:
-        """Send STOP now, and START after its acknowledgement or timeout."""
-        self._took_over, self._has_header = True, False
-        self._enter("starting", None, now)
-        return self._send("stop", now)
-
     def _resume(self, now: float) -> None:
         """Assume that a silent stream continues, until `_check_silence` finds that it does not."""
         self._last_data, self._acked_in_row = now, 0
@@ -422,12 +420,6 @@ class LogStreamClient:
             elif state != "streaming":
                 self._resume(now)
             self._due = now + self._silence_limit()
-        elif (
-            result == dialect.MAV_RESULT_TEMPORARILY_REJECTED
-            and "take" in self._log
-            and not self._took_over
-        ):
-            return self._take_over(now)
         else:
             self._enter(
                 "refused", _REFUSALS.get(result, "failed"), now, _name("MAV_RESULT", result)

@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from typing import Final, NamedTuple, cast
@@ -88,41 +88,38 @@ class PositionSender:
         find_target: Callable[[], Target],
         send: Callable[[bytes, Peer], bool],
     ) -> None:
-        self._name, self._access = name, access
+        self._name = name
+        self._access = access
         self._address = cast("Address", options.position)
         self._clock = options.position_clock
-        self._find_target, self._send = find_target, send
-        self._core, self._lock = ExternalPosition(), threading.Lock()
+        self._find_target = find_target
+        self._send = send
+        self._core = ExternalPosition()
+        self._lock = threading.Lock()
         self._sequence = 0  # of MAVLink
         self._reported = Counter[str]()
         self._answered = -math.inf  # time of an answer to TIMESYNC by another client
         self._decode = codec_of(BY_TOPIC[self._address.topic]).decode_row  # faster than a model
-        self._target, self._target_due = Target(), -math.inf
+        self._target = Target()
+        self._target_due = -math.inf
         self._sender = SenderName(self._address.topic)
-        self._stop, self._reader = threading.Event(), cast("KeyReader | None", None)
-        self._errors = UnexpectedErrors(
-            _log, "%s: unexpected error, left out a position (logged once)", name
-        )
-        text = (
-            "PX4 stamps them on arrival"
-            if self._clock == "arrival"
-            else "PX4's TIMESYNC is answered"
-        )
-        extra = about("position", source=name)
-        _log.info(
-            "%s: positions of %s are sent into the vehicle; %s",
-            name,
-            self._address,
-            text,
-            extra=extra,
-        )
+        self._stop = threading.Event()
+        self._reader: KeyReader | None = None
+        text = "%s: unexpected error, left out a position (logged once)"
+        self._errors = UnexpectedErrors(_log, text, name)
+        stamps = "PX4's TIMESYNC is answered"
+        if self._clock == "arrival":
+            stamps = "PX4 stamps them on arrival"
+        text = "%s: positions of %s are sent into the vehicle; %s"
+        _log.info(text, name, self._address, stamps, extra=about("position", source=name))
         self._thread = threading.Thread(target=self._run, name="nedbus-position", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop sending."""
         self._stop.set()
-        if (reader := self._reader) is not None:
+        reader = self._reader
+        if reader is not None:
             reader.close()
         self._thread.join()
 
@@ -141,27 +138,31 @@ class PositionSender:
                 warnings.append(_FOREIGN_CLOCK)
             is_active = time.monotonic() - core.last_sent < TIMINGS.stale
             return PositionStatus(
-                vehicle=target.name, address=str(self._address), sender=core.sender, sent=core.sent,
-                rate=core.rate if is_active else 0.0, age=core.age if core.sent else None, clock=self._clock,
-                left_out=tuple(sorted(core.left_out.items())), reasons=tuple(core.reasons.values()),
+                vehicle=target.name,
+                address=str(self._address),
+                sender=core.sender,
+                sent=core.sent,
+                rate=core.rate if is_active else 0.0,
+                age=core.age if core.sent else None,
+                clock=self._clock,
+                left_out=tuple(sorted(core.left_out.items())),
+                reasons=tuple(core.reasons.values()),
                 warnings=tuple(warnings),
-            )  # fmt: skip
+            )
 
     def rejections(self) -> Iterator[Rejection]:
         """Yield what was refused since the last call; positions above the maximum rate are not refused."""
         with self._lock:
-            counts, reasons = Counter(self._core.left_out), dict(self._core.reasons)
+            counts = Counter(self._core.left_out)
+            reasons = dict(self._core.reasons)
             warnings = dict(self._core.warnings)
+        place = f"{self._name} position of {self._address}"
         for kind, count in (counts - self._reported).items():
             if kind != _DOWNSAMPLED:
-                yield Rejection(
-                    f"{self._name} position of {self._address}, {kind}",
-                    reasons.get(kind, kind),
-                    count=count,
-                )
+                yield Rejection(f"{place}, {kind}", reasons.get(kind, kind), count=count)
         self._reported = counts
         for kind, text in warnings.items():
-            yield Rejection(f"{self._name} position of {self._address}, {kind}", text, count=0)
+            yield Rejection(f"{place}, {kind}", text, count=0)
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -191,7 +192,8 @@ class PositionSender:
     def _handle(self, raw: RawSample, superseded: int) -> None:
         now = time.monotonic()
         if now >= self._target_due:
-            self._target, self._target_due = self._find_target(), now + _TARGET_INTERVAL
+            self._target = self._find_target()
+            self._target_due = now + _TARGET_INTERVAL
         target = self._target
         with self._lock:
             core = self._core
@@ -207,10 +209,8 @@ class PositionSender:
             try:
                 position = self._decode(raw.payload.to_bytes())
             except DecodeError as exc:
-                core.refuse(
-                    "invalid",
-                    f"the message cannot be decoded: {exc}; use the same version of nedbus",
-                )
+                text = f"the message cannot be decoded: {exc}; use the same version of nedbus"
+                core.refuse("invalid", text)
                 return
             outcome = core.add(position, self._sender.of(raw), now)
         if outcome.odometry is None:
@@ -234,26 +234,25 @@ class SenderName:
 
     def of(self, raw: RawSample) -> str:
         """Return the publisher of a sample."""
-        publisher = None if raw.source_info is None else entity_name(raw.source_info.source_id)
+        publisher = None
+        if raw.source_info is not None:
+            publisher = entity_name(raw.source_info.source_id)
         if publisher != self._publisher or not self._name:
             self._publisher = publisher
-            source = provenance_of(
-                self._definition, str(raw.encoding)[: limits.ENCODING_TEXT]
-            ).source
+            encoding = str(raw.encoding)[: limits.ENCODING_TEXT]
+            source = provenance_of(self._definition, encoding).source
             self._name = source or "a publisher"
             if publisher is not None:
                 self._name += f" (session {publisher[:_SHORT_ID]})"
         return self._name
 
 
-def choose_target(vehicles: Mapping[int, tuple[str, Peer]]) -> Target:
-    """Return the only vehicle on a link, by system id with name and address, or why there is none."""
+def choose_target(vehicles: Sequence[Target]) -> Target:
+    """Return the only vehicle on a link, or why there is none."""
     if not vehicles:
         return Target(obstacle="no vehicle has been received on this link: check the link")
     if len(vehicles) > 1:
-        names = ", ".join(name for name, _ in vehicles.values())
-        return Target(
-            obstacle=f"this link has several vehicles ({names}): give each its own link and position="
-        )
-    [(system, (name, peer))] = vehicles.items()
-    return Target(system, name, peer)
+        names = ", ".join(vehicle.name for vehicle in vehicles)
+        text = f"this link has several vehicles ({names}): give each its own link and position="
+        return Target(obstacle=text)
+    return vehicles[0]

@@ -41,13 +41,27 @@ _PAUSE: Final = 0.02
 # ... while TIMESYNC is answered: PX4 discards answers that take over 10 ms
 _ANSWER_PAUSE: Final = 0.002
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
+_NO_PARAMETERS: Final = (0,) * 7  # of a command
+
+
+def heartbeat() -> Any:
+    """Return the message that announces this component: others send only to announced ones."""
+    return dialect.MAVLink_heartbeat_message(
+        type=dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+        autopilot=dialect.MAV_AUTOPILOT_INVALID,
+        base_mode=0,
+        custom_mode=0,
+        system_status=dialect.MAV_STATE_ACTIVE,
+        mavlink_version=3,
+    )
 
 
 class LinkReader:
     """Parse the MAVLink messages of a link."""
 
     def __init__(self, link: Link, *, name: str) -> None:
-        self.link, self.name = link, name
+        self.link = link
+        self.name = name
         self._parser = new_parser()
 
     def read(self, timeout: float) -> Iterator[Received | Rejection]:
@@ -118,15 +132,13 @@ class LogReceiver:
             end = time.monotonic() + _STOP_TIMEOUT
             for vehicle in self.vehicles.values():
                 self._execute(vehicle, vehicle.client.stop(time.monotonic()))
-            while time.monotonic() < end and any(
-                vehicle.client.status.state == "stopping" for vehicle in self.vehicles.values()
-            ):
+            while self._is_any("stopping") and time.monotonic() < end:
                 self._step()
         except BaseException as exc:  # noqa: BLE001 - re-raised by `read`, on the thread of the source
             self._waiting.fail(exc)
 
     def _step(self) -> None:
-        if any(vehicle.client.status.state == "streaming" for vehicle in self.vehicles.values()):
+        if self._is_any("streaming"):
             time.sleep(_ANSWER_PAUSE if self._answers_timesync else _PAUSE)
         items = list[Received | Rejection]()
         try:
@@ -138,19 +150,19 @@ class LogReceiver:
         for vehicle in self.vehicles.values():
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
+    def _is_any(self, state: str) -> bool:
+        """Return whether a ULog stream is in this state."""
+        return any(vehicle.client.status.state == state for vehicle in self.vehicles.values())
+
     def _process(self, received: Received) -> Received | Rejection:
         """Count the losses before a message; handle it for the ULog stream, and reassemble its data."""
-        system, now = received.system, received.time
-        vehicle = self.vehicles.get(system)
+        now = received.time
+        vehicle = self.vehicles.get(received.system) or self._add_vehicle(received)
         if vehicle is None:
-            if len(self.vehicles) == limits.MAVLINK_VEHICLES and not self._evict(now):
-                reason = f"a link has up to {limits.MAVLINK_VEHICLES}; give the others a link of their own"
-                return Rejection(f"{self._reader.name} further vehicles", reason)
-            ids, options = {"system": SYSTEM, "component": COMPONENT}, self._options
-            client = LogStreamClient(options.log, **ids, header=options.header)
-            vehicle = self.vehicles[system] = _Vehicle(
-                system, client, PeerChoice(received.peer, now), now
+            reason = (
+                f"a link has up to {limits.MAVLINK_VEHICLES}; give the others a link of their own"
             )
+            return Rejection(f"{self._reader.name} further vehicles", reason)
         vehicle.last = now
         vehicle.peers.add(received.peer, now)
         if self._answers_timesync:
@@ -159,7 +171,26 @@ class LogReceiver:
         link = vehicle.sequence.link
         if lost or link:
             received = received._replace(lost=lost, link=link)
-        return self._follow_stream(vehicle, received) if self._options.log else received
+        if not self._options.log:
+            return received
+        if received.message.get_type().startswith("LOGGING_DATA"):
+            return self._process_data(received, vehicle)
+        if received.peer == vehicle.peers.peer:  # not another link, or a stranger
+            self._follow_state(vehicle, received)
+        return received
+
+    def _add_vehicle(self, received: Received) -> _Vehicle | None:
+        """Add the vehicle of a message; return None if the link has too many."""
+        now = received.time
+        if len(self.vehicles) == limits.MAVLINK_VEHICLES and not self._evict(now):
+            return None
+        client = LogStreamClient(
+            {self._options.log}, system=SYSTEM, component=COMPONENT, header=self._options.header
+        )
+        peers = PeerChoice(received.peer, now)
+        vehicle = _Vehicle(received.system, client, peers, now)
+        self.vehicles[received.system] = vehicle
+        return vehicle
 
     @property
     def _answers_timesync(self) -> bool:
@@ -184,83 +215,76 @@ class LogReceiver:
         del self.vehicles[oldest.system]
         return True
 
-    def _follow_stream(self, vehicle: _Vehicle, received: Received) -> Received | Rejection:
+    def _follow_state(self, vehicle: _Vehicle, received: Received) -> None:
+        """Pass a message that changes the state of the ULog stream to its client."""
         message = received.message
-        kind = received.message.get_type()
+        kind = message.get_type()
         now = received.time
-        if kind.startswith("LOGGING_DATA"):
-            return self._process_data(received, vehicle, kind)
-        if received.peer != vehicle.peers.peer:  # another link, or a stranger
-            return received
+        client = vehicle.client
         if kind == "HEARTBEAT":
             vehicle.is_known = True
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
-            self._execute(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
+            self._execute(vehicle, client.on_heartbeat(message.autopilot, now, armed=armed))
         elif kind == "COMMAND_ACK":
             target = message.target_system, message.target_component
-            self._execute(
-                vehicle,
-                vehicle.client.on_command_ack(message.command, message.result, *target, now),
-            )
+            answer = client.on_command_ack(message.command, message.result, *target, now)
+            self._execute(vehicle, answer)
         elif kind == "TIMESYNC" and message.tc1:
-            self._execute(vehicle, vehicle.client.on_timesync(message.ts1, now))
-        elif (
-            reading := read_time(vehicle.clock, message, now)
-        ) and reading.kind is TimeKind.REBOOT:
-            vehicle.client.on_reboot()
-            vehicle.reassembly, vehicle.refusal = Reassembly(), ""
-        return received
+            self._execute(vehicle, client.on_timesync(message.ts1, now))
+        else:
+            reading = read_time(vehicle.clock, message, now)
+            if reading is not None and reading.kind is TimeKind.REBOOT:
+                client.on_reboot()
+                vehicle.reassembly = Reassembly()
+                vehicle.refusal = ""
 
-    def _process_data(
-        self, received: Received, vehicle: _Vehicle, kind: str
-    ) -> Received | Rejection:
+    def _process_data(self, received: Received, vehicle: _Vehicle) -> Received | Rejection:
         """Acknowledge and reassemble data of the ULog stream; see `_process`."""
-        message, now = received.message, received.time
+        message = received.message
+        now = received.time
         target = message.target_system, message.target_component
-        is_ours = target == (SYSTEM, COMPONENT)
-        if (
-            is_ours
-            and vehicle.is_known
-            and vehicle.reassembly.is_new
-            and message.sequence
-            and not vehicle.refusal
-        ):
+        is_ours = target == (SYSTEM, COMPONENT) and vehicle.is_known
+        is_running = vehicle.reassembly.is_new and message.sequence > 0
+        if is_ours and is_running and not vehicle.refusal:
             if vehicle.client.status.state in ("stopping", "stopped"):
                 return received
-            if (adopted := self._adopt(vehicle, now)) or not vehicle.refusal:
-                return received._replace(chunk=adopted)
+            definitions = self._adopt(vehicle, now)
+            if not vehicle.refusal:
+                return received._replace(chunk=definitions)
         if not vehicle.client.accepts(*target):
             # before a HEARTBEAT, perhaps the stream of an earlier process
-            if not (is_ours and vehicle.is_known):
-                return received
-            where = f"{self._reader.name} system {received.system}"
-            if not vehicle.refusal:
-                return Rejection(where, f"{kind} of a stream that was not requested")
-            reason = f"the ULog stream of an earlier process cannot be continued, because {vehicle.refusal}"
-            remedy = "it restarts after disarming, or at once with log=armed"
-            return Rejection(f"{where}, ULog stream", f"{reason}; {remedy}")
-        fields = message.sequence, message.length, message.first_message_offset, message.data
-        chunk = vehicle.reassembly.add(*fields, now)
+            return self._refuse(received, vehicle) if is_ours else received
+        chunk = vehicle.reassembly.add(
+            message.sequence, message.length, message.first_message_offset, message.data, now
+        )
         # takes a third of the time of `_replace`
         received = Received(*received[:-3], chunk, link=received.link)
         if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
             vehicle.clock.confirm()
-        is_acked = kind == "LOGGING_DATA_ACKED"
-        self._execute(
-            vehicle,
-            vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=chunk.begins),
-        )
+        acked = message.get_type() == "LOGGING_DATA_ACKED"
+        answer = vehicle.client.on_data(message.sequence, now, acked=acked, begins=chunk.begins)
+        self._execute(vehicle, answer)
         return received
+
+    def _refuse(self, received: Received, vehicle: _Vehicle) -> Rejection:
+        where = f"{self._reader.name} system {received.system}"
+        if not vehicle.refusal:
+            kind = received.message.get_type()
+            return Rejection(where, f"{kind} of a stream that was not requested")
+        reason = (
+            f"the ULog stream of an earlier process cannot be continued, because {vehicle.refusal}"
+        )
+        remedy = "it restarts after disarming, or at once with log=armed"
+        return Rejection(f"{where}, ULog stream", f"{reason}; {remedy}")
 
     def _adopt(self, vehicle: _Vehicle, now: float) -> Chunk | None:
         """Continue the stream of an earlier process; return its definitions, or None while its boot is unknown.
 
         The message that shows it is not used: an acknowledged one is repeated, and any other one counts as lost.
         """
+        path = state_path(self._options, self._reader.name, vehicle.system)
         try:
-            saved = read_stream(
-                state_path(self._options, self._reader.name, vehicle.system), vehicle.system
-            )
+            saved = read_stream(path, vehicle.system)
             if vehicle.clock.newest is None:
                 return None
             saved.check_boot(vehicle.clock.newest, now)
@@ -273,15 +297,16 @@ class LogReceiver:
 
     def _execute(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
         for command in commands:
+            message: Any
             if command.kind == "acknowledge":
-                message: Any = dialect.MAVLink_logging_ack_message(
+                message = dialect.MAVLink_logging_ack_message(
                     vehicle.system, AUTOPILOT, command.sequence
                 )
             elif command.kind == "ping":
                 message = dialect.MAVLink_timesync_message(0, command.sequence)
             else:
-                parameters = [COMMANDS[command.kind], 0, *(0,) * 7]
+                number = COMMANDS[command.kind]
                 message = dialect.MAVLink_command_long_message(
-                    vehicle.system, AUTOPILOT, *parameters
+                    vehicle.system, AUTOPILOT, number, 0, *_NO_PARAMETERS
                 )
             self._send(message, vehicle.peers.peer)

@@ -7,7 +7,9 @@ import zlib
 from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
+from uuid import UUID
 
+from nedbus import limits
 from nedbus.atomic_write import atomic_write
 from nedbus.errors import OutputError
 from nedbus.log_event import about
@@ -16,15 +18,16 @@ from nedbus.sources.options import MavlinkOptions
 
 _log = logging.getLogger(__name__)
 
-MAX_DEFINITIONS: Final = 2**20  # bytes; a real header has 68,000 to 170,000
 _MAGIC: Final = b"nedbusS1"  # the last character is the version
 # magic, boot of the host, system id, size and CRC of the definitions
 _HEAD: Final = struct.Struct("<8s16sBII")
 # host time [s], vehicle time [us], sequence of the last LOGGING_DATA
 _PROGRESS: Final = struct.Struct("<dQH")
+_NO_PROGRESS: Final = bytes(_PROGRESS.size)
+_START: Final = _HEAD.size + _PROGRESS.size  # of the definitions
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
-# of the vehicle's clock: seconds, and share of the time since the last message
-_TOLERANCE: Final = 2.0, 0.02
+_JITTER: Final = 2.0  # s that a message may be late
+_DRIFT: Final = 0.02  # of the vehicle's clock, as a share of the time since the last message
 
 
 class SavedStream(NamedTuple):
@@ -38,19 +41,20 @@ class SavedStream(NamedTuple):
     def check_boot(self, vehicle_time: int, now: float) -> None:
         """Raise ValueError unless the vehicle's time [us] shows that it has not rebooted since."""
         elapsed = now - self.host_time
-        seconds, share = _TOLERANCE
-        if abs((vehicle_time - self.vehicle_time) / 1e6 - elapsed) > seconds + share * elapsed:
+        difference = (vehicle_time - self.vehicle_time) / 1e6 - elapsed
+        if abs(difference) > _JITTER + _DRIFT * elapsed:
             raise ValueError("the vehicle has rebooted since its definitions were saved")
 
 
 def state_path(options: MavlinkOptions, link: str, system: int) -> Path | None:
     """Return the path of the state file of a vehicle on a link; None if `state=0`."""
-    folder = Path(options.state).expanduser() if options.state else state_folder() / "ulog-streams"
-    return (
-        None
-        if options.state == "0"
-        else folder / f"{sha256(link.encode()).hexdigest()[:16]}-{system}"
-    )
+    if options.state == "0":
+        return None
+    folder = state_folder() / "ulog-streams"
+    if options.state:
+        folder = Path(options.state).expanduser()
+    name = sha256(link.encode()).hexdigest()[:16]
+    return folder / f"{name}-{system}"
 
 
 def read_stream(path: Path | None, system: int) -> SavedStream:
@@ -59,16 +63,17 @@ def read_stream(path: Path | None, system: int) -> SavedStream:
         raise ValueError("state=0 is set")
     try:
         with path.open("rb") as file:
-            content = file.read(_HEAD.size + _PROGRESS.size + MAX_DEFINITIONS)
+            content = file.read(_START + limits.LOG_STREAM_PENDING)
     except FileNotFoundError:
         raise ValueError(f"its definitions are not in {path.parent}") from None
     except OSError as exc:
-        raise ValueError(f"{path} cannot be read ({(exc.strerror or str(exc)).lower()})") from exc
-    definitions = content[_HEAD.size + _PROGRESS.size :]
-    if len(content) < _HEAD.size + _PROGRESS.size or not content.startswith(_MAGIC):
+        reason = (exc.strerror or str(exc)).lower()
+        raise ValueError(f"{path} cannot be read ({reason})") from exc
+    definitions = content[_START:]
+    if len(content) < _START or not content.startswith(_MAGIC):
         raise ValueError(f"{path} was not written by this release")
     _, boot, owner, size, checksum = _HEAD.unpack_from(content)
-    if (size, checksum) != (len(definitions), zlib.crc32(definitions)):
+    if size != len(definitions) or checksum != zlib.crc32(definitions):
         raise ValueError(f"{path} is damaged")
     if owner != system:
         raise ValueError(f"{path} is of system {owner}")
@@ -81,8 +86,10 @@ class StreamFile:
     """The state file of one vehicle's stream, written by its receiver; after an error it is not written any more."""
 
     def __init__(self, path: Path | None, system: int) -> None:
-        self._path, self._system = path, system
-        self._definitions, self._progress = b"", bytes(_PROGRESS.size)
+        self._path = path
+        self._system = system
+        self._definitions = b""
+        self._progress = _NO_PROGRESS
         self._file: BinaryIO | None = None
 
     @property
@@ -90,15 +97,15 @@ class StreamFile:
         """Whether the file has the definitions of the current stream."""
         return self._file is not None
 
-    def write(self, definitions: bytes, progress: bytes = bytes(_PROGRESS.size)) -> None:
+    def write(self, definitions: bytes, progress: bytes = _NO_PROGRESS) -> None:
         """Replace the definitions, by default without progress until the next `update`."""
         self.close()
-        self._definitions, self._progress = definitions, progress
-        if self._path is None or len(definitions) > MAX_DEFINITIONS:
+        self._definitions = definitions
+        self._progress = progress
+        size = len(definitions)
+        if self._path is None or size > limits.LOG_STREAM_PENDING:
             return
-        head = _HEAD.pack(
-            _MAGIC, _host_boot(), self._system, len(definitions), zlib.crc32(definitions)
-        )
+        head = _HEAD.pack(_MAGIC, _host_boot(), self._system, size, zlib.crc32(definitions))
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with atomic_write(self._path, replace=True) as temporary:
@@ -132,7 +139,8 @@ class StreamFile:
 
     def _give_up(self, path: Path, exc: OSError) -> None:
         self.close()
-        error, self._path = OutputError(path, exc), None
+        self._path = None
+        error = OutputError(path, exc)
         text = "%s; after a restart in flight, the ULog stream of system %d cannot be continued: set state="
         _log.warning(text, error, self._system, extra=about("log_stream", reason=str(error)))
 
@@ -140,6 +148,6 @@ class StreamFile:
 def _host_boot() -> bytes:
     """Return an id of the host's boot, because monotonic times are comparable within it only; zeros if unknown."""
     try:
-        return bytes.fromhex(_BOOT.read_text().strip().replace("-", "")).ljust(16, b"\0")[:16]
+        return UUID(_BOOT.read_text().strip()).bytes
     except (OSError, ValueError):
         return bytes(16)

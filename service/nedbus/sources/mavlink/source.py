@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from typing import Any, Final
 
@@ -11,7 +11,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
-from nedbus.mavlink import AUTOPILOT, CONVERSIONS, Received, Vehicle
+from nedbus.mavlink import AUTOPILOT, CONVERSIONS, Chunk, Received, Vehicle
+from nedbus.samples import LogStreamStatus
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import LinkCopies, LiveItem, Rejection, SourceMessage
 from nedbus.timings import TIMINGS
@@ -22,7 +23,7 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 from .link import DuplicateIds, Link, Peer, name_of, open_link, parse_link
 from .log_stream import LogStream
 from .position_sender import TIMESYNC_TOPIC, BusAccess, PositionSender, Target, choose_target
-from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
+from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver, heartbeat
 from .saved_stream import StreamFile, state_path
 
 _log = logging.getLogger(__name__)
@@ -54,9 +55,8 @@ class MavlinkSource:
         prefix: str,
     ) -> None:
         if parse_link(link).kind != "serial" and "baud" in options.model_fields_set:
-            raise ConfigError(
-                f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud"
-            )
+            reason = "baud= is the rate of a serial port; remove it"
+            raise ConfigError(f"mavlink:{link}", reason, key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
@@ -72,9 +72,8 @@ class MavlinkSource:
         access = BusAccess(router, self._routers, self._tls, self._prefix)
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                with closing(
-                    _LinkSession(link, self._options, name=self._link, access=access)
-                ) as session:
+                session = _LinkSession(link, self._options, name=self._link, access=access)
+                with closing(session):
                     yield from session.run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
@@ -85,7 +84,7 @@ class _LinkSession:
     """One open link: request and convert messages, send heartbeats; with `log=`, decode the ULog streams."""
 
     def __init__(
-        self, link: Link, options: MavlinkOptions, *, name: str, access: BusAccess | None = None
+        self, link: Link, options: MavlinkOptions, *, name: str, access: BusAccess
     ) -> None:
         self._link = link
         self._options = options
@@ -94,18 +93,17 @@ class _LinkSession:
         self._sending = threading.Lock()
         self._unsent = 0  # messages that the link did not accept, to be logged
         self._vehicles: dict[int, Vehicle] = {}
-        self._remarked: set[int] = set()  # system ids whose second address was reported
-        self._copied: set[int] = set()  # system ids whose copies were reported
-        # as last reported; those of vehicles that were removed
-        self._copies = self._copies_of_removed = 0
-        self._high_latency: set[int] = set()  # system ids whose satellite link was reported
+        self._remarks: set[tuple[int, str]] = set()  # those made, by system id
+        self._copies = 0  # as last reported
+        self._copies_of_removed = 0  # of vehicles that were removed
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
         self._receiver = LogReceiver(LinkReader(link, name=name), options, self._send)
         self._positions: PositionSender | None = None
-        if options.position is not None and access is not None:
-            find, send = self._find_target, self._send_position
-            self._positions = PositionSender(name, options, access, find_target=find, send=send)
+        if options.position is not None:
+            self._positions = PositionSender(
+                name, options, access, find_target=self._find_target, send=self._send_position
+            )
 
     def run(self) -> Iterator[LiveItem]:
         next_requests = next_status = 0.0
@@ -124,21 +122,12 @@ class _LinkSession:
                     log.log_changes()
             if now >= next_status:
                 next_status = now + _STATUS_INTERVAL
-                # Routers and vehicles send only to components that have announced themselves.
-                kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
-                heartbeat = dialect.MAVLink_heartbeat_message(
-                    kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3
-                )
                 self._remove_evicted()
                 for peer in self._all_peers():
-                    self._send(heartbeat, peer)
+                    self._send(heartbeat(), peer)
                 self._log_unsent()
-                yield from self._report_copies()
-                for system, log in self._logs.items():
-                    yield log.status(now)
-                    if self._vehicles[system].is_high_latency:
-                        continue
-                    self._send_to(system, dialect.MAVLink_timesync_message(0, log.request_time()))
+                yield from self._report_vehicles()
+                yield from self._report_logs(now)
                 if self._positions is not None:
                     yield from self._positions.rejections()
                     yield self._positions.status()
@@ -154,64 +143,79 @@ class _LinkSession:
             log.end()
 
     def _handle(self, received: Received) -> Iterator[SourceMessage | Rejection]:
-        message = received.message
         system = received.system
         now = received.time
         chunk = received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            options, name = self._options, self._name_of(system)
-            vehicle = Vehicle(name, options.chosen_topics, rate=options.rate, baud=self._link.baud)
+            name = self._name_of(system)
+            topics = self._options.chosen_topics
+            vehicle = Vehicle(name, topics, rate=self._options.rate, baud=self._link.baud)
             self._vehicles[system] = vehicle
-        if text := self._senders.add(system, received.peer, now):
-            _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
-        yield from self._second_address(system)
-        vehicle.count_lost(
-            received.lost, now, counted=chunk.lost if chunk else None, link=received.link
-        )
+        duplicate = self._senders.add(system, received.peer, now)
+        if duplicate:
+            extra = about("duplicate", source=self._name)
+            _log.warning("%s: %s", self._name, duplicate, extra=extra)
+        counted = chunk.lost if chunk else None
+        vehicle.count_lost(received.lost, now, counted=counted, link=received.link)
         log = self._log_of(system)
-        if (
-            log is not None
-            and message.get_type() == "TIMESYNC"
-            and message.tc1
-            and self._is_chosen(received)
-        ):
-            log.add_timesync(message.tc1, message.ts1, now)
         if chunk is None:
-            items: Iterable[SourceMessage | Rejection] = vehicle.handle_all(message, now, log)
-            if vehicle.is_high_latency and system not in self._high_latency:
-                self._high_latency.add(system)
-                yield Rejection(f"{self._name} system {system}", HIGH_LATENCY_LINK, count=0)
-        else:
-            items = log.add(chunk, now) if log is not None else ()
-        # the delay is that of the first message in each part of a stream
-        is_measured = log is None or chunk is None
-        for each in items:
-            if not isinstance(each, SourceMessage):
-                yield each
+            yield from self._convert(received, vehicle, log)
+        elif log is not None:
+            yield from self._decode(received, chunk, vehicle, log)
+
+    def _convert(
+        self, received: Received, vehicle: Vehicle, log: LogStream | None
+    ) -> Iterator[SourceMessage | Rejection]:
+        """Yield what is converted from a message."""
+        message = received.message
+        now = received.time
+        is_answer = message.get_type() == "TIMESYNC" and message.tc1
+        if log is not None and is_answer and self._is_chosen(received):
+            log.add_timesync(message.tc1, message.ts1, now)
+        for item in vehicle.handle_all(message, now, log):
+            if isinstance(item, SourceMessage):
+                yield self._complete(item, vehicle, log, now)
+            else:
+                yield item
+
+    def _decode(
+        self, received: Received, chunk: Chunk, vehicle: Vehicle, log: LogStream
+    ) -> Iterator[SourceMessage | Rejection]:
+        """Yield what a part of a ULog stream contains."""
+        now = received.time
+        is_measured = False
+        for item in log.add(chunk, now):
+            if not isinstance(item, SourceMessage):
+                yield item
                 continue
-            if self._positions is not None and each.address.topic == TIMESYNC_TOPIC:
-                self._positions.on_timesync_status(each.fields, now)
-            item = vehicle.report(each, log) if vehicle.lost or vehicle.rebooted else each
-            if log is not None and not is_measured:
+            message = self._complete(item, vehicle, log, now)
+            if not is_measured:  # the delay is that of the first message in each part
                 is_measured = True
-                log.add_delay(item.timestamp, time.monotonic())
-            if item.rebooted:
-                address = Address(item.address.vehicle, DEFAULT_TOPIC)
-                extra = about("rebooted", address, source=self._name)
-                _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
-            yield item
-        if (
-            log
-            and chunk
-            and chunk.verdict in ("delivered", "unsynchronised")
-            and vehicle.clock.newest is not None
-        ):
-            log.state.update(message.sequence, vehicle.clock.newest, now)
+                log.add_delay(message.timestamp, time.monotonic())
+            yield message
+        is_sound = chunk.verdict in ("delivered", "unsynchronised")
+        if is_sound and vehicle.clock.newest is not None:
+            log.state.update(received.message.sequence, vehicle.clock.newest, now)
+
+    def _complete(
+        self, message: SourceMessage, vehicle: Vehicle, log: LogStream | None, now: float
+    ) -> SourceMessage:
+        """Return a message with the losses and the reboot before it."""
+        if self._positions is not None and message.address.topic == TIMESYNC_TOPIC:
+            self._positions.on_timesync_status(message.fields, now)
+        if vehicle.lost or vehicle.rebooted:
+            message = vehicle.report(message, log)
+        if message.rebooted:
+            address = Address(message.address.vehicle, DEFAULT_TOPIC)
+            extra = about("rebooted", address, source=self._name)
+            _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
+        return message
 
     def _log_unsent(self) -> None:
         with self._sending:
-            count, self._unsent = self._unsent, 0
+            count = self._unsent
+            self._unsent = 0
         if count:
             text = (
                 "%s: %d messages to the vehicle were not sent, because the link did not accept them"
@@ -220,70 +224,88 @@ class _LinkSession:
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`."""
-        known = self._receiver.vehicles.get(system)
-        if system not in self._logs and self._options.log and known is not None:
-            client = known.client
+        log = self._logs.get(system)
+        if log is None and self._options.log and system in self._receiver.vehicles:
+            client = self._receiver.vehicles[system].client
             state = StreamFile(state_path(self._options, self._name, system), system)
-            self._logs[system] = LogStream(self._name_of(system), self._options, client, state)
-        return self._logs.get(system)
+            log = LogStream(self._name_of(system), self._options, client, state)
+            self._logs[system] = log
+        return log
 
     def _name_of(self, system: int) -> str:
-        configured = self._options.vehicles
-        default = f"system{system}" if str(system) in configured.values() else str(system)
-        return configured.get(str(system), default)
+        """Return the configured name of a vehicle; by default its system id, unless another vehicle has this name."""
+        names = self._options.vehicles
+        own = str(system)
+        if own in names:
+            return names[own]
+        return f"system{system}" if own in names.values() else own
 
     def _send_requests(self, now: float) -> None:
         for system, vehicle in self._vehicles.items():
-            if request := vehicle.next_request(now):
-                number, rate = request
-                command = (
-                    dialect.MAV_CMD_SET_MESSAGE_INTERVAL
-                    if rate
-                    else dialect.MAV_CMD_REQUEST_MESSAGE
-                )
-                parameters = [number, 1e6 / rate if rate else 0, 0, 0, 0, 0, 0]
-                message = dialect.MAVLink_command_long_message(
-                    system, AUTOPILOT, command, 0, *parameters
-                )
-                self._send_to(system, message)
+            request = vehicle.next_request(now)
+            if request is None:
+                continue
+            number, rate = request
+            command = dialect.MAV_CMD_REQUEST_MESSAGE
+            interval = 0.0
+            if rate:
+                command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+                interval = 1e6 / rate
+            message = dialect.MAVLink_command_long_message(
+                system, AUTOPILOT, command, 0, number, interval, 0, 0, 0, 0, 0
+            )
+            self._send_to(system, message)
 
     def _all_peers(self) -> set[Peer]:
         """Return the addresses of all vehicles, or the only address of the link; none that are behind a satellite."""
-        reached = {
-            system for system, vehicle in self._vehicles.items() if not vehicle.is_high_latency
-        }
-        if self._link.peer is not None:
-            return {self._link.peer} if reached or not self._vehicles else set()
-        known = [*self._receiver.vehicles.values()]  # changed on another thread
-        return {vehicle.peers.peer for vehicle in known if vehicle.system in reached}
+        reached = set()
+        for system, vehicle in self._vehicles.items():
+            if not vehicle.is_high_latency:
+                reached.add(system)
+        if self._link.peer is None:
+            known = [*self._receiver.vehicles.values()]  # changed on another thread
+            return {vehicle.peers.peer for vehicle in known if vehicle.system in reached}
+        if self._vehicles and not reached:
+            return set()
+        return {self._link.peer}
 
     def _is_chosen(self, received: Received) -> bool:
         """Return whether a message is from the address to which the messages for its vehicle are sent."""
         known = self._receiver.vehicles.get(received.system)
         return known is not None and known.peers.peer == received.peer
 
-    def _second_address(self, system: int) -> Iterator[Rejection]:
-        """Yield a remark, once, if a vehicle's id also arrives from another address."""
-        known = self._receiver.vehicles.get(system)
-        if known is None or known.peers.second is None or system in self._remarked:
-            return
-        self._remarked.add(system)
-        text = f"also arrives from {name_of(known.peers.second)}; requests go to {name_of(known.peers.peer)} only"
-        yield Rejection(f"{self._name} system {system}, second address", text, count=0)
+    def _remark(self, system: int, subject: str, text: str) -> Iterator[Rejection]:
+        """Yield a remark about a vehicle once."""
+        if (system, subject) not in self._remarks:
+            self._remarks.add((system, subject))
+            yield Rejection(f"{self._name} system {system}{subject}", text, count=0)
 
-    def _report_copies(self) -> Iterator[LinkCopies | Rejection]:
-        """Yield the number of copies, and a remark on the first ones of each vehicle."""
+    def _report_vehicles(self) -> Iterator[LinkCopies | Rejection]:
+        """Yield the number of copies, and a remark on each unusual link of a vehicle."""
+        copies = self._copies_of_removed
         for system, vehicle in self._vehicles.items():
-            if vehicle.copies and system not in self._copied:
-                self._copied.add(system)
+            copies += vehicle.copies
+            if vehicle.is_high_latency:
+                yield from self._remark(system, "", HIGH_LATENCY_LINK)
+            known = self._receiver.vehicles.get(system)
+            if known is not None and known.peers.second is not None:
+                first = name_of(known.peers.peer)
+                second = name_of(known.peers.second)
+                text = f"also arrives from {second}; requests go to {first} only"
+                yield from self._remark(system, ", second address", text)
+            if vehicle.copies:
                 text = "its messages come again, or late, over a second link: each is used once, the first time"
-                yield Rejection(f"{self._name} system {system}, second link", text, count=0)
-        copies = self._copies_of_removed + sum(
-            vehicle.copies for vehicle in self._vehicles.values()
-        )
+                yield from self._remark(system, ", second link", text)
         if copies != self._copies:
             self._copies = copies
             yield LinkCopies(copies)
+
+    def _report_logs(self, now: float) -> Iterator[LogStreamStatus]:
+        """Yield the status of each ULog stream, and request the time of its vehicle."""
+        for system, log in self._logs.items():
+            yield log.status(now)
+            if not self._vehicles[system].is_high_latency:
+                self._send_to(system, dialect.MAVLink_timesync_message(0, log.request_time()))
 
     def _remove_evicted(self) -> None:
         """Forget the vehicles that the receiver has removed."""
@@ -293,23 +315,24 @@ class _LinkSession:
             if system in known and (log is None or log.serves(known[system].client)):
                 continue
             self._copies_of_removed += self._vehicles.pop(system).copies
-            self._copied.discard(system)
-            self._remarked.discard(system)
+            self._remarks = {remark for remark in self._remarks if remark[0] != system}
             if log is not None:
                 del self._logs[system]
                 log.end()
 
     def _send_to(self, system: int, message: Any) -> None:
         """Send a message to a vehicle, unless it was removed."""
-        if (known := self._receiver.vehicles.get(system)) is not None:
+        known = self._receiver.vehicles.get(system)
+        if known is not None:
             self._send(message, known.peers.peer)
 
     def _find_target(self) -> Target:
         """Return the vehicle for positions; called on the thread of PositionSender."""
-        known = [*self._receiver.vehicles.values()]  # changed on another thread
-        return choose_target(
-            {each.system: (self._name_of(each.system), each.peers.peer) for each in known}
-        )
+        targets = []
+        for vehicle in [*self._receiver.vehicles.values()]:  # changed on another thread
+            name = self._name_of(vehicle.system)
+            targets.append(Target(vehicle.system, name, vehicle.peers.peer))
+        return choose_target(targets)
 
     def _send_position(self, frame: bytes, peer: Peer) -> bool:
         try:
@@ -319,5 +342,6 @@ class _LinkSession:
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread of LogReceiver also sends
-            self._unsent += not self._link.send(message.pack(self._sender), peer)
+            if not self._link.send(message.pack(self._sender), peer):
+                self._unsent += 1
             self._sender.seq = (self._sender.seq + 1) % 256

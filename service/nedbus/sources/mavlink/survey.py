@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus import limits
 from nedbus.mavlink import NO_HEARTBEAT, Senders
 
-from .link import DuplicateIds, Link, Packet, name_of, open_link
-from .reader import SYSTEM
+from .link import DuplicateIds, Link, Packet, Peer, name_of, open_link
+from .reader import COMPONENT, SYSTEM, heartbeat
 
 _READ_TIMEOUT: Final = 0.25  # s
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
@@ -86,7 +86,7 @@ class _Surveyor:
         self._seconds = seconds
         self._senders = Senders()
         self._addresses = DuplicateIds()
-        self._encoder = dialect.MAVLink(None, SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._encoder = dialect.MAVLink(None, SYSTEM, COMPONENT)
         self._parser = _new_parser()
 
     def run(self) -> None:
@@ -97,21 +97,10 @@ class _Surveyor:
         while now < end:
             if self._link.peer is not None and now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
-                self._send_heartbeat()
+                self._send(heartbeat(), self._link.peer)
             for packet in self._link.read(_READ_TIMEOUT):
                 self._on_packet(packet, now)
             now = time.monotonic()
-
-    def _send_heartbeat(self) -> None:
-        heartbeat = dialect.MAVLink_heartbeat_message(
-            type=dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-            autopilot=dialect.MAV_AUTOPILOT_INVALID,
-            base_mode=0,
-            custom_mode=0,
-            system_status=dialect.MAV_STATE_ACTIVE,
-            mavlink_version=3,
-        )
-        self._link.send(heartbeat.pack(self._encoder), self._link.peer)
 
     def _on_packet(self, packet: Packet, now: float) -> None:
         packets = self.survey.packets
@@ -125,7 +114,7 @@ class _Surveyor:
             if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):
                 self._on_message(message, packet.peer, now)
 
-    def _on_message(self, message: Any, peer: Any, now: float) -> None:
+    def _on_message(self, message: Any, peer: Peer, now: float) -> None:
         survey = self.survey
         ids = message.get_srcSystem(), message.get_srcComponent()
         reason = self._senders.ignore_reason(message, *ids)
@@ -164,12 +153,13 @@ class _Surveyor:
         if traffic.round_trip is None or trip < traffic.round_trip:
             traffic.round_trip = trip
 
-    def _request_state(self, ids: tuple[int, int], peer: Any) -> None:
+    def _request_state(self, ids: tuple[int, int], peer: Peer) -> None:
         """Request the parameter of the log's destination, and a round trip, from a PX4."""
-        parameter = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
-        self._link.send(parameter.pack(self._encoder), peer)
-        timesync = dialect.MAVLink_timesync_message(0, time.monotonic_ns())
-        self._link.send(timesync.pack(self._encoder), peer)
+        self._send(dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1), peer)
+        self._send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()), peer)
+
+    def _send(self, message: Any, peer: Peer) -> None:
+        self._link.send(message.pack(self._encoder), peer)
 
 
 def _new_parser() -> Any:

@@ -32,7 +32,14 @@ from nedbus_msgs import (
     ros2_type,
 )
 
-from .streams import Definitions, NotAcceptedError, StreamRegistry
+from .streams import (
+    Definitions,
+    NotAcceptedError,
+    Px4Stream,
+    StreamRegistry,
+    TypeHashes,
+    WireFormat,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -41,11 +48,10 @@ _REPORT_INTERVAL: Final = 1.0  # s between reports of unavailable topics
 _RING_SIZE: Final = 16_384  # samples waiting for the receiving thread
 _JOIN_TIMEOUT: Final = 3.0  # s
 _INPUT: Final = "px4-zenoh-input"  # `sample.source` of messages to a vehicle
-_TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
-_TOO_LARGE: Final = (
-    "size",
-    f"a payload of more than {limits.PX4_PAYLOAD} bytes, or a key that is too long",
-)
+_DROP_REASONS: Final = {
+    "queue": "messages arrive faster than they are decoded",
+    "size": f"a payload of more than {limits.PX4_PAYLOAD} bytes, or a key that is too long",
+}
 
 
 class Px4ZenohSource:
@@ -64,8 +70,10 @@ class Px4ZenohSource:
             check_endpoints([endpoint], where="px4-zenoh")
         self._endpoints = (endpoint,) if endpoint else routers
         self._is_own = not endpoint or endpoint in routers
-        self._options, self._tls = options, tls
-        self._supplied, self._vehicle = _read_definitions(options.msg), options.vehicle or vehicle
+        self._options = options
+        self._tls = tls
+        self._supplied = _read_definitions(options.msg)
+        self._vehicle = options.vehicle or vehicle
 
     def listen(
         self, router: Session | None
@@ -103,20 +111,22 @@ class Px4ZenohNode:
         self._tokens = transport.LivelinessTokens(
             session, transport.px4_publishers_key_expr(domain)
         )
-        self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
+        self._zid = str(session.info.zid())
+        self._node = f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
         self._subscriptions: dict[TopicKey, zenoh.LivelinessToken] = {}
         self._entities = 0
-        self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
-        self._reported = Counter[tuple[str, str]]()
-        key_expr = f"{'*' if domain is None else domain}/**/{transport.PX4_TYPES}/*"
+        self._dropped = Counter(dict.fromkeys(_DROP_REASONS, 0))
+        self._reported = Counter[str]()
+        chunk = "*" if domain is None else domain
+        key_expr = f"{chunk}/**/{transport.PX4_TYPES}/*"
         with transport.translate_zenoh_errors():
             self._subscriber = session.declare_subscriber(
                 key_expr, zenoh.handlers.RingChannel(_RING_SIZE)
             )
-        handler = self._subscriber.handler
+        arguments = [self._subscriber.handler]  # no reference to the subscriber on that thread
         self._thread = threading.Thread(
-            target=self._receive, args=[handler], name="nedbus-px4", daemon=True
+            target=self._receive, args=arguments, name="nedbus-px4", daemon=True
         )
         self._thread.start()
 
@@ -126,10 +136,10 @@ class Px4ZenohNode:
         last: UnavailableTopics | None = None
         next_report = 0.0
         while True:
-            new = self._dropped - self._reported
-            for (where, reason), count in new.items():
-                yield Rejection(where, reason, count=count)
-            self._reported += new
+            dropped = self._dropped - self._reported
+            self._reported += dropped
+            for where, count in dropped.items():
+                yield Rejection(where, _DROP_REASONS[where], count=count)
             sample: zenoh.Sample | BaseException | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=TIMINGS.source_tick)
@@ -139,10 +149,13 @@ class Px4ZenohNode:
             for token, alive in self._tokens.poll():
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
-            if (now := time.monotonic()) >= next_report:
+            now = time.monotonic()
+            if now >= next_report:
                 next_report = now + _REPORT_INTERVAL
-                if (unavailable := self._streams.report(now)) != last:
-                    yield (last := unavailable)
+                unavailable = self._streams.report(now)
+                if unavailable != last:
+                    last = unavailable
+                    yield unavailable
 
     def close(self) -> None:
         """Undeclare the tokens and the subscriber, and end the thread."""
@@ -156,61 +169,53 @@ class Px4ZenohNode:
     def _decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
         if sample.kind != zenoh.SampleKind.PUT:
             return None
-        key, now = str(sample.key_expr), time.monotonic()
-        is_bridged = str(sample.encoding) == transport.BRIDGED_ENCODING
+        key = str(sample.key_expr)
+        now = time.monotonic()
         address: Address | None = None
         try:
             stream = self._streams.on_message(key, now)
+            is_bridged = str(sample.encoding) == transport.BRIDGED_ENCODING
             if stream.unsupported is not None:
-                # announced streams are in the report
-                is_unannounced = stream.unsupported and not stream.tokens
-                reason = f"{stream.unsupported} is not selected by topics= or msg="
-                return Rejection(key, reason) if is_unannounced and not is_bridged else None
-            if (form := stream.wire_format) is None:
-                form = self._streams.wire_format_of(stream)
-                if form.unknown:
-                    names = ", ".join(form.unknown)
-                    extra = about("newer_layout", stream.address, source="px4-zenoh")
-                    _log.warning(
-                        "%s: left out unknown fields %s; update nedbus",
-                        stream.key,
-                        names,
-                        extra=extra,
-                    )
-                if form.is_literal:
-                    text = "%s: hashed with a literal char, unlike in ROS 2"
-                    extra = about("notice", stream.address)
-                    _log.warning(text, stream.key, extra=extra)
-            definition, layout, unknown, _ = form
+                is_reported = is_bridged or stream.tokens  # announced streams are in the report
+                return None if is_reported else _unsupported(stream)
+            form = stream.wire_format or self._begin(stream)
             address = stream.address
-            attachment = (
-                None
-                if sample.attachment is None
-                else transport.Attachment.parse(sample.attachment.to_bytes())
-            )
+            attachment = None
+            if sample.attachment is not None:
+                attachment = transport.Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
-                if not stream.is_bridged:
-                    extra = about("bridge_loop", source="px4-zenoh")
-                    _log.info(
-                        "%s is published by nedbus ros2; ignored to avoid a loop", key, extra=extra
-                    )
-                stream.is_bridged = True
+                _ignore_bridge(stream)
                 return None
-            fields = decode_with(definition, sample.payload.to_bytes(), layout)
+            fields = decode_with(form.definition, sample.payload.to_bytes(), form.layout)
             lost, rebooted = self._streams.accept(stream, attachment, now)
-        except (AddressError, DecodeError, NotAcceptedError) as exc:
-            return Rejection(key, exc.reason if isinstance(exc, DecodeError) else str(exc), address)
-        for name in unknown:
+        except DecodeError as exc:
+            return Rejection(key, exc.reason, address)
+        except (AddressError, NotAcceptedError) as exc:
+            return Rejection(key, str(exc), address)
+        for name in form.unknown:
             del fields[name]
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
-            _log.warning(
-                "%s: the publisher restarted; counted as a reboot of the vehicle", key, extra=extra
-            )
+            text = "%s: the publisher restarted; counted as a reboot of the vehicle"
+            _log.warning(text, key, extra=extra)
         source = _INPUT if stream.is_input else None
         return SourceMessage(
-            0.0, stream.address, fields, lost, rebooted, definition=definition, source=source
+            0.0, address, fields, lost, rebooted, definition=form.definition, source=source
         )
+
+    def _begin(self, stream: Px4Stream) -> WireFormat:
+        """Return the format of a stream at its first message, and log what is unusual in it."""
+        form = self._streams.wire_format_of(stream)
+        if form.unknown:
+            names = ", ".join(form.unknown)
+            extra = about("newer_layout", stream.address, source="px4-zenoh")
+            text = "%s: left out unknown fields %s; update nedbus"
+            _log.warning(text, stream.key, names, extra=extra)
+        if form.is_literal:
+            extra = about("notice", stream.address)
+            text = "%s: hashed with a literal char, unlike in ROS 2"
+            _log.warning(text, stream.key, extra=extra)
+        return form
 
     def _on_token(self, text: str, *, alive: bool) -> None:
         now = time.monotonic()
@@ -220,27 +225,31 @@ class Px4ZenohNode:
                 self._streams.add_publisher(token, now)
         except (AddressError, DecodeError, NotAcceptedError):
             return  # messages on its key are rejected
-        if alive and not token.node.startswith("nedbus_"):
-            key = token.key
-            if key in self._subscriptions or len(self._subscriptions) >= limits.PX4_SUBSCRIPTIONS:
-                return
-            if key.domain not in self._nodes:
-                self._nodes[key.domain] = self._declare(
-                    transport.node_token(key.domain, self._zid, self._node)
-                )
-            self._entities += 1
-            self._subscriptions[key] = self._declare(
-                key.token("MS", self._zid, self._node, self._entities)
-            )
-        elif (
-            not alive
-            and self._streams.remove_publisher(token, now)
-            and token.key in self._subscriptions
-        ):
-            with suppress(zenoh.ZError):  # the session may be closed already
-                self._subscriptions.pop(token.key).undeclare()
-                if all(key.domain != token.key.domain for key in self._subscriptions):
-                    self._nodes.pop(token.key.domain).undeclare()
+        if alive:
+            if not token.node.startswith("nedbus_"):
+                self._announce(token.key)
+        elif self._streams.remove_publisher(token, now):
+            self._withdraw(token.key)
+
+    def _announce(self, key: TopicKey) -> None:
+        """Declare to ROS 2 that this node subscribes to a key."""
+        if key in self._subscriptions or len(self._subscriptions) >= limits.PX4_SUBSCRIPTIONS:
+            return
+        if key.domain not in self._nodes:
+            node = transport.node_token(key.domain, self._zid, self._node)
+            self._nodes[key.domain] = self._declare(node)
+        self._entities += 1
+        subscription = key.token("MS", self._zid, self._node, self._entities)
+        self._subscriptions[key] = self._declare(subscription)
+
+    def _withdraw(self, key: TopicKey) -> None:
+        """Undeclare the subscription to a key, and the node after the last one of its domain."""
+        if key not in self._subscriptions:
+            return
+        with suppress(zenoh.ZError):  # the session may be closed already
+            self._subscriptions.pop(key).undeclare()
+            if all(other.domain != key.domain for other in self._subscriptions):
+                self._nodes.pop(key.domain).undeclare()
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
         with transport.translate_zenoh_errors():
@@ -251,18 +260,36 @@ class Px4ZenohNode:
             while True:
                 sample = handler.recv()
                 if self._pending.qsize() >= limits.PX4_PENDING:
-                    self._dropped[_TOO_FAST] += 1
-                elif (
-                    len(sample.payload) > limits.PX4_PAYLOAD
-                    or len(str(sample.key_expr)) > transport.LONGEST_TOKEN
-                ):
-                    self._dropped[_TOO_LARGE] += 1
+                    self._dropped["queue"] += 1
+                elif _is_too_large(sample):
+                    self._dropped["size"] += 1
                 else:
                     self._pending.put(sample)
         except BaseException as exc:  # noqa: BLE001 - re-raised by `run`, on the thread of the source
             # the subscriber is undeclared
             ended = SourceError("px4-zenoh", "receiving has stopped unexpectedly")
             self._pending.put(ended if isinstance(exc, zenoh.ZError) else exc)
+
+
+def _is_too_large(sample: zenoh.Sample) -> bool:
+    if len(sample.payload) > limits.PX4_PAYLOAD:
+        return True
+    return len(str(sample.key_expr)) > transport.LONGEST_TOKEN
+
+
+def _unsupported(stream: Px4Stream) -> Rejection | None:
+    """Return the rejection of a message without a definition, or None if it was not asked for."""
+    if not stream.unsupported:
+        return None
+    return Rejection(str(stream.key), f"{stream.unsupported} is not selected by topics= or msg=")
+
+
+def _ignore_bridge(stream: Px4Stream) -> None:
+    """Log once that `nedbus ros2` publishes on a key."""
+    if not stream.is_bridged:
+        stream.is_bridged = True
+        text = "%s is published by nedbus ros2; ignored to avoid a loop"
+        _log.info(text, stream.key, extra=about("bridge_loop", source="px4-zenoh"))
 
 
 def _read_definitions(paths: str) -> Definitions:
@@ -272,53 +299,56 @@ def _read_definitions(paths: str) -> Definitions:
 
     Raises ConfigError for an unreadable file, or with line and column for an invalid one.
     """
-    found: dict[str, dict[tuple[str, str], Definition[Any]]] = {}
+    definitions: dict[str, dict[TypeHashes, Definition[Any]]] = {}
     skipped: list[str] = []
-    for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
+    for part in paths.split(","):
+        if not part.strip():
+            continue
+        path = Path(part.strip()).expanduser()
         files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
         if not files and path.is_dir():
             reason = "no .msg file in this folder or its subfolders; use PX4's msg folder"
             raise ConfigError(str(path), reason, key="msg")
         for file in files or [path]:
             try:
-                text = _with_nested_messages(file)
-                definition = define_msg(file.stem, text)
-                hashes = (
-                    hash_of_msg(file.stem, text),
-                    hash_of_msg(file.stem, text, literal_char=True),
-                )
+                definition, hashes = _define(file)
             except OSError as exc:
-                raise ConfigError(
-                    str(file), (exc.strerror or str(exc)).lower(), key="msg"
-                ) from None
+                reason = (exc.strerror or str(exc)).lower()
+                raise ConfigError(str(file), reason, key="msg") from None
             except ValueError as exc:  # such as MsgError
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None
                 skipped.append(f"{file.stem} ({exc})")
                 continue
-            found.setdefault(dds_type(ros2_type(definition)), {})[hashes] = definition
+            definitions.setdefault(dds_type(ros2_type(definition)), {})[hashes] = definition
     if skipped:
+        text = "px4-zenoh: skipped unsupported definitions in %s: %.2000s"
         extra = about("damaged", source="px4-zenoh")
-        _log.info(
-            "px4-zenoh: skipped unsupported definitions in %s: %.2000s",
-            paths,
-            ", ".join(skipped),
-            extra=extra,
-        )
-    return found
+        _log.info(text, paths, ", ".join(skipped), extra=extra)
+    return definitions
+
+
+def _define(file: Path) -> tuple[Definition[Any], TypeHashes]:
+    text = _with_nested_messages(file)
+    definition = define_msg(file.stem, text)
+    usual = hash_of_msg(file.stem, text)
+    return definition, TypeHashes(usual, hash_of_msg(file.stem, text, literal_char=True))
 
 
 def _with_nested_messages(file: Path) -> str:
     """Return a .msg file followed by its nested messages from the same folder, in ROS 2's format."""
-    text = new = _read_text(file)
-    added = set[str]()
-    while missing := {
-        base for base in bases_of_msg(new) - added if file.with_name(f"{base}.msg").is_file()
-    }:
-        added |= missing
-        files = {base: _read_text(file.with_name(f"{base}.msg")) for base in sorted(missing)}
-        new = "".join(f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{each}" for base, each in files.items())
-        text += new
+    text = _read_text(file)
+    names = set[str]()
+    missing = bases_of_msg(text)
+    while missing:
+        names |= missing
+        added = ""
+        for name in sorted(missing):
+            nested = file.with_name(f"{name}.msg")
+            if nested.is_file():
+                added += f"\n{'=' * 80}\nMSG: px4_msgs/{name}\n{_read_text(nested)}"
+        text += added
+        missing = bases_of_msg(added) - names
     return text
 
 

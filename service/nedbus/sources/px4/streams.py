@@ -29,12 +29,20 @@ _TIMEOUT: Final = 3.0  # s without messages after which another publisher may us
 _EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
 # s during which messages may still arrive after a publisher's token is gone
 _SETTLE_TIME: Final = 1.0
-# s, or periods of the nominal rate if longer, after which a topic without messages is silent
+# s after which a topic without messages is silent; all nominal rates are 1 Hz or more
 _SILENCE: Final = 5.0
 _HINT: Final = "give each vehicle its own namespace or domain"
 
-# Supplied by the user, by DDS type and ROS 2 type hash, the latter also with `literal_char`.
-Definitions = Mapping[str, Mapping[tuple[str, str], Definition[Any]]]
+
+class TypeHashes(NamedTuple):
+    """ROS 2 type hashes of one definition: the usual one, and the one with `literal_char`."""
+
+    usual: str
+    literal: str
+
+
+Definitions = Mapping[str, Mapping[TypeHashes, Definition[Any]]]
+"""Definitions that the user supplies, by DDS type and type hashes."""
 
 
 class NotAcceptedError(Exception):
@@ -85,22 +93,72 @@ class Px4Stream:
 
     def is_ambiguous(self) -> bool:
         """Return whether several sessions publish with the same gid."""
-        sessions = {
-            (token.gid, token.session) for token in self.tokens.values() if token.gid is not None
-        }
-        return len({gid for gid, _ in sessions}) < len(sessions)
+        session_of: dict[bytes, str] = {}
+        for token in self.tokens.values():
+            if token.gid is None:
+                continue
+            if session_of.setdefault(token.gid, token.session) != token.session:
+                return True
+        return False
 
     def nodes(self) -> set[tuple[str, str]]:
         """Return the nodes that publish on this key, except nedbus's bridges, which serve several vehicles."""
-        every = {(token.session, token.node) for token in self.tokens.values()}
-        return {(session, node) for session, node in every if not node.startswith("nedbus_")}
+        return {
+            (token.session, token.node)
+            for token in self.tokens.values()
+            if not token.node.startswith("nedbus_")
+        }
 
     def is_silent(self, now: float) -> bool:
         """Return whether messages are overdue; never for topics without a nominal rate, which may pause."""
-        rate = get_topic(self.address.topic).rate if self.unsupported is None else 0.0
-        return rate > 0 and now - max(self.since, self.last_message) >= max(
-            _SILENCE, _SILENCE / rate
-        )
+        if self.unsupported is not None or not get_topic(self.address.topic).rate:
+            return False
+        return now - max(self.since, self.last_message) >= _SILENCE
+
+    def is_expired(self, now: float) -> bool:
+        """Return whether the key has no publisher, and no recent message that could be decoded."""
+        if self.tokens or now < self.ambiguous_until:
+            return False
+        return self.wire_format is None or now - self.last_message >= _EXPIRY
+
+    def count_lost(self, sequence: int, now: float) -> int:
+        """Note the sequence number of a message, and return the number of messages lost just before it.
+
+        A number that goes back is a restart.
+
+        Raises NotAcceptedError for a duplicate, and if numbers go back repeatedly.
+        """
+        before = self.sequence
+        if before is None:
+            self.sequence = sequence
+            return 0
+        step = sequence - before
+        if step == 0:
+            raise NotAcceptedError(f"sequence number {sequence} is a duplicate")
+        if step < 0:
+            is_repeated = now - self.rebooted < _TIMEOUT
+            self.rebooted = now
+            if is_repeated:
+                reason = f"sequence numbers go back and forth, as if two vehicles shared this key; {_HINT}"
+                raise NotAcceptedError(reason)
+            self.restarted = True
+        self.sequence = sequence
+        if 0 < step <= _PLAUSIBLE_LOSS:
+            return step - 1
+        return 0
+
+    def claim_key(self, gid: bytes, now: float) -> None:
+        """Make a publisher the owner of the key; raise NotAcceptedError while it has another one."""
+        publisher = self.publisher
+        self.restarted = publisher is not None and publisher.text not in self.tokens
+        is_active = self.gid is not None and now - self.last_accepted < _TIMEOUT
+        if is_active and not self.restarted:
+            raise NotAcceptedError(f"two publishers share this key; {_HINT}")
+        self.gid = gid
+        self.sequence = None
+        self.publisher = None
+        if len(self.tokens) == 1:
+            [self.publisher] = self.tokens.values()
 
 
 class StreamRegistry:
@@ -118,7 +176,7 @@ class StreamRegistry:
 
     def add_publisher(self, token: PublisherToken, now: float) -> None:
         """Add the publisher of a new liveliness token; raise the errors of `on_message` if its key has no address."""
-        stream = self._find(token.key)
+        stream = self._stream_of(token.key)
         if _TIMEOUT <= now - stream.last_accepted < math.inf:
             # The previous publisher is silent: it lost its connection, which a router takes longer to notice.
             stream.tokens.clear()
@@ -127,7 +185,8 @@ class StreamRegistry:
             stream.since = now
         if len(stream.tokens) < limits.PX4_PUBLISHERS:
             stream.tokens[token.text] = token
-            stream.ambiguous_until = math.inf if stream.is_ambiguous() else stream.ambiguous_until
+            if stream.is_ambiguous():
+                stream.ambiguous_until = math.inf
 
     def remove_publisher(self, token: PublisherToken, now: float) -> bool:
         """Remove a publisher; return whether it was the last one of its key."""
@@ -141,23 +200,23 @@ class StreamRegistry:
 
     def on_message(self, key: str, now: float) -> Px4Stream:
         """Return the stream of a message's key; raise DecodeError, AddressError or NotAcceptedError."""
-        stream = self._streams.get(key) or self._find(TopicKey.parse(key))
+        stream = self._streams.get(key) or self._stream_of(TopicKey.parse(key))
         stream.last_message = now
         return stream
 
     def wire_format_of(self, stream: Px4Stream) -> WireFormat:
         """Return the format of a stream's messages; raise NotAcceptedError if it is unknown."""
         definition, layout = self._layout_of(stream.key, stream.address.topic)
-        unknown = tuple(
-            name
-            for name, kind in layout.types.items()
-            if kind not in definition.known_types.get(name, ())
-        )
-        digest, supplied = stream.key.type_hash, self._supplied.get(stream.key.dds_type, {})
-        is_literal = has_char_hash(digest) or any(
-            literal == digest != own for own, literal in supplied
-        )
-        stream.wire_format = WireFormat(definition, layout, unknown, is_literal)
+        unknown = []
+        for name, kind in layout.types.items():
+            if kind not in definition.known_types.get(name, ()):
+                unknown.append(name)
+        type_hash = stream.key.type_hash
+        is_literal = has_char_hash(type_hash)
+        for hashes in self._supplied.get(stream.key.dds_type, {}):
+            if type_hash == hashes.literal != hashes.usual:
+                is_literal = True
+        stream.wire_format = WireFormat(definition, layout, tuple(unknown), is_literal)
         stream.reboots = self._reboots.get(stream.address.vehicle, 0)
         return stream.wire_format
 
@@ -172,154 +231,151 @@ class StreamRegistry:
         publishers have the same gid; for a duplicate; and for a sequence that goes back repeatedly, as with two
         vehicles of the same gid.
         """
-        self._claim(stream, attachment, now)
-        lost, restarted = 0, stream.restarted
+        self._claim_address(stream, now)
+        lost = 0
         if attachment is not None:
-            step = 1 if stream.sequence is None else attachment.sequence - stream.sequence
-            if step == 0:
-                raise NotAcceptedError(f"sequence number {attachment.sequence} is a duplicate")
-            if step < 0:
-                is_repeated = now - stream.rebooted < _TIMEOUT
-                stream.rebooted = now
-                restarted = True
-                if is_repeated:
-                    reason = f"sequence numbers go back and forth, as if two vehicles shared this key; {_HINT}"
-                    raise NotAcceptedError(reason)
-            elif step <= _PLAUSIBLE_LOSS:
-                lost = step - 1
-            stream.sequence = attachment.sequence
-        stream.last_accepted, stream.restarted = now, False
-        if stream.is_input or not restarted:
-            return lost, False
-        known = self._reboots.get(stream.address.vehicle, 0)
-        is_first = stream.reboots == known  # its vehicle's first stream to restart
-        self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
-        return lost, is_first
+            if attachment.gid != stream.gid:
+                stream.claim_key(attachment.gid, now)
+            lost = stream.count_lost(attachment.sequence, now)
+        restarted = stream.restarted
+        stream.restarted = False
+        stream.last_accepted = now
+        return lost, restarted and self._is_reboot(stream)
 
     def report(self, now: float) -> UnavailableTopics:
         """Return unsupported messages, and topics that are silent while others of the same node arrive."""
-        self._streams = {
-            key: each
-            for key, each in self._streams.items()
-            if each.tokens
-            or (each.wire_format and now - each.last_message < _EXPIRY)
-            or now < each.ambiguous_until
-        }
-        known = {each.address.vehicle for each in self._streams.values()}
-        self._owners = {
-            at: each
-            for at, each in self._owners.items()
-            if self._streams.get(str(each.key)) is each
-        }
-        self._reboots = {
-            vehicle: count for vehicle, count in self._reboots.items() if vehicle in known
-        }
-        nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
+        self._remove_expired(now)
         # A node without any message has a broken link, not silent topics.
-        sending = {
-            node for stream, own in nodes if now - stream.last_message < _TIMEOUT for node in own
-        }
-        silent = {
-            str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)
-        }
-        unsupported = {stream.unsupported for stream, own in nodes if own and stream.unsupported}
+        sending = set()
+        for stream in self._streams.values():
+            if now - stream.last_message < _TIMEOUT:
+                sending |= stream.nodes()
+        unsupported = set()
+        silent = set()
+        for stream in self._streams.values():
+            nodes = stream.nodes()
+            if nodes and stream.unsupported:
+                unsupported.add(stream.unsupported)
+            if nodes & sending and stream.is_silent(now):
+                silent.add(str(stream.address))
         return UnavailableTopics(
             tuple(sorted(unsupported)[: limits.UNREADABLE_TOPICS]),
             tuple(sorted(silent)[: limits.UNREADABLE_TOPICS]),
         )
 
-    def _find(self, key: TopicKey) -> Px4Stream:
+    def _stream_of(self, key: TopicKey) -> Px4Stream:
         stream = self._streams.get(str(key))
-        if stream is None:
-            if len(self._streams) >= limits.PX4_KEYS:
-                raise NotAcceptedError(
-                    f"more than {limits.PX4_KEYS} keys; choose a domain, as in px4-zenoh:?domain=0"
-                )
-            namespace, topic, instance = split_ros2_topic(key.topic)
-            address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
-            stream = Px4Stream(
-                key,
-                address,
-                self._unsupported_name(key, topic),
-                is_input=is_vehicle_input(key.topic),
+        if stream is not None:
+            return stream
+        if len(self._streams) >= limits.PX4_KEYS:
+            raise NotAcceptedError(
+                f"more than {limits.PX4_KEYS} keys; choose a domain, as in px4-zenoh:?domain=0"
             )
-            self._streams[str(key)] = stream
+        namespace, topic, instance = split_ros2_topic(key.topic)
+        address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
+        unsupported = self._unsupported_name(key, topic)
+        stream = Px4Stream(key, address, unsupported, is_input=is_vehicle_input(key.topic))
+        self._streams[str(key)] = stream
         return stream
 
-    def _claim(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> None:
+    def _remove_expired(self, now: float) -> None:
+        for key, stream in [*self._streams.items()]:
+            if stream.is_expired(now):
+                del self._streams[key]
+                if self._owners.get(stream.address) is stream:
+                    del self._owners[stream.address]
+        vehicles = {stream.address.vehicle for stream in self._streams.values()}
+        for vehicle in self._reboots.keys() - vehicles:
+            del self._reboots[vehicle]
+
+    def _claim_address(self, stream: Px4Stream, now: float) -> None:
         if now < stream.ambiguous_until:
-            stream.publisher = stream.gid = stream.sequence = None
+            stream.publisher = None
+            stream.gid = None
+            stream.sequence = None
             stream.last_accepted = now
             raise NotAcceptedError(f"two publishers on this key have the same gid; {_HINT}")
         owner = self._owners.setdefault(stream.address, stream)
-        if owner is not stream:
-            if now - owner.last_accepted < _TIMEOUT:
-                reason = f"{owner.key} already has the address {stream.address}; rename one of them with vehicles="
-                raise NotAcceptedError(reason)
-            self._owners[stream.address] = stream
-        if attachment is not None and attachment.gid != stream.gid:
-            stream.restarted = (
-                stream.publisher is not None and stream.publisher.text not in stream.tokens
-            )
-            if (
-                stream.gid is not None
-                and not stream.restarted
-                and now - stream.last_accepted < _TIMEOUT
-            ):
-                raise NotAcceptedError(f"two publishers share this key; {_HINT}")
-            stream.gid, stream.sequence = attachment.gid, None
-            stream.publisher = (
-                next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
-            )
+        if owner is stream:
+            return
+        if now - owner.last_accepted < _TIMEOUT:
+            reason = f"{owner.key} already has the address {stream.address}; rename one of them with vehicles="
+            raise NotAcceptedError(reason)
+        self._owners[stream.address] = stream
+
+    def _is_reboot(self, stream: Px4Stream) -> bool:
+        """Return whether the restart of a stream is the first sign of a reboot of its vehicle."""
+        if stream.is_input:
+            return False
+        vehicle = stream.address.vehicle
+        known = self._reboots.get(vehicle, 0)
+        if stream.reboots != known:  # another stream of this vehicle has restarted before
+            stream.reboots = known
+            return False
+        self._reboots[vehicle] = known + 1
+        stream.reboots = known + 1
+        return True
 
     def _unsupported_name(self, key: TopicKey, topic: str) -> str | None:
-        options, name = self._options, _message_name(key)
-        is_known = key.dds_type in _by_dds_type() or key.dds_type in self._supplied
-        if options.chosen_topics is None:
+        name = _message_name(key)
+        is_supplied = key.dds_type in self._supplied
+        is_known = is_supplied or key.dds_type in _by_dds_type()
+        chosen = self._options.chosen_topics
+        if chosen is None:
             return None if is_known else name
-        if topic in options.chosen_topics or (
-            not options.topics and key.dds_type in self._supplied
-        ):
+        if topic in chosen:
             return None
-        return "" if options.topics else f"{name} on {topic}" if is_known else name
+        if self._options.topics:
+            return ""
+        if is_supplied:
+            return None
+        return f"{name} on {topic}" if is_known else name
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
         """Return the namespace's vehicle, else the domain's or `domain<N>` and the namespace, else the default."""
         vehicles = self._options.vehicles
         if namespace in vehicles:
             return vehicles[namespace]
-        is_expected = domain == (self._options.domain or 0)
-        of_domain = vehicles.get(str(domain), "" if is_expected else f"domain{domain}")
-        return "-".join(filter(None, [of_domain, namespace.replace("/", "-")])) or self._vehicle
+        parts = []
+        if str(domain) in vehicles:
+            parts.append(vehicles[str(domain)])
+        elif domain != (self._options.domain or 0):
+            parts.append(f"domain{domain}")
+        if namespace:
+            parts.append(namespace.replace("/", "-"))
+        return "-".join(parts) or self._vehicle
 
     def _layout_of(self, key: TopicKey, topic: str) -> tuple[Definition[Any], Layout]:
         """Return nedbus's definition and layout for the type hash of a key, else those supplied by the user."""
-        name, known = _message_name(key), _by_dds_type().get(key.dds_type)
-        supplied = self._supplied.get(key.dds_type, {})
+        name = _message_name(key)
+        known = _by_dds_type().get(key.dds_type)
         expected = BY_TOPIC.get(topic)
         if expected is not None and expected is not known:
             raise NotAcceptedError(f"{topic} has messages of type {expected.name}, not {name}")
-        found = message_of_type_hash(key.type_hash)
-        if found is not None and found[0] is known:
-            return found
-        own = next((each for hashes, each in supplied.items() if key.type_hash in hashes), None)
-        if own is None and key.type_hash == NO_HASH and len(supplied) == 1:
-            [own] = supplied.values()
-        if own is not None:
-            return known or own, own.layouts["PX4"]
-        hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
+        built_in = message_of_type_hash(key.type_hash)
+        if built_in is not None and built_in[0] is known:
+            return built_in
+        supplied = self._supplied.get(key.dds_type, {})
+        for hashes, definition in supplied.items():
+            is_only = key.type_hash == NO_HASH and len(supplied) == 1
+            if is_only or key.type_hash in hashes:
+                return known or definition, definition.layouts["PX4"]
         if supplied:
-            hashes = " or ".join(own for own, _ in supplied)
-            reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}; use the file of this PX4"
-        elif known is None:
+            own = " or ".join(hashes.usual for hashes in supplied)
+            reason = f"{name}.msg has the type hash {own}, but the key has {key.type_hash}; use the file of this PX4"
+            raise NotAcceptedError(reason)
+        hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
+        if known is None:
             reason = f"{name} with the type hash {key.type_hash} is unknown; {hint}"
-        elif key.type_hash != NO_HASH:
+            raise NotAcceptedError(reason)
+        if key.type_hash != NO_HASH:
             reason = f"no known layout of {name} has the type hash {key.type_hash}; update nedbus, or {hint}"
-        elif layout := known.layout_of_release(self._options.layout or ""):
-            return known, layout
-        else:
+            raise NotAcceptedError(reason)
+        layout = known.layout_of_release(self._options.layout or "")
+        if layout is None:
             reason = f"the key has no type hash ({NO_HASH}); choose a layout, as in px4-zenoh:?layout=1.14, or {hint}"
-        raise NotAcceptedError(reason)
+            raise NotAcceptedError(reason)
+        return known, layout
 
 
 def _message_name(key: TopicKey) -> str:

@@ -23,7 +23,7 @@ ACCEPTED: Final = dialect.MAV_RESULT_ACCEPTED
 REJECTED: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
 IN_PROGRESS: Final = dialect.MAV_RESULT_IN_PROGRESS
 
-Log = Literal["1", "armed", "take"]
+Log = Literal["1", "armed"]
 StateAndReason = tuple[LogState, LogReason | None]
 
 
@@ -234,8 +234,8 @@ def test_arming_stops_start_retries(session: Session) -> None:
 class TestOwnership:
     """PX4 streams to one client at a time, and rejects all others."""
 
-    def test_rejected_client_without_take_never_sends_stop(self, session: Session) -> None:
-        """Without log=take, a rejected client never sends STOP, not even on shutdown."""
+    def test_rejected_client_never_sends_stop(self, session: Session) -> None:
+        """A rejected client never sends STOP, not even on shutdown: another client may receive the stream."""
         session.wait(0.1)
         for _ in range(4):
             session.answer(START, REJECTED)
@@ -254,46 +254,23 @@ class TestOwnership:
         assert "system 255 component 190 already receives it" in session.client.status.text
         assert session.client.status[:2] == ("refused", "taken")
 
-    def test_log_take_takes_over_stream(self) -> None:
-        """log=take sends STOP, waits for acceptance and a pause, then sends START, and acknowledges data throughout."""
-        session = Session("take")
-        session.wait(0.1)
-        session.answer(START, REJECTED)
-        session.answer(STOP, IN_PROGRESS)
-        session.wait(0.2)
-        session.receive(acked=True, sequence=70)
-        session.answer(STOP, ACCEPTED)
-        assert (session.commands, session.acknowledged) == (["start", "stop"], [70])
-        session.wait(TIMINGS.log_timeout - 0.2)
-        assert session.commands == ["start", "stop"]
-        session.wait(0.4)
-        assert session.commands == ["start", "stop", "start"]
-        session.answer(START, ACCEPTED)
-        session.header()
-        assert session.states[1:] == [("starting", None), ("header", None)]
-
-    def test_log_take_takes_over_only_once(self) -> None:
-        """If START is rejected again after STOP, as with SDLOG_BACKEND 1, the client does not repeat STOP."""
-        session = Session("take")
-        session.wait(0.1)
-        session.answer(START, REJECTED)
-        session.answer(STOP, ACCEPTED)
-        session.wait(TIMINGS.log_timeout + 0.2)
-        for _ in range(5):
-            session.answer(START, REJECTED)
-            session.wait(TIMINGS.log_retry + 0.2)
-        assert session.commands.count("stop") == 1
-        assert session.states[1:] == [("starting", None), ("refused", "taken")]
-
     def test_stream_of_earlier_process_is_restarted(self, session: Session) -> None:
-        """A stream without a header that is addressed to the client is restarted once with STOP, a pause and START."""
+        """A stream without a header that is addressed to the client is restarted once with STOP, a pause and START.
+
+        Its data is acknowledged throughout, because PX4 stops only after the acknowledgement.
+        """
         session.wait(0.1)
         session.answer(START, REJECTED)
         session.receive(sequence=7000)
         assert session.commands == ["start", "stop"]
+        session.answer(STOP, IN_PROGRESS)
+        session.wait(0.2)
+        session.receive(acked=True, sequence=7001)
         session.answer(STOP, ACCEPTED)
-        session.receive(sequence=7001)
-        session.wait(TIMINGS.log_timeout + 0.2)
+        assert (session.commands, session.acknowledged) == (["start", "stop"], [7001])
+        session.wait(TIMINGS.log_timeout - 0.2)
+        assert session.commands == ["start", "stop"]
+        session.wait(0.4)
         assert session.commands == ["start", "stop", "start"]
         session.answer(START, REJECTED)
         session.receive(sequence=7002)

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from itertools import groupby
 from typing import Any, Final
 
 import pytest
@@ -207,14 +206,6 @@ class TestAbnormalStreams:
             link.expect_states(*STARTED)
         assert [each for each in link.peer.commands if each == START] == [START, START]
 
-    @pytest.mark.parametrize("is_heard", [True, False])
-    def test_log_take_takes_over_stream(self, is_heard: bool) -> None:
-        """With log=take the other client's stream ends, and this client's begins."""
-        with Link("take").play("flight1", owner=OTHERS, is_owner_on_link=is_heard) as link:
-            link.expect_states(*STARTED)
-        # STOP may be repeated: it takes effect later while an acknowledgement of the other client is missing.
-        assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
-
     def test_stream_of_earlier_process_is_restarted(self) -> None:
         """The stream of an earlier process, with the same ids, arrives without definitions, and is restarted."""
         with Link().play("flight1", owner=OURS, is_owner_on_link=True) as link:
@@ -266,39 +257,39 @@ class TestAbnormalStreams:
             assert link.client.header_seconds > 273 * 0.044
 
     def test_stream_of_a_client_on_another_link_is_left_alone(self, timings: Timings) -> None:
-        """A client without log=take does not end the stream of another client, even after a ground station's STOP.
+        """A client does not end the stream of another client, even after a ground station's STOP.
 
         PX4 then accepts the START of either client, but sends the data to the client that had the stream before.
         """
         # the client without the stream is the first to send START after STOP
         timings.log_retry = 1.0
-        take, other = Link("armed", "take"), Link("armed", ids=OTHERS)
-        for each in (take, other):
+        first, other = Link("armed"), Link("armed", ids=OTHERS)
+        for each in (first, other):
             each._socket.settimeout(0.001)  # they take turns
-        with other._socket, take.play("flight1", second_port=other.port) as link:
+        with other._socket, first.play("flight1", second_port=other.port) as link:
             link.expect_states(*STARTED)
 
             def both_until(condition: Callable[[], object]) -> None:
                 end = time.monotonic() + DEADLINE
                 while not condition():
-                    assert time.monotonic() < end, (take.states, other.states)
-                    take.step()
+                    assert time.monotonic() < end, (first.states, other.states)
+                    first.step()
                     other.step()
 
             both_until(lambda: other.states[-1] == ("refused", "taken"))
             timings.log_retry = DEADLINE  # from now on for the client that had the stream
             link.peer.trigger("foreign_stop")
-            both_until(lambda: link.peer.streams == 2 and take.states[-1] == ("streaming", None))
+            both_until(lambda: link.peer.streams == 2 and first.states[-1] == ("streaming", None))
             timings.log_retry = 1.0
-            starts, received = len(other.sent), take.reassembly.bytes
-            both_until(lambda: len(other.sent) > starts + 3 and take.reassembly.bytes > received)
+            starts, received = len(other.sent), first.reassembly.bytes
+            both_until(lambda: len(other.sent) > starts + 3 and first.reassembly.bytes > received)
         assert "stop" not in other.sent
         assert other.states[-1] == ("refused", "taken")
         assert other.reassembly.bytes == 0
-        assert set(take.states[4:]) <= {
+        assert set(first.states[4:]) <= {
             ("ended", "stopped_elsewhere"),
             ("header", None),
             ("streaming", None),
         }
-        assert take.sent == ["start"]
+        assert first.sent == ["start"]
         assert STOP not in link.peer.commands

@@ -101,7 +101,7 @@ def test_same_first_message_begins_new_stream_after_reboot() -> None:
         closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
     ):
-        options, reader = MavlinkOptions(log=frozenset({"1"})), LinkReader(link, name="link")
+        options, reader = MavlinkOptions(log="1"), LinkReader(link, name="link")
         starts: list[Any] = []
 
         def transmit(*messages: Any) -> None:

@@ -320,7 +320,7 @@ def test_estimate_of_gaps_with_records_of_one_size(size: int, lost: int) -> None
     client = cast(
         "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None)
     )
-    reassembly, stream = Reassembly(), LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
+    reassembly, stream = Reassembly(), LogStream("1", MavlinkOptions(log="1"), client)
     last = missing = estimated = 0
     for each in sent:
         if each.sequence % period >= period - lost:
@@ -353,7 +353,7 @@ def test_estimate_after_a_restart_does_not_depend_on_the_first_messages(first: i
     client = cast(
         "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None)
     )
-    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
+    stream = LogStream("1", MavlinkOptions(log="1"), client)
     assert not [*stream.add(Chunk("delivered", definitions, begins=True), 0.0)]
     lost, reported = 500, 0
     for number, size in enumerate(sizes):
@@ -374,7 +374,7 @@ def test_rate_is_measured_since_the_last_window(tmp_path: Path) -> None:
     client = cast(
         "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None)
     )
-    stream, found = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client), []
+    stream, found = LogStream("1", MavlinkOptions(log="1"), client), []
     assert not [*stream.add(Chunk("delivered", header, begins=True), 10.0)]
     stream.status(10.0)
     for now, number in ((11.0, 100), (11.5, 100), (13.0, 50), (14.0, 0)):
@@ -540,7 +540,7 @@ def small_stream(tmp_path: Path) -> tuple[LogStream, bytes]:
     client = cast(
         "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=0.0)
     )
-    return LogStream("1", MavlinkOptions(log=frozenset({"1"})), client), path.read_bytes()
+    return LogStream("1", MavlinkOptions(log="1"), client), path.read_bytes()
 
 
 def measured_delay(stream: LogStream, vehicle_time: float, now: float) -> float | None:
@@ -628,7 +628,7 @@ def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
         + struct.pack("<HBHQi", 14, ord("D"), 0, 9, 8)
     )
     client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming")))
-    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
+    stream = LogStream("1", MavlinkOptions(log="1"), client)
     found = list(stream.add(Chunk("delivered", data, begins=True), 0.0))
     messages = [each for each in found if isinstance(each, SourceMessage)]
     assert [each.fields.get("cell_count") for each in messages] == [6, None, None, 7, 8]
@@ -647,9 +647,7 @@ def test_uninitialized_bools_of_stream_are_true(tmp_path: Path) -> None:
     path = write_raw_log(
         tmp_path / "a.ulg", {"rtl_status": (fields, "Q2B")}, [("rtl_status", (1, 194, 94))] * 2
     )
-    stream = LogStream(
-        "1", MavlinkOptions(log=frozenset({"1"}), topics=("rtl_status",)), cast("Any", None)
-    )
+    stream = LogStream("1", MavlinkOptions(log="1", topics=("rtl_status",)), cast("Any", None))
     found = [*stream.add(Chunk("delivered", path.read_bytes(), begins=True), 0.0)]
     assert [each.encode().payload[-3:] for each in found if isinstance(each, SourceMessage)] == [
         b"\x92\xc3\xc3"

@@ -20,6 +20,7 @@ from typing import Any, Final, cast
 import pytest
 from pyulog import ULog
 
+from nedbus import limits
 from nedbus.mavlink.log_reassembly import Chunk
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
@@ -243,9 +244,12 @@ class TestState:
         )
 
     def test_folder_that_cannot_be_written_is_logged_once(
-        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+        self,
+        tmp_path: Path,
+        caplog: pytest.LogCaptureFixture,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
-        """Without a writable folder, or with definitions above 1 MiB, the stream cannot be continued later."""
+        """Without a writable folder, or with very long definitions, the stream cannot be continued later."""
         (tmp_path / "file").write_text("")
         file = StreamFile(tmp_path / "file" / "state", 7)
         for _ in range(3):
@@ -255,8 +259,12 @@ class TestState:
         assert len(caplog.messages) == 1
         assert "cannot be continued: set state=" in caplog.text
         file = StreamFile(tmp_path / "state", 7)
-        file.write(bytes(2**20 + 1))
+        monkeypatch.setattr(limits, "LOG_STREAM_PENDING", 1000)
+        file.write(bytes(1001))
         assert not file.is_current
+        file.write(bytes(1000))
+        assert file.is_current
+        file.close()
 
 
 def stream_with_files(folder: Path) -> tuple[LogStream, bytes, bytes]:
@@ -267,7 +275,7 @@ def stream_with_files(folder: Path) -> tuple[LogStream, bytes, bytes]:
     client = cast(
         "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=1.0)
     )
-    options = MavlinkOptions(log=frozenset({"1"}), save=str(folder / "saved"))
+    options = MavlinkOptions(log="1", save=str(folder / "saved"))
     return (
         LogStream("1", options, client),
         path.read_bytes(),
@@ -374,7 +382,7 @@ def test_changed_definitions_of_continued_stream_are_rejected(tmp_path: Path) ->
         status=LogStatus("streaming"), header_seconds=None, reject=reasons.append
     )
     _, header, record = stream_with_files(tmp_path)
-    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
+    stream = LogStream("1", MavlinkOptions(log="1"), client)
     unknown = struct.pack("<HBHQ", 10, ord("D"), 9, 1)
     found = [*stream.add(Chunk("delivered", header, begins=True), 1.0)]
     for chunk in (

@@ -24,6 +24,7 @@ import nedbus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.mavlink.vehicle import ORIGIN
 from nedbus.sources import parse_source
+from nedbus.sources.mavlink import source as mavlink_source
 from nedbus.sources.mavlink.link import DuplicateIds, open_link
 from nedbus.timings import Timings
 from tests.flights.local_position import upgrade
@@ -324,12 +325,14 @@ def test_vehicles_on_one_port_are_separate(timings: Timings, listener: Listener,
     assert list(requested.values()) == [pytest.approx(expected)] * 2
 
 
+HIGH_LATENCY = dialect.MAVLink_high_latency2_message(
+    5000, 2, 12, 0, 10, 20, 30, *[0] * 12, 0, 0, 50, *[0] * 5
+)
+
+
 def test_nothing_is_sent_over_a_satellite_link(timings: Timings, port: int) -> None:
     """To a vehicle that sends only HIGH_LATENCY2 nothing is sent, with log=1 as well; its kind of link is a remark."""
     timings.source_tick = 0.01
-    message = dialect.MAVLink_high_latency2_message(
-        5000, 2, 12, 0, 10, 20, 30, *[0] * 12, 0, 0, 50, *[0] * 5
-    )  # fmt: skip
     with (
         Listener(f"mavlink:udpin:127.0.0.1:{port}?log=1&state=0") as listener,
         Autopilot(port, system=3) as satellite, Autopilot(port) as other,
@@ -337,12 +340,12 @@ def test_nothing_is_sent_over_a_satellite_link(timings: Timings, port: int) -> N
         found: list[object] = []
 
         def is_requested() -> bool:
-            satellite.send(message)
+            satellite.send(HIGH_LATENCY)
             other.send(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3), local_position(1000))
             found.extend(other.requests())
-            return len(found) > 3
+            return len(found) > 3 and len(listener.rejections) > 0
 
-        listener.step_until(is_requested, what="requests to the other vehicle")
+        listener.step_until(is_requested, what="requests to the other vehicle, and a remark")
         with pytest.raises(BlockingIOError):
             satellite._socket.recv(1)
         topics = {each.address.topic for each in listener.messages if each.address.vehicle == "3"}
@@ -352,6 +355,41 @@ def test_nothing_is_sent_over_a_satellite_link(timings: Timings, port: int) -> N
             remark.count,
             "a satellite link, because only HIGH_LATENCY2 arrives" in remark.reason,
         ) == (0, True)
+
+
+def test_fixed_address_gets_no_heartbeat_over_a_satellite_link(
+    monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
+    """Over `udpout`, heartbeats announce the service until only HIGH_LATENCY2 arrives; then nothing is sent."""
+    monkeypatch.setattr(mavlink_source, "_STATUS_INTERVAL", 0.0)
+    timings.source_tick = 0.01
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as satellite:
+        satellite.bind(("127.0.0.1", 0))
+        satellite.setblocking(False)
+        with Listener(f"mavlink:udpout:127.0.0.1:{satellite.getsockname()[1]}") as listener:
+            heard = [address for _, address in _received(listener, satellite)]
+            satellite.sendto(HIGH_LATENCY.pack(dialect.MAVLink(None, 3, 1)), heard[0])
+            listener.step_until(lambda: listener.rejections, what="the remark")
+            with suppress(BlockingIOError):
+                while True:
+                    satellite.recv(65535)
+            for _ in range(20):
+                listener.step()
+            with pytest.raises(BlockingIOError):
+                satellite.recv(65535)
+
+
+def _received(listener: Listener, peer: socket.socket) -> list[tuple[bytes, Any]]:
+    """Step until a datagram arrives, and return it with its sender."""
+    datagrams: list[tuple[bytes, Any]] = []
+
+    def has_arrived() -> bool:
+        with suppress(BlockingIOError):
+            datagrams.append(peer.recvfrom(65535))
+        return len(datagrams) > 0
+
+    listener.step_until(has_arrived, what="a datagram")
+    return datagrams
 
 
 def test_receive_buffer_holds_a_burst(port: int) -> None:

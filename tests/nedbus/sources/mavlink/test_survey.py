@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 import time
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
@@ -12,6 +14,8 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus import limits
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import LinkSurvey, survey_link
+from nedbus.sources.mavlink.link import Link, Packet
+from nedbus.sources.mavlink.survey import _Surveyor
 from tests.peers.ports import free_port
 from tests.waits import DEADLINE, repeating
 
@@ -50,7 +54,7 @@ def test_survey_tells_autopilots_from_other_senders() -> None:
         b"SDLOG_BACKEND", backend, dialect.MAV_PARAM_TYPE_INT32, 1, 0
     )
     log = dialect.MAVLink_logging_data_message(245, 191, 7, 1, 0, [0] * 249)
-    own = packets_of(7, 1, HEARTBEAT, parameter, log)
+    own = packets_of(7, 1, parameter, HEARTBEAT, log)
     camera = packets_of(7, 100, HEARTBEAT)
     result = survey(*own, *camera, until="(7, 100)")
     assert set(result.systems) == {7}
@@ -61,6 +65,7 @@ def test_survey_tells_autopilots_from_other_senders() -> None:
     assert system.sends_log_to_nedbus
     assert set(system.messages) == {"HEARTBEAT", "PARAM_VALUE", "LOGGING_DATA"}
     assert system.size >= sum(map(len, own))
+    assert [*result.ignored] == [(7, 100)]  # the autopilot only until its first HEARTBEAT
     assert result.ignored[7, 100].startswith("not an autopilot")
     assert len(result.packets) == 1
 
@@ -77,11 +82,25 @@ def test_packets_are_counted_for_few_addresses(monkeypatch: pytest.MonkeyPatch) 
 
     try:
         with repeating(send):
-            counts = [len(survey_link(f"udpin:127.0.0.1:{port}", 0.3).packets) for _ in range(3)]
+            surveys = [survey_link(f"udpin:127.0.0.1:{port}", 0.3).packets for _ in range(3)]
     finally:
         for sender in senders:
             sender.close()
-    assert max(counts) == 5
+    assert max(map(len, surveys)) == 5
+    assert max(packets.total() for packets in surveys) > 5, "all packets of these"
+
+
+def test_round_trip_is_the_shortest_of_this_survey() -> None:
+    """The shortest answer to TIMESYNC counts; answers to other programs, whose clock differs, do not."""
+    surveyor = _Surveyor(cast("Link", SimpleNamespace(stream=False, send=lambda *_: True)), 5.0)
+    for system, age in ((7, 0.5), (7, 0.1), (7, 0.8), (8, 60.0), (8, -1.0)):
+        sent = time.monotonic_ns() - round(age * 1e9)
+        for packet in packets_of(system, 1, HEARTBEAT, dialect.MAVLink_timesync_message(1, sent)):
+            surveyor._on_packet(Packet(packet, "peer", time.monotonic()), time.monotonic())
+    trip = surveyor.survey.systems[7].round_trip
+    assert trip is not None
+    assert 0.1 <= trip < 0.5
+    assert surveyor.survey.systems[8].round_trip is None
 
 
 def test_invalid_links_raise() -> None:

@@ -5,9 +5,17 @@ from __future__ import annotations
 import pytest
 
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.px4.streams import NotAcceptedError, StreamRegistry
-from nedbus.transport import Attachment, TopicKey
-from nedbus_msgs import MESSAGES, DecodeError, dds_type, hash_of, ros2_type
+from nedbus.sources.px4.streams import NotAcceptedError, StreamRegistry, TypeHashes
+from nedbus.transport import NO_HASH, Attachment, TopicKey
+from nedbus_msgs import (
+    MESSAGES,
+    DecodeError,
+    dds_type,
+    define_msg,
+    hash_of,
+    hash_of_msg,
+    ros2_type,
+)
 from tests.flights.local_position import ROS2_TYPE, type_hash
 from tests.flights.messages import VLP
 
@@ -68,6 +76,26 @@ def test_hash_with_literal_char_is_recognized(streams: StreamRegistry, is_litera
     assert (form.definition, form.layout.types, form.is_literal) == (
         definition, definition.current.types, is_literal,
     )  # fmt: skip
+
+
+def test_key_without_type_hash_needs_a_single_definition() -> None:
+    """A key without a type hash is decoded with the only definition of its message; with two it is ambiguous."""
+    topic = TopicKey(0, "fmu/out/thing", "px4_msgs::msg::dds_::Thing_", NO_HASH)
+    definitions = {}
+    for field in ("a", "b"):
+        text = f"uint64 timestamp\nfloat32 {field}\n"
+        digest = hash_of_msg("Thing", text)
+        definitions[TypeHashes(digest, digest)] = define_msg("Thing", text)
+        streams = StreamRegistry(
+            Px4ZenohOptions(), vehicle="1", supplied={topic.dds_type: definitions}
+        )
+        stream = streams.on_message(str(topic), 100.0)
+        if field == "a":
+            assert "a" in streams.wire_format_of(stream).layout.types
+    with pytest.raises(
+        NotAcceptedError, match=r"Thing\.msg has the type hash .* or .*; use the file"
+    ):
+        streams.wire_format_of(stream)
 
 
 def test_address_is_released_after_3_s(streams: StreamRegistry) -> None:

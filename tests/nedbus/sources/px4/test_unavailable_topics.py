@@ -8,6 +8,7 @@ from nedbus.sources import UnavailableTopics
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import StreamRegistry
 from nedbus.transport import PublisherToken, TopicKey
+from nedbus_msgs import TOPICS
 
 
 def token(topic: str, message: str = "Any", *, session: str = "a") -> PublisherToken:
@@ -58,7 +59,8 @@ def test_vehicle_without_any_message_has_no_silent_topics(streams: StreamRegistr
 
 
 def test_topic_without_nominal_rate_is_never_reported_as_silent(streams: StreamRegistry) -> None:
-    """A topic without a nominal rate, such as home_position, is never reported as silent."""
+    """A topic without a nominal rate, such as home_position, is never reported as silent; others have 1 Hz or more."""
+    assert {topic.rate for topic in TOPICS.values() if topic.rate < 1} == {0}
     streams.add_publisher(token("home_position"), 100.0)
     assert streams.report(200.0) == UnavailableTopics()
     assert report_after_message(streams, "vehicle_attitude", 200.0).silent == (

@@ -292,9 +292,11 @@ def test_restart_of_the_service_continues(setup: Setup, bus: nedbus.Bus) -> None
 
 def test_several_vehicles_on_a_link_get_none() -> None:
     """A position is for one vehicle: with two on the link, or none, nothing is sent, with the reason."""
-    assert choose_target({4: ("4", "peer")}) == Target(4, "4", "peer")
-    assert "no vehicle" in choose_target({}).obstacle
-    assert "several vehicles (a, b)" in choose_target({1: ("a", 0), 2: ("b", 0)}).obstacle
+    assert choose_target([Target(4, "4", "peer")]) == Target(4, "4", "peer")
+    assert "no vehicle" in choose_target([]).obstacle
+    assert (
+        "several vehicles (a, b)" in choose_target([Target(1, "a", 0), Target(2, "b", 0)]).obstacle
+    )
 
 
 def test_own_name_of_the_vehicle_is_refused(start: Start) -> None:

@@ -92,6 +92,15 @@ def test_data_before_the_first_heartbeat_is_no_fault(tmp_path: Path) -> None:
     assert chunk_of(link.data(1500, SAVED + 2.3)) == Chunk("delivered", DEFINITIONS, begins=True)
 
 
+def test_new_stream_is_not_continued(tmp_path: Path) -> None:
+    """A stream that begins, with sequence 0, has definitions of its own: the saved ones are not used."""
+    link = Link(tmp_path)
+    link.introduce(SAVED + 2, 62.0)
+    rejected = link.data(0, SAVED + 2.1)
+    assert isinstance(rejected, Rejection)
+    assert "of a stream that was not requested" in rejected.reason
+
+
 @pytest.mark.parametrize(("boot", "state", "reason"), [
     (5.0, None, "the vehicle has rebooted since its definitions were saved"),
     (62.0, "0", "state=0 is set"),
