@@ -153,9 +153,7 @@ class Vehicle:
         """Whether the link is a satellite link, whose only message is HIGH_LATENCY2."""
         return self._last_high_latency > self._last_heartbeat + _HEARTBEAT_TIMEOUT
 
-    def handle_all(
-        self, message: Any, now: float, log: StreamedTopics | None = None
-    ) -> list[Item]:
+    def handle_all(self, message: Any, now: float, log: StreamedTopics | None = None) -> list[Item]:
         """Convert a message as `handle` does; HIGH_LATENCY2 contains several topics."""
         kind = message.get_type()
         if kind == HIGH_LATENCY:
@@ -183,9 +181,7 @@ class Vehicle:
                 items.append(item)
         return items
 
-    def handle(
-        self, message: Any, now: float, log: StreamedTopics | None = None
-    ) -> Item | None:
+    def handle(self, message: Any, now: float, log: StreamedTopics | None = None) -> Item | None:
         """Convert a message; return a Rejection if it is out of order, or there are too many texts.
 
         Return None if no chosen topic needs it, or `log`, the vehicle's ULog stream, delivers that topic.
@@ -203,15 +199,12 @@ class Vehicle:
         else:
             self._stored.add(name, message, timestamp, now)
         if name == "STATUSTEXT":
-            rejection = self._add_text(message, now, log)
-            if rejection is not None:
-                return rejection
+            return self._add_text(message, now, log) or self._next_text(now, log)
         if name not in CONVERSIONS:
             return self._next_text(now, log)
         topic, convert = CONVERSIONS[name]
-        if topic not in self._topics or timestamp is None:
-            return None
-        if name == "ATTITUDE" and self._has_quaternion(now):
+        is_redundant = name == "ATTITUDE" and self._has_quaternion(now)
+        if topic not in self._topics or timestamp is None or is_redundant:
             return None
         return self._publish(
             self._address_of(topic, message), convert(message), timestamp, now, log
@@ -233,9 +226,7 @@ class Vehicle:
         self._texts.add(message, now)
         return None
 
-    def _next_text(
-        self, now: float, log: StreamedTopics | None
-    ) -> Item | None:
+    def _next_text(self, now: float, log: StreamedTopics | None) -> Item | None:
         """Return the next text that is complete, with the newest time."""
         newest = self.clock.newest
         if self._text_address.topic not in self._topics or newest is None:
