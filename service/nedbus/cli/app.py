@@ -40,7 +40,7 @@ _COMMANDS: Final[Mapping[str, _Command]] = {
         "Show whether a position that is sent into a vehicle is used, and why not, live or from a file.",
     ),
     "health": _Command(
-        "checks", "Check services, sources, messages and vehicles; exit with 0 if healthy."
+        "health", "Check services, sources, messages and vehicles; exit with 0 if healthy."
     ),
     "doctor": _Command("checks", "Diagnose why no messages arrive."),
     "check": _Command("checks", "Check settings and router files."),

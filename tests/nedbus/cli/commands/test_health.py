@@ -213,6 +213,22 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
         assert health("--vehicle", "1").exit_code == 0
 
 
+def test_faults_of_a_vehicle_do_not_hide_those_of_a_vehicle_with_a_shorter_name(
+    endpoint: str, health: Health
+) -> None:
+    """An expected vehicle without a publisher is missing, even if a service still reports it."""
+    with serving(endpoint, "sim:") as daemon:
+        wait_for(lambda: health().exit_code == 0, what="health")
+        daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time())
+        wait_for(lambda: "1, 2" in health("--expect", "25").err, what="vehicle 2")
+        result = health("--expect", "2,25")
+    assert result.exit_code == 1
+    assert result.err.splitlines() == [
+        "nedbus: vehicle 25 is missing: it has no publisher; published: 1, 2",
+        "nedbus: vehicle 2 is missing: it has no publisher, although a service reports it",
+    ]
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
