@@ -141,7 +141,8 @@ def ros2(
             raise ConfigError("--namespace", f"{text!r}: expected VEHICLE:NAMESPACE")
         namespaces[vehicle] = name
     try:
-        session, observer = bus.open_session(to), bus.open_session(to)
+        session = bus.open_session(to)
+        observer = bus.open_session(to)
     except ConnectError as exc:
         raise NedbusError(
             f"no router answers at {to}: start ROS 2's router there, or correct --to"

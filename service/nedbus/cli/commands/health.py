@@ -272,7 +272,8 @@ class _Check:
         if not self.ages:
             return None
         vehicle = min(self.ages, key=self.ages.__getitem__)
-        age, limit = self.ages[vehicle], self._wanted.max_age
+        age = self.ages[vehicle]
+        limit = self._wanted.max_age
         if age <= limit:
             return None
         return f"the newest message is {format_duration(age)} old, from vehicle {vehicle}: the limit is {limit:g} s"

@@ -34,7 +34,8 @@ _WARNINGS: Final = 5
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     """Show the services on the network with their sources and streams."""
-    services, vehicles = bus.services(), bus.vehicles()
+    services = bus.services()
+    vehicles = bus.vehicles()
     if json_output:
         for service in services:
             write(json.dumps(asdict(service)))
