@@ -46,3 +46,12 @@ def test_stream_that_was_hidden_is_written_when_it_returns(
     monkeypatch.setattr(hz, "_streams", lambda *_: next(rows))
     monkeypatch.setattr(hz, "follow", show_each)
     assert run_command("hz", "-c", endpoint, "--json").out.count(VLP) == 2
+
+
+def test_worst_streams_come_first() -> None:
+    """Streams are ordered by state; in one state those with a fault, such as a gap, come before the sound ones."""
+    address, health = Address("1", VLP), StreamHealth(VLP).snapshot(0)
+    sound = _Stream(address, health, StreamState("ok"))
+    faulty = _Stream(address, replace(health, gaps=1), StreamState("ok"))
+    stale = _Stream(address, health, StreamState("stale", "no message"))
+    assert sorted([sound, faulty, stale], key=_Stream.rank) == [stale, faulty, sound]
