@@ -23,31 +23,33 @@ class Absence(NamedTuple):
 def explain_absence(bus: Bus, published: Collection[str], wanted: Sequence[str] = ()) -> Absence:
     """Return why no vehicle is published, or none of the `wanted` ones; queries the services."""
     services = bus.services()
-    reasons = [reason for service in services for reason in _source_reasons(service, wanted)]
+    reasons: list[str] = []
+    for service in services:
+        reasons += _source_reasons(service, wanted)
     if reasons:
+        text = "; ".join(reasons[:_REASONS])
         hidden = len(reasons) - _REASONS
-        more = f"; and {hidden} more" if hidden > 0 else ""
-        return Absence(f"{'; '.join(reasons[:_REASONS])}{more}", is_fault=True)
+        if hidden > 0:
+            text = f"{text}; and {hidden} more"
+        return Absence(text, is_fault=True)
     if published:
-        return Absence(
-            f"choose one of {to_text(', '.join(sorted(published)[: limits.SHOWN_NAMES]))}",
-            is_fault=False,
-        )
+        return Absence(f"choose one of {_names(sorted(published))}", is_fault=False)
     if services:
         advice = "see 'nedbus info' and the access rules for it and this client (docs/security.md)"
         outdated = [service.service for service in services if service.is_outdated]
         if outdated:
-            names = to_text(", ".join(outdated[: limits.SHOWN_NAMES]))
-            advice = f"{advice}; update nedbus on the host of {names}, which is older"
+            advice = f"{advice}; update nedbus on the host of {_names(outdated)}, which is older"
         return Absence(f"a service answers: {advice}", is_fault=False)
-    if prefixes := bus.other_prefixes(timeout=_TIMEOUT)[:_REASONS]:
-        names = " and ".join(f"{to_text(prefix)}/" for prefix in prefixes)
-        advice = f"use --prefix {to_text(prefixes[0])}"
-        reason = (
-            f"messages are published under {names}, but the prefix here is {bus.prefix}/: {advice}"
-        )
-        return Absence(reason, is_fault=True)
+    prefixes = [to_text(prefix) for prefix in bus.other_prefixes(timeout=_TIMEOUT)[:_REASONS]]
+    if prefixes:
+        names = " and ".join(f"{prefix}/" for prefix in prefixes)
+        here = f"the prefix here is {bus.prefix}/: use --prefix {prefixes[0]}"
+        return Absence(f"messages are published under {names}, but {here}", is_fault=True)
     return Absence("start a source with 'nedbus serve'", is_fault=False)
+
+
+def _names(names: Sequence[str]) -> str:
+    return to_text(", ".join(names[: limits.SHOWN_NAMES]))
 
 
 def describe_outdated(services: Sequence[ServiceStatus]) -> list[str]:
@@ -85,10 +87,8 @@ def _source_reason(source: SourceStatus, wanted: Sequence[str]) -> str:
         address for address in source.stale if not wanted or address.partition("/")[0] in wanted
     ]
     if stale:
-        names = to_text(", ".join(stale[: limits.SHOWN_NAMES]))
-        return (
-            f"receives no more messages of {names}: check that the vehicle is on and its link is up"
-        )
+        hint = "check that the vehicle is on and its link is up"
+        return f"receives no more messages of {_names(stale)}: {hint}"
     if source.state in {"waiting", "starting"} and not source.addresses:
         return "has received no message yet: check that the vehicle sends to it"
     return ""

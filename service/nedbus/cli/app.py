@@ -29,7 +29,7 @@ _COMMANDS: Final[Mapping[str, _Command]] = {
     "echo": _Command("echo", "Print messages as they arrive, one line each."),
     "hz": _Command("hz", "Measure rate, jitter, latency, loss and validity of each stream."),
     "get": _Command("query", "Show the last message of each stream with all its fields."),
-    "info": _Command("query", "Show the services on the network with their sources and streams."),
+    "info": _Command("info", "Show the services on the network with their sources and streams."),
     "events": _Command("events", "Show vehicle events and their evidence, live or from a file."),
     "why": _Command(
         "events",
@@ -40,7 +40,7 @@ _COMMANDS: Final[Mapping[str, _Command]] = {
         "Show whether a position that is sent into a vehicle is used, and why not, live or from a file.",
     ),
     "health": _Command(
-        "checks", "Check services, sources, messages and vehicles; exit with 0 if healthy."
+        "health", "Check services, sources, messages and vehicles; exit with 0 if healthy."
     ),
     "doctor": _Command("checks", "Diagnose why no messages arrive."),
     "check": _Command("checks", "Check settings and router files."),

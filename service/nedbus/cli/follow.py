@@ -1,6 +1,7 @@
 """Receive loop of commands with a subscription; it logs when the router link is lost and restored."""
 
 import logging
+import math
 import signal
 import sys
 import time
@@ -34,38 +35,40 @@ def follow(
 
     Raises NoDataError if no sample was counted.
     """
-    start = time.monotonic()
-    end = float("inf") if duration is None else start + duration
-    next_second = start + 1.0
-    noticed, seen = False, 0
+    end = math.inf if duration is None else time.monotonic() + duration
+    most = math.inf if count is None else count
+    notice_time = time.monotonic() + TIMINGS.first_sample
+    next_second = time.monotonic() + 1.0
+    seen = 0
 
     def log_link(is_up: bool) -> None:
-        text = "the link to %s is up again" if is_up else "the link to %s is lost: reconnecting"
-        _log.warning(
-            text, " or ".join(bus.routers), extra=about("link_up" if is_up else "link_lost")
-        )
+        routers = " or ".join(bus.routers)
+        if is_up:
+            _log.warning("the link to %s is up again", routers, extra=about("link_up"))
+        else:
+            _log.warning("the link to %s is lost: reconnecting", routers, extra=about("link_lost"))
 
     bus.on_link(log_link)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        while (now := time.monotonic()) < end and (count is None or seen < count):
+        while seen < most and (now := time.monotonic()) < end:
             if now >= next_second:
                 next_second = max(next_second + 1.0, now)
                 each_second()
-            if not seen and not noticed and now > start + TIMINGS.first_sample:
-                noticed = True
+            if not seen and now > notice_time:
+                notice_time = math.inf
                 write_notice(subscription)
-            try:
+            with suppress(NoDataError):
                 sample = subscription.receive(max(0.0, min(end, next_second) - now))
-            except NoDataError:
-                continue
-            seen += handle(sample) is not False
+                if handle(sample) is not False:
+                    seen += 1
     finally:
         if not isinstance(sys.exception(), Exception):  # the end, or a signal
             subscription.drain()
             with suppress(ClosedError):
-                while count is None or seen < count:
-                    seen += handle(subscription.receive(0.0)) is not False
+                while seen < most:
+                    if handle(subscription.receive(0.0)) is not False:
+                        seen += 1
     if not seen:
         raise NoDataError(subscription.name, duration or 0.0)
     each_second()

@@ -225,15 +225,15 @@ def _select(
     streams = [_split_stream(text) for text in topics]
     first = streams[0]
     for text, stream in zip(topics, streams, strict=True):
-        if (stream.vehicle, stream.instance) != (first.vehicle, first.instance):
+        if stream.vehicle != first.vehicle or stream.instance != first.instance:
             reason = f"{topics[0]!r} and {text!r} differ in vehicle or instance: name them with --vehicle and --topic"
             raise ConfigError("TOPIC", reason)
-    chosen = vehicle or ANY if first.vehicle is None else first.vehicle
-    return Selection(
-        [stream.topic for stream in streams],
-        chosen,
-        instance if first.instance is None else first.instance,
-    )
+    vehicles = vehicle or ANY
+    if first.vehicle is not None:
+        vehicles = first.vehicle
+    if first.instance is not None:
+        instance = first.instance
+    return Selection([stream.topic for stream in streams], vehicles, instance)
 
 
 class _Stream(NamedTuple):
@@ -247,7 +247,8 @@ class _Stream(NamedTuple):
 def _split_stream(text: str) -> _Stream:
     chunks = text.strip("/").split("/")
     vehicle = instance = None
-    if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1 and chunks[1] not in ("in", "out"):
+    names_vehicle = len(chunks) > 1 and chunks[0] not in {*TOPICS, ANY}
+    if names_vehicle and chunks[1] not in ("in", "out"):  # fmu/out/TOPIC has its own error
         vehicle = chunks.pop(0)
     if len(chunks) == 2 and chunks[1].isdecimal():
         instance = int(chunks.pop())
@@ -272,7 +273,9 @@ def _columns_of(definition: Definition[Any]) -> list[str]:
 
 def parse_fields(text: str | None, selection: Selection) -> list[str]:
     """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
-    names = [name.strip() for name in text.split(",") if name.strip()] if text else []
+    if text is None:
+        return []
+    names = [name.strip() for name in text.split(",") if name.strip()]
     topics = selection.topics
     if topics == (ANY,):
         messages: list[Definition[Any]] = list(MESSAGES.values())

@@ -30,14 +30,9 @@ class _StrictParsing:
         try:
             _, _, parsed = command.make_parser(ctx).parse_args(args=list(args))
             for option, times in Counter(parsed).items():
-                if (
-                    times > 1
-                    and option.param_type_name == "option"
-                    and not (option.multiple or option.is_flag)
-                ):
-                    raise typer.BadParameter(
-                        f"given {times} times, but it takes one value", ctx=ctx, param=option
-                    )
+                if times > 1 and _takes_one_value(option):
+                    text = f"given {times} times, but it takes one value"
+                    raise typer.BadParameter(text, ctx=ctx, param=option)
             parsed_args: list[str] = super().parse_args(ctx, args)  # type: ignore[misc] # of the command
         except _UsageError as exc:
             meant = _MEANT.get(getattr(exc, "option_name", ""))
@@ -46,6 +41,12 @@ class _StrictParsing:
                 exc.possibilities = [meant]  # type: ignore[attr-defined] # of an unknown option
             raise
         return parsed_args
+
+
+def _takes_one_value(option: Any) -> bool:
+    if option.param_type_name != "option":
+        return False
+    return not option.multiple and not option.is_flag
 
 
 class Command(_StrictParsing, TyperCommand):

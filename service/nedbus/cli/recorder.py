@@ -1,5 +1,6 @@
 """Recorder of a subscription to an MCAP file."""
 
+import math
 import threading
 import time
 from contextlib import suppress
@@ -24,7 +25,8 @@ class Recorder:
 
     def __init__(self, subscription: Subscription[Any], path: Path) -> None:
         check_recording(path)
-        self._subscription, self._path = subscription, path
+        self._subscription = subscription
+        self._path = path
         self._writer: RecordingWriter | None = None
 
     @property
@@ -35,15 +37,15 @@ class Recorder:
     @property
     def status(self) -> str:
         """The counts so far as text, such as "120 messages, 2 lost"."""
-        names = ("lost", "dropped", "invalid", "discarded", "forgotten")
-        counts = [
-            f"{count} {name}"
-            for name in names
-            if (count := getattr(self._subscription.counts, name))
-        ]
+        texts = [counted(self.messages, "message")]
+        counts = self._subscription.counts
+        for name in ("lost", "dropped", "invalid", "discarded", "forgotten"):
+            count = getattr(counts, name)
+            if count:
+                texts.append(f"{count} {name}")
         if self._writer is not None and self._writer.omitted:
-            counts.append(f"{self._writer.omitted} not recorded")
-        return ", ".join([f"{counted(self.messages, 'message')}", *counts])
+            texts.append(f"{self._writer.omitted} not recorded")
+        return ", ".join(texts)
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
         """Record until `stop` is set, for `duration` seconds, or until the subscription is closed; then drain it.
@@ -51,19 +53,18 @@ class Recorder:
         Raises OutputError if the file exists or cannot be written. Raises NoDataError, and removes the file, if no
         message arrived.
         """
-        start = now = time.monotonic()
-        end = float("inf") if duration is None else now + duration
-        next_flush = now + _FLUSH_INTERVAL
+        start = time.monotonic()
+        now = start
+        end = math.inf if duration is None else start + duration
+        next_flush = start + _FLUSH_INTERVAL
         # raised once all is written
         with RecordingWriter(self._path) as self._writer, suppress(ClosedError):
             while True:
                 if stop.is_set() or now >= end:
                     self._subscription.drain()
+                timeout = max(0.0, min(_POLL_INTERVAL, end - now))
                 with suppress(NoDataError):
-                    _write(
-                        self._writer,
-                        self._subscription.receive_batch(max(0.0, min(_POLL_INTERVAL, end - now))),
-                    )
+                    _write(self._writer, self._subscription.receive_batch(timeout))
                 now = time.monotonic()
                 if now >= next_flush:
                     self._writer.flush()

@@ -44,9 +44,11 @@ def run_until_stopped(
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
-    stop, closing = threading.Event(), closing or threading.Event()
+    stop = threading.Event()
+    closing = closing or threading.Event()
     outcome: Future[object] = Future()
-    signals, hangups = list[int](), list[int]()
+    signals: list[int] = []
+    hangup = threading.Event()
     changed: queue.SimpleQueue[None] = queue.SimpleQueue()  # `put` is reentrant
 
     def run() -> None:
@@ -65,7 +67,10 @@ def run_until_stopped(
         on_stop()
 
     def on_signal(number: int, _: FrameType | None) -> None:
-        (hangups.append if number == signal.SIGHUP else end)(number)
+        if number == signal.SIGHUP:
+            hangup.set()
+        else:
+            end(number)
         changed.put(None)
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -77,8 +82,8 @@ def run_until_stopped(
     thread = threading.Thread(target=run, name="nedbus-run", daemon=True)
     thread.start()
     while thread.is_alive() and not signals:
-        if hangups:
-            hangups.clear()
+        if hangup.is_set():
+            hangup.clear()
             thread.join(_HANGUP_PAUSE)
             if signals:
                 break
@@ -92,9 +97,11 @@ def run_until_stopped(
     if signals:
         _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("shutdown"))
     _await_end(thread, closing, signals)
-    failed, interrupted = outcome.result() is False, signals[:1] == [signal.SIGINT]
-    if failed or interrupted:
-        raise typer.Exit(130 if interrupted else 1)
+    result = outcome.result()
+    if signals and signals[0] == signal.SIGINT:
+        raise typer.Exit(130)
+    if result is False:
+        raise typer.Exit(1)
 
 
 def _await_end(thread: threading.Thread, closing: threading.Event, signals: list[int]) -> None:

@@ -120,28 +120,27 @@ class Notifier:
                 elif now >= next_status:
                     self._send(STATUS=self._status())
                     next_status = now + TIMINGS.systemd_status
-                if (
-                    interval is not None
-                    and now >= next_ping
-                    and self._ticked
-                    and self._daemon.busy < interval
-                ):
-                    self._ticked, next_ping = False, now + interval
+                if interval is not None and now >= next_ping and self._is_alive(interval):
+                    self._ticked = False
+                    next_ping = now + interval
                     self._send(WATCHDOG=1)
             pause = TIMINGS.systemd_status if self._is_ready else _START_INTERVAL
             if self._stop.wait(pause if interval is None else min(pause, interval / 2)):
                 return
 
+    def _is_alive(self, interval: float) -> bool:
+        """Return whether the main thread has run since the last ping, and no thread has been busy for an interval."""
+        return self._ticked and self._daemon.busy < interval
+
     def _status(self) -> str:
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)
-            return (
-                f"waiting for a router at {where}"
-                if daemon.role == "client"
-                else f"starting a router on {where}"
-            )
-        now, sources = time.monotonic(), daemon.sources
+            if daemon.role == "client":
+                return f"waiting for a router at {where}"
+            return f"starting a router on {where}"
+        now = time.monotonic()
+        sources = daemon.sources
         published = sum(source.published for source in sources)
         since, before = self._counted
         self._counted = now, published
@@ -151,19 +150,18 @@ class Notifier:
             f"{counted(len(sources), 'source')}, {counted(streams, 'stream')}, "
             f"{float(f'{rate:.2g}'):g} messages/s, {counted(daemon.sessions, 'session')}"
         )
-        return to_text(
-            "; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])),
-            limits.LINE_TEXT,
-        )
+        texts = [counts, *why_not_ready(daemon)]
+        if self._rejected:
+            texts.insert(1, self._rejected)
+        return to_text("; ".join(texts), limits.LINE_TEXT)
 
 
 def watchdog_interval(environment: Mapping[str, str]) -> float | None:
     """Return the interval of watchdog pings [s], half of systemd's limit; None if the watchdog is off."""
     limit = environment.get("WATCHDOG_USEC", "")
-    if (
-        not limit.isdecimal()
-        or int(limit) == 0
-        or environment.get("WATCHDOG_PID", "") not in {"", str(os.getpid())}
-    ):
+    pid = environment.get("WATCHDOG_PID", "")
+    if not limit.isdecimal() or int(limit) == 0:
+        return None
+    if pid and pid != str(os.getpid()):
         return None
     return int(limit) / 2e6

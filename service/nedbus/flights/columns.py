@@ -42,10 +42,11 @@ class Decoded(NamedTuple):
     def utc_columns(self) -> dict[str, npt.NDArray[Any]]:
         """Return the columns of the valid messages for `UtcEstimate`, without the fields that all messages lack."""
         fields = self.absent.dtype.names or ()
-        columns = {}
+        columns: dict[str, npt.NDArray[Any]] = {}
         for name in UTC_COLUMNS:
-            is_provided = name in fields and not self.absent[name].all()
-            if is_provided or (name in fields and name == "timestamp"):
+            if name not in fields:
+                continue
+            if name == "timestamp" or not self.absent[name].all():
                 columns[name] = self.messages[name][self.valid]
         return columns
 
@@ -163,15 +164,12 @@ def _decode_table(
     plan = definition.plan(tuple(columns))
     decoded = Decoded.empty(definition, len(table))
     messages = decoded.messages
-    valid = decoded.valid
-    absent = decoded.absent
-    provided = plan.provided - stream.lacking
-    for name in definition.all_fields - provided:
-        absent[name] = True
+    for name in definition.all_fields - (plan.provided - stream.lacking):
+        decoded.absent[name] = True
     for name, converted in _convert_columns(stream, table).items():
         columns[name] = converted.values
         if name in plan.names:
-            absent[name] = converted.absent
+            decoded.absent[name] = converted.absent
     for name, old in plan.names.items():
         messages[name] = columns[old]
     for name, (olds, convert) in plan.converted.items():
@@ -179,16 +177,26 @@ def _decode_table(
         parts = [unknown if old is None else columns[old] for old in olds]
         rows = zip(*(part.tolist() for part in parts), strict=True)
         messages[name] = [convert(*values) for values in rows]
-    valid[:] = arrays_of(definition).valid_mask(messages)
+    decoded.valid[:] = arrays_of(definition).valid_mask(messages)
     for name, old in plan.names.items():
-        is_integer = messages[name].dtype.kind in "iu"
-        if is_integer and messages[name].dtype != columns[old].dtype:
-            is_in_range = messages[name] == columns[old]
-            valid &= _by_message(is_in_range).all(axis=1)
+        decoded.valid[_is_out_of_range(messages[name], columns[old])] = False
     for name in stream.strict_bools & columns.keys():
         is_no_bool = columns[name].astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
-        valid[_by_message(is_no_bool).any(axis=1)] = False
+        decoded.valid[_any_in_message(is_no_bool)] = False
     return decoded
+
+
+def _is_out_of_range(values: npt.NDArray[Any], logged: npt.NDArray[Any]) -> _Mask:
+    """Return the messages in which an integer of another type in the file does not fit into that of the field."""
+    if values.dtype.kind not in "iu" or values.dtype == logged.dtype:
+        return np.zeros(len(values), bool)
+    return _any_in_message(values != logged)
+
+
+def _any_in_message(mask: npt.NDArray[Any]) -> _Mask:
+    """Return the messages that have any true element, whether or not the field is an array."""
+    by_message: _Mask = np.any(mask.reshape(len(mask), -1), axis=1)
+    return by_message
 
 
 class _Converted(NamedTuple):
@@ -215,11 +223,6 @@ def _to_column(kind: Any, values: list[Any]) -> npt.NDArray[Any]:
     if kind.is_text:
         return np.char.encode(np.array(values, str), "utf-8")
     return np.array(values, kind.form[-1])
-
-
-def _by_message(mask: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return a mask with one row for each message, whether or not the field is an array."""
-    return mask.reshape(len(mask), -1)
 
 
 def _decode_rows(definition: Definition[Any], rows: Collection[Mapping[str, Any]]) -> Decoded:

@@ -10,7 +10,9 @@ from nedbus_msgs import ANY, MESSAGES, TOPICS, Address, Selection, get_topic
 
 def parse_topics(text: str) -> tuple[str, ...]:
     """Parse `TOPIC,TOPIC`; a message name selects all of its topics; raise AddressError for an invalid name."""
-    names = tuple(part.strip() for part in text.split(",")) if text else ()
+    if not text:
+        return ()
+    names = tuple(part.strip() for part in text.split(","))
     for name in names:
         if name not in (ANY, *MESSAGES):
             get_topic(name)
@@ -44,13 +46,12 @@ def matching(
     where: Path | str, addresses: Sequence[Address], selection: Selection
 ) -> list[Address]:
     """Return the selected addresses of a flight; raise AddressError if there are none."""
-    without_topic = Selection(vehicle=selection.vehicles)
-    without_instance = Selection(selection.topics, selection.vehicles)
-    for part, step in {
-        "vehicle": without_topic,
-        "topic": without_instance,
+    steps = {
+        "vehicle": Selection(vehicle=selection.vehicles),
+        "topic": Selection(selection.topics, selection.vehicles),
         "instance": selection,
-    }.items():
+    }
+    for part, step in steps.items():
         if not any(map(step.matches, addresses)):
             expected = f"one of {_list(addresses)}"
             value = _value_of(part, selection)
@@ -78,16 +79,14 @@ def single_match(path: Path, addresses: Sequence[Address], selection: Selection)
     plain = [address for address in matches if address.instance is None]
     if is_one_topic and len(plain) == 1:
         matches = plain
-    lacking = [
-        part
-        for part in ("topic", "vehicle", "instance")
-        if len({getattr(address, part) for address in matches}) > 1
-    ]
+    lacking = []
+    for part in ("topic", "vehicle", "instance"):
+        values = {getattr(address, part) for address in matches}
+        if len(values) > 1:
+            lacking.append(part)
     if lacking:
-        names = " and ".join(lacking)
-        expected = (
-            f"one stream of {path}, but several match; set {names} to one of {_list(matches)}"
-        )
+        choices = f"set {' and '.join(lacking)} to one of {_list(matches)}"
+        expected = f"one stream of {path}, but several match; {choices}"
         raise AddressError(lacking[0], _value_of(lacking[0], selection), expected)
     return matches
 

@@ -13,7 +13,7 @@ from nedbus import UtcOffset, limits, utc_of
 from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.flights import utc_offset_of
 from nedbus.timeline import to_datetime64
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, Definition, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray, derive_column
 from nedbus_msgs.frames import DERIVED, derived_from
 
@@ -313,16 +313,12 @@ def _interpolate(
     stream: str, values: MessageArray, following: MessageArray, weight: _Floats
 ) -> None:
     """Interpolate the floats of `values` towards `following`, in place."""
-    topics = [part for part in stream.split("/") if part in BY_TOPIC]
-    definition = BY_TOPIC[topics[0]] if topics else None
-    quaternions: set[str] = set()
-    for rule in definition.rules if definition else ():
-        if isinstance(rule, UnitQuaternion):
-            quaternions.update(rule.fields)
     names = values.dtype.names or ()
     for name in names:
         if name.endswith("reset_counter"):
             weight = np.where(values[name] == following[name], weight, 0.0)
+    definition = _definition_of(stream)
+    quaternions = _quaternions_of(definition)
     between = weight > 0
     for name in names:
         if values.dtype[name].base.kind != "f":
@@ -339,6 +335,24 @@ def _interpolate(
             unit = definition.meaning(name) if definition else ""
             middle = _linear(first, second, parts, _period(unit))
         values[name][between] = np.where(is_same, first, middle)
+
+
+def _definition_of(stream: str) -> Definition[Any] | None:
+    """Return the definition of a stream such as "7/sensor_gps/0"; None if its topic is not built in."""
+    for part in stream.split("/"):
+        if part in BY_TOPIC:
+            return BY_TOPIC[part]
+    return None
+
+
+def _quaternions_of(definition: Definition[Any] | None) -> set[str]:
+    """Return the fields of a message that are unit quaternions."""
+    quaternions: set[str] = set()
+    if definition is not None:
+        for rule in definition.rules:
+            if isinstance(rule, UnitQuaternion):
+                quaternions.update(rule.fields)
+    return quaternions
 
 
 def _period(meaning: str) -> float:

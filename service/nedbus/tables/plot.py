@@ -71,6 +71,12 @@ class _Stream(NamedTuple):
         steps = np.diff(self.messages[counter].astype(np.int16))
         return self.seconds[1:][steps != 0]
 
+    def position_at(self, seconds: float) -> Any:
+        """Return the message nearest in time; None if it is far from that."""
+        distances = np.abs(self.seconds - seconds)
+        nearest = distances.argmin()
+        return self.messages[nearest] if distances[nearest] <= _NEAR else None
+
 
 class _Row(NamedTuple):
     """A row of flags or resets: its label, and the stream and field that it shows."""
@@ -467,12 +473,13 @@ def _marks_of(
         if not first - margin <= begin <= last + margin:
             continue
         end = last if span.until is None else min(span.until + offset, last)
+        end = max(begin, end)
         row = KINDS[event.kind].row or event.kind.replace("_", " ")
         # Conditions that begin with the same event share a mark, which ends when the last condition ends.
         shared = rows[row].get(event)
         if shared is not None:
             end = max(end, shared.end)
-        rows[row][event] = _Mark(event, _text_of(event, row), begin, max(begin, end))
+        rows[row][event] = _Mark(event, _text_of(event, row), begin, end)
     return {row: list(marks.values()) for row, marks in rows.items()}
 
 
@@ -490,37 +497,36 @@ def _mark_events(
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():
-        marker, color, size = _MARKERS[severity]
         shown = [mark for mark in marks if mark.event.severity == severity]
         if not shown:
             continue
-        style: dict[str, Any] = {
-            "marker": marker,
-            "color": color,
-            "fillstyle": "none",
-            "linestyle": "none",
-        }
         norths = []
         easts = []
         for mark in shown:
-            stream = main[mark.event.vehicle]
-            distances = np.abs(stream.seconds - mark.begin)
-            nearest = distances.argmin()
-            if distances[nearest] <= _NEAR:
-                norths.append(stream.messages["x"][nearest])
-                easts.append(stream.messages["y"][nearest])
+            position = main[mark.event.vehicle].position_at(mark.begin)
+            if position is not None:
+                norths.append(position["x"])
+                easts.append(position["y"])
         if norths:
-            on_track = Line2D(
-                easts, norths, label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3
-            )
-            on_track.set(**style)
+            on_track = _symbols(severity, easts, norths)
+            on_track.set(label=label, markeredgewidth=1.5, zorder=3)
+            on_track.set_markersize(on_track.get_markersize() + 1)
             axes["track"].add_artist(on_track)
         times = [mark.begin for mark in shown]
         heights = [0.03 for _ in shown]  # as a fraction of the axes
         for name in ("altitude", "speed"):
-            bottom = axes[name].get_xaxis_transform()
-            on_axis = Line2D(times, heights, transform=bottom, markersize=size - 1, **style)
+            on_axis = _symbols(severity, times, heights)
+            on_axis.set_transform(axes[name].get_xaxis_transform())
+            on_axis.set_markersize(on_axis.get_markersize() - 1)
             axes[name].add_artist(on_axis)
+
+
+def _symbols(severity: Severity, x: Sequence[float], y: Sequence[float]) -> Line2D:
+    """Return the symbols of events of a severity, without a line between them."""
+    marker, color, size = _MARKERS[severity]
+    return Line2D(
+        x, y, marker=marker, color=color, markersize=size, fillstyle="none", linestyle="none"
+    )
 
 
 def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:

@@ -100,35 +100,49 @@ class Tracks:
         if end == seen:
             return
         self._seen[index] = end
-        if address.topic == TRUTH:
-            valid_line = doubtful_line = _TRUTH_LINE
-        else:
-            valid_line = f"valid{track.number % PALETTE}"
-            doubtful_line = _DOUBTFUL_LINE
-        lines = ("east", valid_line, doubtful_line)
-        base = index * (self._slots + 2)
-
-        def put(number: int, east: float, line: str, north: float) -> None:
-            """Write slot `number` of the ring, with a gap in the other lines."""
-            slot = number % self._slots
-            values = dict.fromkeys(lines, math.nan)
-            values["east"] = east
-            values[line] = north
-            places = [base + slot]
-            if slot == 0:  # the copy continues the line after the last slot
-                places.append(base + self._slots)
-            for name, value in values.items():
-                for place in places:
-                    cells[name][place] = value
-
+        ring = _Ring(cells, index * (self._slots + 2), self._slots, _lines_of(address, track))
         first = seen // self._step * self._step
         points = history.points(first, end)
         is_broken = False
         for position, point in enumerate(points.tolist(), end - len(points)):
             east = point[_EAST]
-            line = doubtful_line if point[_DOUBTFUL] > 0 else valid_line
             is_new_slot = position % self._step == 0
             is_broken = math.isnan(east) or (is_broken and not is_new_slot)
             north = math.nan if is_broken else round(point[_NORTH], 2)
-            put(position // self._step, round(east, 2), line, north)
-        put((end - 1) // self._step + 1, math.nan, valid_line, math.nan)
+            line = ring.lines.doubtful if point[_DOUBTFUL] > 0 else ring.lines.valid
+            ring.put(position // self._step, round(east, 2), line, north)
+        ring.put((end - 1) // self._step + 1, math.nan, ring.lines.valid, math.nan)
+
+
+class _Lines(NamedTuple):
+    """The line types of a track."""
+
+    valid: str
+    doubtful: str
+
+
+def _lines_of(address: Address, track: Track) -> _Lines:
+    if address.topic == TRUTH:
+        return _Lines(_TRUTH_LINE, _TRUTH_LINE)
+    return _Lines(f"valid{track.number % PALETTE}", _DOUBTFUL_LINE)
+
+
+class _Ring(NamedTuple):
+    """The slots of one track: changed cells by column, the row of the first slot, the number of slots, its lines."""
+
+    cells: dict[str, dict[int, float]]
+    base: int
+    slots: int
+    lines: _Lines
+
+    def put(self, number: int, east: float, line: str, north: float) -> None:
+        """Write slot `number`, with a gap in the other line."""
+        slot = number % self.slots
+        places = [self.base + slot]
+        if slot == 0:  # the copy continues the line after the last slot
+            places.append(self.base + self.slots)
+        for place in places:
+            self.cells["east"][place] = east
+            for name in self.lines:
+                self.cells[name][place] = math.nan
+            self.cells[line][place] = north

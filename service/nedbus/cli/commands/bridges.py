@@ -134,12 +134,15 @@ def ros2(
     to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=_TO)] = None,
 ) -> None:
     """Publish px4_msgs on /fmu/out/... to ROS 2 with rmw_zenoh."""
-    for each in namespace or ():
-        if ":" not in each:
-            raise ConfigError("--namespace", f"{each!r}: expected VEHICLE:NAMESPACE")
-    namespaces = dict(each.partition(":")[::2] for each in namespace or ())
+    namespaces: dict[str, str] = {}
+    for text in namespace or ():
+        vehicle, colon, name = text.partition(":")
+        if not colon:
+            raise ConfigError("--namespace", f"{text!r}: expected VEHICLE:NAMESPACE")
+        namespaces[vehicle] = name
     try:
-        session, observer = bus.open_session(to), bus.open_session(to)
+        session = bus.open_session(to)
+        observer = bus.open_session(to)
     except ConnectError as exc:
         raise NedbusError(
             f"no router answers at {to}: start ROS 2's router there, or correct --to"

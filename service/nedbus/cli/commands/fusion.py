@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import nedbus
@@ -50,16 +51,20 @@ def fusion(
         if duration is not None:
             raise ConfigError("--duration", "needs live vehicles, not a file")
         for path in files:
-            with nedbus.open(path) as flight:
-                topics = {address.topic for address in flight.addresses} & {*FUSION_TOPICS}
-                if not topics:
-                    raise NoDataError(f"{path}: topics {', '.join(FUSION_TOPICS)}", 0.0)
-                samples = flight(*sorted(topics), vehicle=vehicle or ANY)
-                _show(fusion_changes(samples), json_output=json_output)
+            _show_file(path, vehicle, json_output=json_output)
         return
     with open_bus() as bus:
         sent: dict[str, PositionStatus] = {}
         _show(fusion_changes(_follow(bus, vehicle, duration, sent), sent), json_output=json_output)
+
+
+def _show_file(path: Path, vehicles: list[str] | None, *, json_output: bool) -> None:
+    with nedbus.open(path) as flight:
+        topics = {address.topic for address in flight.addresses} & {*FUSION_TOPICS}
+        if not topics:
+            raise NoDataError(f"{path}: topics {', '.join(FUSION_TOPICS)}", 0.0)
+        samples = flight(*sorted(topics), vehicle=vehicles or ANY)
+        _show(fusion_changes(samples), json_output=json_output)
 
 
 def _follow(
@@ -69,28 +74,28 @@ def _follow(
     sent: "dict[str, PositionStatus]",
 ) -> "Iterator[Sample[Any]]":
     """Yield live samples, and update what is sent."""
-    start, next_status = time.monotonic(), 0.0
-    end = start + (math.inf if duration is None else duration)
+    end = math.inf if duration is None else time.monotonic() + duration
+    next_status = 0.0
     has_data = False
     with bus.subscribe(*FUSION_TOPICS, vehicle=vehicles or ANY, mode="every") as subscription:
         while (now := time.monotonic()) < end:
             if now >= next_status:
                 next_status = now + _STATUS_INTERVAL
-                statuses = [
-                    status for service in bus.services(timeout=0.5) for status in service.sources
-                ]
-                sent.update(
-                    {each.vehicle: each for status in statuses for each in status.positions}
-                )
+                _update_sent(bus, sent)
             with suppress(NoDataError):
                 sample = subscription.receive(min(_STATUS_INTERVAL, max(0.0, end - now)))
                 has_data = True
                 yield sample
     if not has_data:
-        raise NoDataError(
-            f"{', '.join(vehicles or ['all vehicles'])}: topics {', '.join(FUSION_TOPICS)}",
-            duration or 0.0,
-        )
+        names = ", ".join(vehicles or ["all vehicles"])
+        raise NoDataError(f"{names}: topics {', '.join(FUSION_TOPICS)}", duration or 0.0)
+
+
+def _update_sent(bus: "Bus", sent: "dict[str, PositionStatus]") -> None:
+    for service in bus.services(timeout=0.5):
+        for source in service.sources:
+            for position in source.positions:
+                sent[position.vehicle] = position
 
 
 def _show(changes: Iterator[tuple[float, Fusion]], *, json_output: bool) -> None:

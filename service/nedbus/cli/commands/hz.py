@@ -1,9 +1,9 @@
 """The command hz: measure rates, latencies and losses of streams."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 from nedbus import Bus, clock
 from nedbus.cli.follow import follow
@@ -48,7 +48,7 @@ def hz(
     """
     allow_one({"--json": json_output, "--csv": csv_output})
     monitor = Monitor()
-    written: dict[Address, tuple[int, str]] = {}
+    writer = _ChangeWriter(is_csv=csv_output)
     with (
         bus.subscribe(
             *selection.topics, vehicle=selection.vehicles, instance=selection.instance, mode="every"
@@ -59,48 +59,80 @@ def hz(
             write(csv_line(_CSV_HEAD))
 
         def show() -> None:
-            states = _states(bus, monitor)
-            streams = sorted(
-                states, key=lambda each: (each[2].severity, describe_stream(*each[1:]) == "ok")
-            )
-            if not (json_output or csv_output):
-                show_table([_to_row(*each) for each in streams])
-                return
-            former = written.copy()
-            written.clear()  # of streams that are no longer shown
-            for address, health, state in streams:
-                written[address] = health.messages, state.name
-                if former.get(address) != written[address]:
-                    fields: dict[str, Any] = {
-                        "time": clock.utc(),
-                        **asdict(address),
-                        "state": state.name,
-                    }
-                    fields |= {"reason": state.reason, **asdict(health)}
-                    cells = {**fields, **(health.flags or {}), "time": f"{fields['time']:.3f}"}
-                    write(csv_line(map(cells.get, _CSV_HEAD)) if csv_output else json.dumps(fields))
+            streams = sorted(_streams(bus, monitor), key=_Stream.rank)
+            if json_output or csv_output:
+                writer.update(streams)
+            else:
+                show_table([stream.cells() for stream in streams])
 
         follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
 
 
-def _states(bus: Bus, monitor: Monitor) -> Iterator[tuple[Address, Health, StreamState]]:
+class _Stream(NamedTuple):
+    """A measured stream."""
+
+    address: Address
+    health: Health
+    state: StreamState
+
+    def rank(self) -> tuple[int, bool]:
+        """Return the place in the table: the worst state first, and in a state the faulty streams."""
+        return self.state.severity, describe_stream(self.health, self.state) == "ok"
+
+    def cells(self) -> list[str]:
+        """Return the cells of a row, with the columns of _HEAD."""
+        health = self.health
+        rate = jitter = latency = latency_max = "-"
+        if health.rate is not None:
+            rate = f"{health.rate:.1f}"
+            if health.latency is not None:
+                latency = format_duration(health.latency)
+            if health.latency_max is not None:
+                latency_max = format_duration(health.latency_max)
+        if health.jitter is not None:
+            jitter = f"{health.jitter * 1e3:.1f} ms"
+        text = describe_stream(health, self.state)
+        return [str(self.address), rate, jitter, latency, latency_max, str(health.lost), text]
+
+
+class _ChangeWriter:
+    """Write a line of JSON or CSV for each stream that received messages or changed its state since the last call."""
+
+    def __init__(self, *, is_csv: bool) -> None:
+        self._is_csv = is_csv
+        self._written: dict[Address, tuple[int, str]] = {}  # number of messages, name of the state
+
+    def update(self, streams: Iterable[_Stream]) -> None:
+        """Write the changed streams, and forget those that are no longer shown."""
+        former = self._written
+        self._written = {}
+        for stream in streams:
+            content = stream.health.messages, stream.state.name
+            self._written[stream.address] = content
+            if former.get(stream.address) != content:
+                self._write(stream)
+
+    def _write(self, stream: _Stream) -> None:
+        now = clock.utc()
+        fields: dict[str, object] = {"time": now}
+        fields |= asdict(stream.address)
+        fields["state"] = stream.state.name
+        fields["reason"] = stream.state.reason
+        fields |= asdict(stream.health)
+        if not self._is_csv:
+            write(json.dumps(fields))
+            return
+        fields["time"] = f"{now:.3f}"
+        fields |= stream.health.flags or {}
+        write(csv_line(map(fields.get, _CSV_HEAD)))
+
+
+def _streams(bus: Bus, monitor: Monitor) -> Iterator[_Stream]:
+    """Yield the streams; forget those that have been gone for long."""
     publishers = bus.publishers(timeout=0.5)
     for address, health in monitor.snapshot().items():
         state = stream_state(health, publishers=publishers[address], connected=bus.connected)
         if state.name == "gone" and (health.age or 0.0) > _FORGET_AFTER:
             monitor.forget(address)
         else:
-            yield address, health, state
-
-
-def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
-    rate = "-" if health.rate is None else f"{health.rate:.1f}"
-    jitter = "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms"
-    latencies = []
-    for latency in (health.latency, health.latency_max):
-        if latency is None or health.rate is None:
-            latencies.append("-")
-        else:
-            latencies.append(format_duration(latency))
-    state_text = describe_stream(health, state)
-    return [str(address), rate, jitter, *latencies, str(health.lost), state_text]
+            yield _Stream(address, health, state)

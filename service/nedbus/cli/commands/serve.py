@@ -140,7 +140,8 @@ def router(
     settings = load_settings(
         config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key
     )
-    routers, closing = tuple(connect or ()), threading.Event()
+    routers = tuple(connect or ())
+    closing = threading.Event()
     tls = settings.tls if routers else None
 
     def run(stop: threading.Event) -> None:

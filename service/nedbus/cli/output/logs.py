@@ -143,13 +143,12 @@ class RateLimit(logging.Filter):
                 return True
             if not bucket.suppressed:
                 example = record.getMessage()[: limits.LINE_TEXT].replace("%", "%%")
-                text = f"suppressed %s like this one: {example}"
-                names = {
+                bucket.first = {
                     "name": record.name,
                     "levelno": record.levelno,
                     "levelname": record.levelname,
+                    "msg": f"suppressed %s like this one: {example}",
                 }
-                bucket.first = {**names, "msg": text}
             bucket.suppressed += 1
             return False
 
@@ -161,10 +160,12 @@ class RateLimit(logging.Filter):
                 if bucket.suppressed and is_due(bucket):
                     count = bucket.suppressed
                     about = About("suppressed", count=count, of=event)
-                    args = (counted(count, "more line"),)
-                    reports.append(
-                        logging.makeLogRecord({**bucket.first, "args": args, "about": about})
-                    )
+                    fields = {
+                        **bucket.first,
+                        "args": (counted(count, "more line"),),
+                        "about": about,
+                    }
+                    reports.append(logging.makeLogRecord(fields))
                     bucket.suppressed = 0
         for report in reports:
             self._handle(report)
@@ -213,9 +214,10 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
 def _log_uncaught(
     kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None
 ) -> None:
-    if not issubclass(kind, SystemExit):
-        exc_info = None if error is None else (kind, error, traceback)
-        text = (
-            str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
-        )
-        _log.error("%s", text, exc_info=exc_info, extra=about("error"))
+    if issubclass(kind, SystemExit):
+        return
+    text = str(error)
+    if not issubclass(kind, NedbusError):
+        text = f"unexpected {kind.__name__}: {error}"
+    exc_info = None if error is None else (kind, error, traceback)
+    _log.error("%s", text, exc_info=exc_info, extra=about("error"))

@@ -12,6 +12,7 @@ from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.endpoints import DEFAULT_ENDPOINT, dial_endpoint
+from nedbus.health import SourceStatus
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus_msgs.text import counted
@@ -32,28 +33,38 @@ def log_progress(daemon: Daemon) -> Iterator[None]:
 
     Once the daemon is ready, commands to try in a second terminal are written to stderr.
     """
-    # time of the last report, and messages by source until then
-    reported, counts = time.monotonic(), Counter[str]()
+    last_report = time.monotonic()
+    reported = Counter[str]()  # messages by source until then
     while not daemon.ready.is_set():
         yield
     if not is_log_structured() and not daemon.until_done:
         write_stderr(suggested_commands(daemon.endpoints))
     for interval in chain(TIMINGS.reports, repeat(TIMINGS.reports[-1])):
-        while (elapsed := time.monotonic() - reported) < interval:
+        while (elapsed := time.monotonic() - last_report) < interval:
             yield
-        reported += elapsed
+        last_report += elapsed
         for status in daemon.sources:
-            count = status.published - counts[status.source]
-            counts[status.source] = status.published
+            rate = (status.published - reported[status.source]) / elapsed
+            reported[status.source] = status.published
             if status.state == "running":
                 name = status.source.rstrip(":")
-                text = counted(status.published, "message")
-                text += f" ({status.done / status.total:.0%})" if status.total else ""
-                text += f", {count / elapsed:.0f}/s"
-                text += f", {status.rejected} rejected" if status.rejected else ""
-                text += f", {status.lost} lost" if status.lost else ""
-                text += f" (gone: {', '.join(status.stale)})" if status.stale else ""
+                text = _describe_progress(status, rate)
                 _log.info("%s: %s", name, text, extra=about("progress", source=name))
+
+
+def _describe_progress(status: SourceStatus, rate: float) -> str:
+    """Describe what a source has published; `rate`: messages per second."""
+    text = counted(status.published, "message")
+    if status.total:
+        text += f" ({status.done / status.total:.0%})"
+    text += f", {rate:.0f}/s"
+    if status.rejected:
+        text += f", {status.rejected} rejected"
+    if status.lost:
+        text += f", {status.lost} lost"
+    if status.stale:
+        text += f" (gone: {', '.join(status.stale)})"
+    return text
 
 
 def suggested_commands(endpoints: Sequence[str]) -> str:
@@ -62,6 +73,8 @@ def suggested_commands(endpoints: Sequence[str]) -> str:
     if not plain:
         return f"Clients of {endpoints[0]} need their own certificate, see docs/security.md"
     here = [dial_endpoint(endpoint) for endpoint in plain]
-    is_on_path = Path(sys.argv[0]).name != "nedbus" or shutil.which("nedbus") is not None
-    program = "nedbus" if is_on_path else sys.argv[0]
-    return _HINT.format(nedbus=program, where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")
+    program = "nedbus"
+    if Path(sys.argv[0]).name == program and shutil.which(program) is None:
+        program = sys.argv[0]
+    where = "" if DEFAULT_ENDPOINT in here else f" -c {here[0]}"
+    return _HINT.format(nedbus=program, where=where)

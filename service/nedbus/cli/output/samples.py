@@ -40,14 +40,13 @@ def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38)
     message = sample.message
     start = f"{sample.address!s:<{width}} {message.timestamp / 1e6:12.3f} s"
     if fields:
-        return "  ".join(
-            [start, *(f"{name} {_to_value(sample, name)}" for name in fields)]
-        ) + _notes(sample)
+        values = [f"{name} {_to_value(sample, name)}" for name in fields]
+        return "  ".join([start, *values]) + _notes(sample)
     if message.DEFINITION is not DEFAULT:
         # a terminal cuts the end of the line
         return f"{start}{_notes(sample)}  {_to_summary(message)}"
-    position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
-    velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
+    position = f"{message.x:9.3f} {message.y:9.3f} {message.z:9.3f}"
+    velocity = f"{message.vx:7.3f} {message.vy:7.3f} {message.vz:7.3f}"
     heading = f"hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}"
     return f"{start}  ned {position} m  v {velocity} m/s  {heading}  {_to_state(sample)}"
 
@@ -66,43 +65,50 @@ class Lines:
 
     def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
         """Return the line of a sample, preceded by a header if one is due."""
-        width, message = terminal_width(), sample.message
+        width = terminal_width()
         if width is None:
             return to_line(sample, fields)
         self._lines_left -= 1
-        # no columns: as much as fits into a line
-        if not fields and message.DEFINITION is not DEFAULT:
+        if not fields and sample.message.DEFINITION is not DEFAULT:
+            # no columns: as much as fits into a line
             line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
             return line if len(line) <= width else f"{line[: width - 1]}…"
-        cells = {_ADDRESS: str(sample.address), "TIME s": f"{message.timestamp / 1e6:8.2f}"}
-        if fields:
-            cells |= {name: _to_value(sample, name).rjust(_FIELD_WIDTH) for name in fields}
-        else:
-            cells[_POSITION] = " ".join(
-                f"{value:7.2f}" for value in (message.x, message.y, message.z)
-            )
-            cells[_VELOCITY] = " ".join(
-                f"{value:6.2f}" for value in (message.vx, message.vy, message.vz)
-            )
-            cells |= {_HEADING: f"{math.degrees(message.heading):.1f}", _EPH: f"{message.eph:.2f}"}
-        cells[_STATE] = _to_state(sample)
+        cells = _to_cells(sample, fields)
         self._widths = {
             name: max(len(name), len(cell), self._widths.get(name, 0))
             for name, cell in cells.items()
         }
-        shown = fit_columns(self._widths, _OPTIONAL, width)
-        head = self._join({name: name for name in shown})
-        line = self._join({name: cells[name] for name in shown})
+        columns = fit_columns(self._widths, _OPTIONAL, width)
+        head = self._join(columns, columns)
+        line = self._join(columns, [cells[name] for name in columns])
         if head == self._head and self._lines_left >= 0:
             return line
         self._head = head
         self._lines_left = max(_MIN_PAGE, shutil.get_terminal_size().lines - 1) - 2
         return f"{head}\n{line}"
 
-    def _join(self, cells: dict[str, str]) -> str:
-        address, *numbers, state = cells.items()
-        padded = [cell.rjust(self._widths[name]) for name, cell in numbers]
-        return COLUMN_GAP.join([address[1].ljust(self._widths[_ADDRESS]), *padded, state[1]])
+    def _join(self, columns: Sequence[str], cells: Sequence[str]) -> str:
+        """Join the cells of a line: address and state are text, the others numbers."""
+        padded = [cell.rjust(self._widths[name]) for name, cell in zip(columns, cells, strict=True)]
+        padded[0] = cells[0].ljust(self._widths[columns[0]])
+        padded[-1] = cells[-1]
+        return COLUMN_GAP.join(padded)
+
+
+def _to_cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
+    """Return the cells of these fields, or of a position, by the name of their column."""
+    message = sample.message
+    cells = {_ADDRESS: str(sample.address), "TIME s": f"{message.timestamp / 1e6:8.2f}"}
+    if fields:
+        for name in fields:
+            cells[name] = _to_value(sample, name).rjust(_FIELD_WIDTH)
+    else:
+        cells[_POSITION] = f"{message.x:7.2f} {message.y:7.2f} {message.z:7.2f}"
+        cells[_VELOCITY] = f"{message.vx:6.2f} {message.vy:6.2f} {message.vz:6.2f}"
+        cells[_HEADING] = f"{math.degrees(message.heading):.1f}"
+        cells[_EPH] = f"{message.eph:.2f}"
+    cells[_STATE] = _to_state(sample)
+    return cells
 
 
 def _to_state(sample: Sample[Any]) -> str:
@@ -130,47 +136,52 @@ def _to_summary(message: Message) -> str:
                 false_flags.append(f"{name} {_to_number(value, None)}")
         elif name not in _TIMES and value != kind.absent and repr(value) != repr(kind.absent):
             numbers.append(f"{name} {_to_number(value, _SUMMARY_DIGITS.get(kind.base))}")
-    if len(flags) + len(false_flags) > _NAMED_FLAGS:
-        false_flags = [f"({len(false_flags)} flags False)"] if false_flags else []
-    flags += false_flags
-    return "  ".join([*numbers, *flags])
+    if false_flags and len(flags) + len(false_flags) > _NAMED_FLAGS:
+        false_flags = [f"({len(false_flags)} flags False)"]
+    return "  ".join([*numbers, *flags, *false_flags])
 
 
 def _notes(sample: Sample[Any]) -> str:
-    lost = f"  [{sample.lost} lost]" if sample.lost else ""
-    age = sample.latency or 0.0
-    old = f"  [{format_duration(age)} old]" if age > TIMINGS.old else ""
-    return f"{old}{lost}"
+    notes = ""
+    if sample.latency is not None and sample.latency > TIMINGS.old:
+        notes += f"  [{format_duration(sample.latency)} old]"
+    if sample.lost:
+        notes += f"  [{sample.lost} lost]"
+    return notes
 
 
 def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format these fields, or all, one per line, like `ros2 topic echo`."""
-    age = "" if sample.latency is None else f", {format_duration(sample.latency)} old"
-    source = "" if sample.source is None else f", from {sample.source}"
-    stored = ", only stored" if sample.stored else ""
-    missing, lines = sample.missing, [f"{sample.address}{age}{source}{stored}"]
-    lines += [
-        f"  {name}: {_to_value(sample, name)}{' (not provided)' if name in missing else ''}"
-        for name in fields or sample.message.DEFINITION.types
-    ]
+    head = str(sample.address)
+    if sample.latency is not None:
+        head += f", {format_duration(sample.latency)} old"
+    if sample.source is not None:
+        head += f", from {sample.source}"
+    if sample.stored:
+        head += ", only stored"
+    lines = [head]
+    for name in fields or sample.message.DEFINITION.types:
+        note = " (not provided)" if name in sample.missing else ""
+        lines.append(f"  {name}: {_to_value(sample, name)}{note}")
     return "\n".join([*lines, "---"])
 
 
 def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format a sample as one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
-    head = asdict(sample.address) | {
-        name: getattr(sample, name) for name in ("received", "sent", "lost", "source")
-    }
-    head |= {"missing": sorted(sample.missing)} | ({"stored": True} if sample.stored else {})
+    head: dict[str, object] = asdict(sample.address)
+    for name in ("received", "sent", "lost", "source"):
+        head[name] = getattr(sample, name)
+    head["missing"] = sorted(sample.missing)
+    if sample.stored:
+        head["stored"] = True
     message = sample.message.model_dump_json(include=set(fields) or None)
-    derived = {
-        name: derive(sample.message, name) for name in _derived_fields(sample.message, fields)
-    }
+    derived = [name for name in fields if _is_derived(sample.message, name)]
     if derived:
-        numbers = {
-            name: value if math.isfinite(value) else "NaN" for name, value in derived.items()
-        }
-        message = json.dumps(json.loads(message) | numbers, separators=(",", ":"))
+        values = json.loads(message)
+        for name in derived:
+            value = derive(sample.message, name)
+            values[name] = value if math.isfinite(value) else "NaN"
+        message = json.dumps(values, separators=(",", ":"))
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 
 
@@ -185,58 +196,61 @@ class CsvLines:
 
     def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
         """Return the line of a sample."""
-        head, cells = zip(*_to_row(sample, fields), strict=True)
+        row = _to_row(sample, fields)
+        head = tuple(name for name, _ in row)
+        line = csv_line(cell for _, cell in row)
         if not self._head:
             self._head = head
-            return f"{csv_line(head)}\n{csv_line(cells)}"
+            return f"{csv_line(head)}\n{line}"
         if head != self._head:
             text = f"a CSV table has only one message type, but {sample.address} has another: select a topic"
             raise ConfigError("--csv", text)
-        return csv_line(cells)
+        return line
 
 
 def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
     """Return names and cells of a CSV row; an array has one cell per element, an absent field an empty cell."""
-    address, message = sample.address, sample.message
-    row: list[tuple[str, object]] = [
-        *asdict(address).items(),
-        ("utc", sample.stamp and sample.stamp.get_time().isoformat()), ("sent", sample.sent),
-        ("timestamp", message.timestamp),
-    ]  # fmt: skip
-    types = message.DEFINITION.types
-    for name in fields or types:
+    message = sample.message
+    row: list[tuple[str, object]] = [*asdict(sample.address).items()]
+    row.append(("utc", sample.stamp and sample.stamp.get_time().isoformat()))
+    row.append(("sent", sample.sent))
+    row.append(("timestamp", message.timestamp))
+    for name in fields or message.DEFINITION.types:
         if name == "timestamp":
             continue
-        if name in _derived_fields(message, fields):
+        if _is_derived(message, name):
             row.append((name, str(derive(message, name))))
             continue
         value = getattr(message, name, "")
-        digits = _DIGITS.get(types[name].base) if name in types else None
-        if isinstance(value, tuple):
-            row += [
-                (f"{name}[{index}]", _to_number(element, digits))
-                for index, element in enumerate(value)
-            ]
-        else:
+        digits = _digits_of(message, name)
+        if not isinstance(value, tuple):
             row.append((name, _to_number(value, digits)))
+            continue
+        for index, element in enumerate(value):
+            row.append((f"{name}[{index}]", _to_number(element, digits)))
     if message.DEFINITION is DEFAULT:
         row.append(("state", message_doubts(message, sample.missing)))
     return row
 
 
-def _derived_fields(message: Message, fields: Sequence[str]) -> list[str]:
-    """Return those of the fields that are not PX4's, but derived from its fields."""
-    known = derived_from(message.DEFINITION.types)
-    return [name for name in fields if name in known]
+def _is_derived(message: Message, name: str) -> bool:
+    """Return True for a field that is not PX4's, but derived from its fields."""
+    types = message.DEFINITION.types
+    return name not in types and name in derived_from(types)
+
+
+def _digits_of(message: Message, name: str) -> int | None:
+    kind = message.DEFINITION.types.get(name)
+    return None if kind is None else _DIGITS.get(kind.base)
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
-    if _derived_fields(sample.message, [name]):
-        return f"{derive(sample.message, name):.9g}"
-    kind = sample.message.DEFINITION.types.get(name)
-    if kind is None:
+    message = sample.message
+    if _is_derived(message, name):
+        return f"{derive(message, name):.9g}"
+    if name not in message.DEFINITION.types:
         return "-"
-    return _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
+    return _to_number(getattr(message, name), _digits_of(message, name))
 
 
 def _to_number(value: object, digits: int | None) -> str:

@@ -25,10 +25,9 @@ Rows = Sequence[Sequence[str]]
 
 def terminal_width() -> int | None:
     """Return the width of the terminal; None if stdout is not a terminal."""
-    is_terminal = (
-        sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
-    )
-    return shutil.get_terminal_size().columns if is_terminal else None
+    if sys.stdout is None or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
+        return None
+    return shutil.get_terminal_size().columns
 
 
 def fold(head: str, text: str) -> str:
@@ -72,19 +71,23 @@ def to_table(
     width = terminal_width() or _UNLIMITED
     first = head[0]
     last = head[-1]
-    widths = {
-        name: max(map(len, (name, *cells))) for name, *cells in zip(head, *shown, strict=True)
-    }
+    widths: dict[str, int] = {}
+    for index, name in enumerate(head):
+        cells = [row[index] for row in shown]
+        widths[name] = max(map(len, [name, *cells]))
     widths[last] = min(widths[last], _LAST_WIDTH)
     kept = fit_columns(widths, optional, width)
     widths[last] = min(widths[last], _MIN_LAST_WIDTH)
-    folded = (last,) if _width_of(kept, widths) <= width else (first, last)
+    folded = {last}
+    if _width_of(kept, widths) > width:
+        folded.add(first)
     table = Table(box=None, pad_edge=False, padding=(0, len(COLUMN_GAP), 0, 0), header_style="")
     for name in kept:
         justify: Literal["left", "right"] = "left" if name in (first, last) else "right"
         table.add_column(name, justify=justify, no_wrap=name not in folded, overflow="fold")
     for row in shown:
-        table.add_row(*(Text(cell) for name, cell in zip(head, row, strict=True) if name in kept))
+        by_name = dict(zip(head, row, strict=True))
+        table.add_row(*(Text(by_name[name]) for name in kept))
     drawn = io.StringIO()
     Console(file=drawn, width=width, color_system=None).print(table)
     lines = [line.rstrip() for line in drawn.getvalue().splitlines()]
@@ -98,7 +101,11 @@ def to_table(
 def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callable[[Rows], None]]:
     """Yield a function that prints rows; on a terminal, each call redraws the table in place, below the log lines."""
     if terminal_width() is None:
-        yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=limits.LIVE_ROWS))
+
+        def print_table(rows: Rows) -> None:
+            write(to_table(head, rows, optional=optional, max_rows=limits.LIVE_ROWS))
+
+        yield print_table
         return
     from rich.console import Console
     from rich.live import Live
@@ -131,11 +138,17 @@ def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
-    columns = TextColumn("{task.description}", markup=False), BarColumn(bar_width=24)
-    with Progress(
-        *columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
-    ) as progress:
+    progress = Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=24),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
+    with progress:
         task = progress.add_task("", total=None)
-        yield lambda text, done, total: progress.update(
-            task, description=text, completed=done or 0, total=total
-        )
+
+        def show(text: str, done: int | None, total: int | None) -> None:
+            progress.update(task, description=text, completed=done or 0, total=total)
+
+        yield show

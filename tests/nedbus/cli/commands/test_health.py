@@ -121,6 +121,14 @@ def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, healt
         assert health("--vehicle", "a/b").exit_code == 2
 
 
+def test_vehicle_option_judges_the_age_of_this_vehicle_alone(endpoint: str, health: Health) -> None:
+    """--vehicle reports only this vehicle, also of a service with several."""
+    with serving(endpoint, "sim:", "sim:?vehicle=2"):
+        wait_for(lambda: health("--vehicles", "2").exit_code == 0, what="both vehicles")
+        report = json.loads(health("--vehicle", "2", "--max-age", "60", "--json").out)
+    assert report["vehicles"].keys() == {"2"}
+
+
 def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
     """--json writes the result, the reason and the ages of the newest messages, healthy or not."""
     with serving(endpoint, "sim:"):
@@ -213,6 +221,22 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
         assert health("--vehicle", "1").exit_code == 0
 
 
+def test_faults_of_a_vehicle_do_not_hide_those_of_a_vehicle_with_a_shorter_name(
+    endpoint: str, health: Health
+) -> None:
+    """An expected vehicle without a publisher is missing, even if a service still reports it."""
+    with serving(endpoint, "sim:") as daemon:
+        wait_for(lambda: health().exit_code == 0, what="health")
+        daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time())
+        wait_for(lambda: "1, 2" in health("--expect", "25").err, what="vehicle 2")
+        result = health("--expect", "2,25")
+    assert result.exit_code == 1
+    assert result.err.splitlines() == [
+        "nedbus: vehicle 25 is missing: it has no publisher; published: 1, 2",
+        "nedbus: vehicle 2 is missing: it has no publisher, although a service reports it",
+    ]
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -266,3 +290,14 @@ def test_service_without_history_is_a_fault(
             result = health("--services", "1", *option)
             assert result.exit_code == 1
             assert "service old keeps no event history: update nedbus on its host" in result.err
+
+
+def test_older_service_is_named_once(endpoint: str, zenoh_session: Session, health: Health) -> None:
+    """A service whose status key names no vehicle is one fault, and is not also asked for its event history."""
+    key = "nedbus/@service/old-1/status"
+    status = json.dumps({"host": "flyer", "version": "0.1.0"}).encode()
+    with answer_queries(zenoh_session, key, reply_with({key: status})):
+        result = health("--services", "1", "--valid", "xy")
+    assert result.exit_code == 1
+    assert result.err.count("service old-1 on flyer runs nedbus 0.1.0") == 1
+    assert "keeps no event history" not in result.err
