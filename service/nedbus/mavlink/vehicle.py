@@ -146,6 +146,8 @@ class Vehicle:
         # newest timestamps, and the links that delivered them
         self._last: dict[Address, tuple[int, int]] = {}
         self._delivered = RecentTimes()
+        # times of the last samples, and the links that delivered them
+        self._samples: dict[Address, tuple[int, int]] = {}
         self._texts = _StatusTexts()
         self._text_copies = TextCopies()
         self._started = now
@@ -310,9 +312,12 @@ class Vehicle:
         fields = {name: value for name, value in fields.items() if value is not None}
         if not fields or (log is not None and log.delivers(address)):
             return None
-        if self._delivered.contains(address, timestamp) and address.topic in _SENT_ONCE:
-            self.copies += 1
-            return None
+        if address.topic in _SENT_ONCE:
+            placed = self._place_sample(address, timestamp)
+            if placed is None:
+                self.copies += 1
+                return None
+            timestamp = placed
         last, link = self._last.get(address, (0, self._link))
         # a second link's times need not be equal to those of the first
         if timestamp < last and link != self._link:
@@ -324,11 +329,29 @@ class Vehicle:
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp, self._link
-        self._delivered.add(address, timestamp)
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(address.topic, fields, timestamp, now)
         source = self._text_source if address == self._text_address else None
         return self.report(SourceMessage(0.0, address, fields, source=source, arrived=now), log)
+
+    def _place_sample(self, address: Address, sampled: int) -> int | None:
+        """Return the time of a message whose sensor sampled at `sampled` [us since boot]; None for a copy.
+
+        While its GPS has no fix, ArduPilot repeats the time of the last one, with a new state: over the same link such
+        a message is no copy, and has the vehicle's newest time. Later samples follow it.
+        """
+        last, link = self._samples.get(address, (-1, self._link))
+        is_repeated = sampled == last and self._link == link != REPEATED
+        if self._delivered.contains(address, sampled) and not is_repeated:
+            return None
+        self._delivered.add(address, sampled)
+        self._samples[address] = sampled, self._link
+        newest, _ = self._last.get(address, (0, self._link))
+        if is_repeated:
+            return max(newest, self.clock.newest or sampled)
+        if sampled > last:
+            return max(newest, sampled)
+        return sampled
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
