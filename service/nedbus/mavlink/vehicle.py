@@ -106,6 +106,8 @@ class Vehicle:
         # newest timestamps, and the links that delivered them
         self._last: dict[Address, tuple[int, int]] = {}
         self._delivered = RecentTimes()
+        # times of the last samples, and the links that delivered them
+        self._samples: dict[Address, tuple[int, int]] = {}
         self._texts = StatusTexts()
         self._text_copies = TextCopies()
         self._requests.restart(now)
@@ -275,14 +277,16 @@ class Vehicle:
         known = {name: value for name, value in fields.items() if value is not None}
         if not known or (log is not None and log.delivers(address)):
             return None
-        if address.topic in _SENT_ONCE and self._delivered.contains(address, timestamp):
-            self.copies += 1
-            return None
+        if address.topic in _SENT_ONCE:
+            placed = self._place_sample(address, timestamp)
+            if placed is None:
+                self.copies += 1
+                return None
+            timestamp = placed
         last, link = self._last.get(address, (0, self._link))
         if timestamp < last:
             return self._reject_late(address, timestamp, last, link)
         self._last[address] = timestamp, self._link
-        self._delivered.add(address, timestamp)
         known = {"timestamp": timestamp, **known}
         self._stored.complete(address.topic, known, now)
         source = self._text_source if address.topic == LOG_MESSAGE.name else None
@@ -299,6 +303,25 @@ class Vehicle:
             return None  # probably the first messages after a reboot, which is not certain yet
         reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
         return Rejection(str(address), reason, address)
+
+    def _place_sample(self, address: Address, sampled: int) -> int | None:
+        """Return the time of a message whose sensor sampled at `sampled` [us since boot]; None for a copy.
+
+        While its GPS has no fix, ArduPilot repeats the time of the last one, with a new state: over the same link such
+        a message is no copy, and has the vehicle's newest time. Later samples follow it.
+        """
+        last, link = self._samples.get(address, (-1, self._link))
+        is_repeated = sampled == last and self._link == link != REPEATED
+        if self._delivered.contains(address, sampled) and not is_repeated:
+            return None
+        self._delivered.add(address, sampled)
+        self._samples[address] = sampled, self._link
+        newest, _ = self._last.get(address, (0, self._link))
+        if is_repeated:
+            return max(newest, self.clock.newest or sampled)
+        if sampled > last:
+            return max(newest, sampled)
+        return sampled
 
     def _track_time(self, message: Any, now: float) -> tuple[TimeKind | None, int | None]:
         """Return what the time of a message shows, and the time [us since boot].

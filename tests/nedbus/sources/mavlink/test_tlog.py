@@ -261,6 +261,34 @@ def test_flight_over_the_antimeridian_has_no_event(
         assert nedbus.why(file)["7"].text == "no faults in 20 s"
 
 
+def test_gps_loss_that_repeats_the_time_of_the_last_fix_is_an_event(tmp_path: Path) -> None:
+    """ArduPilot's GPS_RAW_INT keeps the time of the last fix while there is none: the loss is an event, no silence.
+
+    The intervals are those of a log of ArduSub 4.1.1.
+    """
+    path = tmp_path / "flight.tlog"
+
+    def fly() -> Iterable[tuple[int, Any]]:
+        for ms in range(700_000, 730_000, 500):
+            is_lost = 710_000 <= ms < 717_500
+            fix_type = 0 if is_lost else 3
+            fix_ms = 709_500 if is_lost else ms
+            place = 483861418, -1246305732, 0, 2228, 65535, 65535, 65535, 21
+            yield ms, mavlink.MAVLink_local_position_ned_message(ms, 0, 0, 1, 0, 0, 0)
+            yield ms, mavlink.MAVLink_gps_raw_int_message(1000 * fix_ms, fix_type, *place)
+            if ms % 1000 == 0:
+                yield ms, mavlink.MAVLink_heartbeat_message(12, 3, 128, 0, 4, 3)
+
+    write_messages(path, fly())
+    with nedbus.open(path) as flight:
+        assert len(list(flight("sensor_gps"))) == 60
+        assert flight.warnings == ()
+    assert [(event.text, event.boot) for event in nedbus.events(path)] == [
+        ("GPS fix lost: 3D to none", 710.0),
+        ("GPS fix regained: none to 3D after 7.5 s", 717.5),
+    ]
+
+
 def test_transition_of_a_vtol_over_mavlink_is_an_event(tmp_path: Path) -> None:
     """Transitions in EXTENDED_SYS_STATE are events as in a log, each within the interval of HEARTBEAT."""
     path = tmp_path / "flight.tlog"

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.parser import new_parser
-from nedbus.mavlink.sequence import SequenceCounter
 from nedbus.mavlink.requests import ORIGIN, STREAMS, request_rates
+from nedbus.mavlink.sequence import SequenceCounter
 from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_stream import LogStream
@@ -230,6 +230,61 @@ def test_second_link_replaces_the_first_one() -> None:
     vehicle.count_lost(0, 102.0, link=1)
     assert isinstance(vehicle.handle(position(11_700), 102.0), SourceMessage)
     assert isinstance(vehicle.handle(heartbeat(), 102.0), SourceMessage)
+
+
+def gps(time_usec: int, fix_type: int) -> Any:
+    unknown = 2**16 - 1
+    return dialect.MAVLink_gps_raw_int_message(
+        time_usec, fix_type, 483861418, -1246305732, 0, 160, unknown, unknown, unknown, 9
+    )
+
+
+def test_gps_without_a_fix_is_no_copy() -> None:
+    """ArduPilot repeats the time of the last fix while it has none: each message is published, at the newest time.
+
+    As in a log of ArduSub 4.1.1, whose GPS lost its fix for 2.7 s at 768.005 s, with messages every half second. A fix
+    that comes just after such a message has its own time, or that of the message if it was taken before.
+    """
+    vehicle = new_vehicle("*")
+    received = []
+    for ms, fix_ms, fix_type in (
+        (768_200, 768_005, 3),
+        (768_665, 768_005, 0),
+        (769_205, 768_005, 0),
+        (769_705, 768_005, 0),
+        (770_205, 770_190, 3),
+        (770_300, 770_190, 3),
+        (770_350, 770_290, 3),
+    ):
+        vehicle.count_lost(0, ms / 1000)
+        vehicle.handle(position(ms), ms / 1000)
+        fields = handle(vehicle, gps(1000 * fix_ms, fix_type), ms / 1000).fields
+        received.append((fields["timestamp"], fields["fix_type"]))
+    assert received == [
+        (768_005_000, 3),
+        (768_665_000, 0),
+        (769_205_000, 0),
+        (769_705_000, 0),
+        (770_190_000, 3),
+        (770_300_000, 3),
+        (770_300_000, 3),
+    ]
+    assert vehicle.copies == 0
+
+
+def test_gps_of_a_second_link_is_a_copy_also_without_a_fix() -> None:
+    """Each message of a GPS that repeats its time is published once, although it comes over two links."""
+    vehicle = new_vehicle("*")
+    published = 0
+    for number, fix_type in enumerate((3, 0, 0)):
+        ms = 10_000 + 500 * number
+        for link, now in enumerate((100 + 0.5 * number, 100.2 + 0.5 * number)):
+            vehicle.count_lost(0, now, link=link)
+            vehicle.handle(position(ms), now)
+            converted = vehicle.handle(gps(9_900_000, fix_type), now)
+            published += isinstance(converted, SourceMessage)
+    assert published == 3
+    assert vehicle.copies == 3 + 3
 
 
 def numbered_texts(
