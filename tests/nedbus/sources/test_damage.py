@@ -121,7 +121,7 @@ def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], McapReader]
     ), reader
 
 
-@pytest.mark.timeout(120 + TRIES)
+@pytest.mark.timeout(120 + 3 * TRIES)
 @each_tier
 def test_damaged_recording_yields_only_original_messages(tmp_path: Path, tries: int) -> None:
     """Each message that is read is an original one, none is repeated, and losses are reported."""
@@ -239,7 +239,7 @@ def is_truncation(damaged: bytes, data: bytes) -> bool:
     return len(damaged) < len(data) and data.startswith(damaged)
 
 
-@pytest.mark.timeout(120 + TRIES)
+@pytest.mark.timeout(120 + 3 * TRIES)
 @each_tier
 def test_damaged_log_loses_only_damaged_messages(tmp_path: Path, tries: int) -> None:
     """No more messages differ than were damaged, and losses from a damaged structure are reported."""

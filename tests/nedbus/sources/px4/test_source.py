@@ -663,7 +663,7 @@ def test_stale_vehicle_is_not_listed(
     assert source_status(bus).state == "running"
     wait_for(is_stale, what="the status to be stale")
     assert list(bus.vehicles()) == ["domain1"]
-    assert "is stale: no message for 3 s" in service.err
+    assert f"1/{VLP} is stale: no message for " in service.err  # 3 s, or more on a busy machine
     px4.put(2)
     wait_for(lambda: source_status(bus).stale == (), what="the vehicle to return")
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
