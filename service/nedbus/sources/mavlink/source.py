@@ -224,12 +224,14 @@ class _LinkSession:
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`."""
-        log = self._logs.get(system)
-        if log is None and self._options.log and system in self._receiver.vehicles:
-            client = self._receiver.vehicles[system].client
-            state = StreamFile(state_path(self._options, self._name, system), system)
-            log = LogStream(self._name_of(system), self._options, client, state)
-            self._logs[system] = log
+        if system in self._logs or not self._options.log:
+            return self._logs.get(system)
+        known = self._receiver.vehicles.get(system)
+        if known is None:  # removed on another thread
+            return None
+        state = StreamFile(state_path(self._options, self._name, system), system)
+        log = LogStream(self._name_of(system), self._options, known.client, state)
+        self._logs[system] = log
         return log
 
     def _name_of(self, system: int) -> str:
