@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.parser import new_parser
-from nedbus.mavlink.sequence import SequenceCounter
 from nedbus.mavlink.requests import ORIGIN, STREAMS, request_rates
+from nedbus.mavlink.sequence import SequenceCounter
 from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_stream import LogStream
@@ -141,11 +141,7 @@ def test_only_needed_messages_are_requested_within_bandwidth(
     If the link cannot carry them, all but the position are reduced, to 2 Hz at the least, until 90 % of it are used.
     """
     rates = request_rates(rate, 57600, topics)
-    own = {
-        number: hertz or rate
-        for number, (_, hertz, of) in STREAMS.items()
-        if of & {*topics}
-    }
+    own = {number: hertz or rate for number, (_, hertz, of) in STREAMS.items() if of & {*topics}}
     if 230 in own:
         own[230] = max(2.0, rate)  # ESTIMATOR_STATUS, which has the flags
     least = {number: hertz if number == 32 else min(2.0, hertz) for number, hertz in own.items()}
