@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import common as dialect
 from pyulog import ULog
 
 from nedbus.mavlink.parser import new_parser
-from nedbus.mavlink.vehicle import STREAMS as REQUESTED, Vehicle
+from nedbus.mavlink.requests import STREAMS as REQUESTED
+from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, upgrade_with
 from tests.flights.messages import VLP
