@@ -22,7 +22,7 @@ from tests.nedbus.sources.px4.test_real_flight import PX4, read_datagrams
 from tests.peers.px4_log_stream import STREAMS, datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
-TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
+TOPICS: Final = {topic for stream in REQUESTED.values() for topic in stream.topics} - {VLP}
 # s: maximum age of the logged value that equals a message without a timestamp
 UNTIMED_AGE: Final = 2.0
 STATUS_AGE: Final = 1.2  # s: ESTIMATOR_STATUS is sent once a second
