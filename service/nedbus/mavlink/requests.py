@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Set
 from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
@@ -31,29 +31,25 @@ class Stream(NamedTuple):
 
     size: int
     rate: float
-    topics: frozenset[str]
-
-
-def _stream(size: int, rate: float, *topics: str) -> Stream:
-    return Stream(size, rate, frozenset(topics))
+    topics: Set[str]
 
 
 _LOCAL: Final = "vehicle_local_position"
 _GLOBAL: Final = "vehicle_global_position"
 STREAMS: Final[Mapping[int, Stream]] = {
-    _POSITION: _stream(40, 0.0, _LOCAL),
-    _STATUS: _stream(54, 0.0, _LOCAL, _GLOBAL),
-    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _stream(40, 10.0, _LOCAL, _GLOBAL),
-    dialect.MAVLINK_MSG_ID_ALTITUDE: _stream(44, 10.0, _LOCAL),
-    dialect.MAVLINK_MSG_ID_ODOMETRY: _stream(244, 10.0, _LOCAL, "vehicle_odometry"),
-    QUATERNION: _stream(44, 0.0, "vehicle_attitude"),
-    dialect.MAVLINK_MSG_ID_GPS_RAW_INT: _stream(64, 5.0, "sensor_gps"),
-    dialect.MAVLINK_MSG_ID_SYSTEM_TIME: _stream(24, 1.0, "sensor_gps"),
-    dialect.MAVLINK_MSG_ID_SYS_STATUS: _stream(55, 1.0, "vehicle_status"),
-    dialect.MAVLINK_MSG_ID_BATTERY_STATUS: _stream(66, 1.0, "battery_status"),
-    dialect.MAVLINK_MSG_ID_HOME_POSITION: _stream(72, 1.0, "home_position"),
-    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _stream(
-        14, 1.0, "vehicle_land_detected", "vehicle_status"
+    _POSITION: Stream(40, 0.0, {_LOCAL}),
+    _STATUS: Stream(54, 0.0, {_LOCAL, _GLOBAL}),
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Stream(40, 10.0, {_LOCAL, _GLOBAL}),
+    dialect.MAVLINK_MSG_ID_ALTITUDE: Stream(44, 10.0, {_LOCAL}),
+    dialect.MAVLINK_MSG_ID_ODOMETRY: Stream(244, 10.0, {_LOCAL, "vehicle_odometry"}),
+    QUATERNION: Stream(44, 0.0, {"vehicle_attitude"}),
+    dialect.MAVLINK_MSG_ID_GPS_RAW_INT: Stream(64, 5.0, {"sensor_gps"}),
+    dialect.MAVLINK_MSG_ID_SYSTEM_TIME: Stream(24, 1.0, {"sensor_gps"}),
+    dialect.MAVLINK_MSG_ID_SYS_STATUS: Stream(55, 1.0, {"vehicle_status"}),
+    dialect.MAVLINK_MSG_ID_BATTERY_STATUS: Stream(66, 1.0, {"battery_status"}),
+    dialect.MAVLINK_MSG_ID_HOME_POSITION: Stream(72, 1.0, {"home_position"}),
+    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Stream(
+        14, 1.0, {"vehicle_land_detected", "vehicle_status"}
     ),
 }
 """Messages to request, in this order, and the topics that need them."""

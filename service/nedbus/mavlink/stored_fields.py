@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, cast
 
 from pymavlink.dialects.v20 import common as dialect
 
@@ -15,18 +15,7 @@ _VALUE_TIMEOUT: Final = 2.0  # s for which a received value is used
 _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS once a second
 _UNKNOWN_HEADING: Final = 65535
 _POLE: Final = 90e7  # 1e-7 deg
-
-
-class _Expiring(NamedTuple):
-    fields: Fields
-    until: float
-
-
-class _Part(NamedTuple):
-    """Fields of a message, and for how long they are used [s]."""
-
-    convert: Conversion
-    seconds: float
+_NOTHING: Final[Mapping[str, Any]] = {}
 
 
 def _heading(message: Any) -> Fields:
@@ -137,26 +126,28 @@ def _vtol(message: Any) -> Fields:
     return vtol_status(message.vtol_state)
 
 
-_PARTS: Final[Mapping[str, Mapping[str, _Part]]] = {
+_PARTS: Final[Mapping[str, Mapping[str, Conversion]]] = {
     "vehicle_local_position": {
-        "ATTITUDE": _Part(_yaw, _VALUE_TIMEOUT),
-        "GLOBAL_POSITION_INT": _Part(_heading, _VALUE_TIMEOUT),  # replaces that of ATTITUDE
-        "ESTIMATOR_STATUS": _Part(_local_status, _STATUS_TIMEOUT),
-        "ALTITUDE": _Part(_clearance, _VALUE_TIMEOUT),
-        "ODOMETRY": _Part(_velocity_errors, _VALUE_TIMEOUT),
-        "GPS_GLOBAL_ORIGIN": _Part(_origin, math.inf),
+        "ATTITUDE": _yaw,
+        "GLOBAL_POSITION_INT": _heading,  # replaces that of ATTITUDE
+        "ESTIMATOR_STATUS": _local_status,
+        "ALTITUDE": _clearance,
+        "ODOMETRY": _velocity_errors,
+        "GPS_GLOBAL_ORIGIN": _origin,
     },
-    "vehicle_global_position": {"ESTIMATOR_STATUS": _Part(_global_status, _STATUS_TIMEOUT)},
-    "vehicle_status": {
-        "SYS_STATUS": _Part(_sensors, _STATUS_TIMEOUT),
-        "EXTENDED_SYS_STATE": _Part(_vtol, _STATUS_TIMEOUT),
-    },
+    "vehicle_global_position": {"ESTIMATOR_STATUS": _global_status},
+    "vehicle_status": {"SYS_STATUS": _sensors, "EXTENDED_SYS_STATE": _vtol},
 }
 """By topic: the MAVLink messages that complete it, and what they add."""
 
-_TOPICS_OF: Final[Mapping[str, list[str]]] = {
-    kind: [topic for topic, parts in _PARTS.items() if kind in parts]
-    for kind in {kind for parts in _PARTS.values() for kind in parts}
+_KINDS: Final = {kind for parts in _PARTS.values() for kind in parts}
+_TIMEOUTS: Final = {
+    **dict.fromkeys(_KINDS, _VALUE_TIMEOUT),
+    "ESTIMATOR_STATUS": _STATUS_TIMEOUT,
+    "SYS_STATUS": _STATUS_TIMEOUT,
+    "EXTENDED_SYS_STATE": _STATUS_TIMEOUT,
+    "SYSTEM_TIME": _STATUS_TIMEOUT,
+    "GPS_GLOBAL_ORIGIN": math.inf,
 }
 
 
@@ -165,35 +156,37 @@ class StoredFields:
 
     def __init__(self) -> None:
         # by topic and type of message, in the order of _PARTS
-        self._stored = {
-            topic: dict.fromkeys(parts, _Expiring({}, 0.0)) for topic, parts in _PARTS.items()
-        }
-        self._boot = 0  # UTC of the boot [us], used for GPS messages ...
-        self._boot_until = -math.inf  # ... until then [s]
+        self._fields = {topic: dict.fromkeys(parts, _NOTHING) for topic, parts in _PARTS.items()}
+        self._until = dict.fromkeys(_TIMEOUTS, -math.inf)  # when the fields of a message expire
+        self._boot = 0  # UTC of the boot [us]
 
     def add(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         """Store what a message of this type adds to others; `timestamp`: its time since boot [us].
 
         The caller leaves out a GPS_GLOBAL_ORIGIN without an origin: an earlier one is still valid.
         """
-        for topic in _TOPICS_OF.get(kind, ()):
-            part = _PARTS[topic][kind]
-            self._stored[topic][kind] = _Expiring(part.convert(message), now + part.seconds)
-        if kind == "SYSTEM_TIME" and timestamp is not None and is_unix_time(message.time_unix_usec):
+        timeout = _TIMEOUTS.get(kind)
+        if timeout is None:
+            return
+        if kind == "SYSTEM_TIME":
+            if timestamp is None or not is_unix_time(message.time_unix_usec):
+                return
             self._boot = message.time_unix_usec - timestamp
-            self._boot_until = now + _STATUS_TIMEOUT
+        self._until[kind] = now + timeout
+        for topic, parts in _PARTS.items():
+            if kind in parts:
+                self._fields[topic][kind] = parts[kind](message)
 
     def complete(self, topic: str, fields: Fields, now: float) -> None:
         """Add to the fields of a message, which include its timestamp, what is known from others."""
-        for kind, stored in self._stored.get(topic, {}).items():
-            if now > stored.until:
-                continue
+        for kind, further in self._fields.get(topic, _NOTHING).items():
             if kind == "EXTENDED_SYS_STATE" and not can_be_vtol(fields.get("system_type")):
                 continue
-            fields |= stored.fields
+            if now <= self._until[kind]:
+                fields |= further
         if topic == "vehicle_local_position":
             _check_flags(fields)
-        elif topic == "sensor_gps" and now <= self._boot_until:
+        elif topic == "sensor_gps" and now <= self._until["SYSTEM_TIME"]:
             fields["time_utc_usec"] = self._boot + cast("int", fields["timestamp"])
 
 

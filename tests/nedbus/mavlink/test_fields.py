@@ -28,7 +28,7 @@ def test_example_of_the_module_is_true() -> None:
     assert (result.failed, result.attempted) == (0, 4)
 
 
-CONVERTED = {
+CONVERTED: dict[str, tuple[Any, dict[str, Any]]] = {
     "gps": (
         dialect.MAVLink_gps_raw_int_message(
             10**6, 3, 470_000_000, 80_000_000, 500_000, 120, 150, 1234, 18_000, 12,
