@@ -43,7 +43,7 @@ def test_clock_of_most_messages_begins() -> None:
 
 def test_first_message_from_before_the_recording_is_left_out() -> None:
     """A recorder first gets the last message of a rarely published topic, which may be old by its timestamp."""
-    rare = stream_of("battery_status", [1_000_000, BEGIN + STEP, BEGIN + 2 * STEP], log=10**15)
+    rare = stream_of("vehicle_status", [1_000_000, BEGIN + STEP, BEGIN + 2 * STEP], log=10**15)
     positions = stream_of("vehicle_local_position", steps(BEGIN, 5), log=10**15)
     assert first_of([*rare, *positions], 0) is positions[0]
 
