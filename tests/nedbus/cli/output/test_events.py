@@ -16,7 +16,7 @@ CAUSE = Event("1", "gps_fix_lost", "begin", "watch", "GPS fix lost", 10.0)
     ("time", "severity", "evidence"),
     [
         (12.0, "bad", "  <- GPS fix lost (2.0 s before)"),
-        (9.5, "bad", "  <- GPS fix lost (500.0 ms after)"),
+        (9.5, "bad", "  <- GPS fix lost (500 ms after)"),
         (12.0, "info", ""),
     ],
 )
@@ -30,8 +30,9 @@ def test_line_of_an_event_has_the_distance_of_its_evidence(
 
 def test_paragraph_of_a_fault_has_only_the_headings_it_needs() -> None:
     """A fault without events before, during or after it has its period and the missing topics."""
-    begin = Event("1", "xy_invalid", "begin", "bad", "xy not valid", 12.0)
-    end = Event("1", "xy_invalid", "end", "info", "xy valid again", 15.0)
+    flags = ("xy_valid",)
+    begin = Event("1", "xy_invalid", "begin", "bad", "xy not valid", 12.0, names=flags)
+    end = Event("1", "xy_invalid", "end", "info", "xy valid again", 15.0, names=flags)
     verdict = verdict_of("1", [begin, end], topics=[VLP], times=Times(), end=20.0)
     [paragraph] = describe_stories(verdict, "advice")
     first, *lines = paragraph.splitlines()
