@@ -184,8 +184,7 @@ class Track(Generic[M]):
         previous = self._previous
         if previous is None or not _agree(item.lag, previous.lag):
             return None
-        self.last[item.stream] = item.stamp
-        return previous.base + item.stamp
+        return previous.base + item.stamp  # `last` is of the clock after the change
 
     def _follow(self, item: Item[M]) -> None:
         self.last[item.stream] = item.stamp

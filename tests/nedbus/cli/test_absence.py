@@ -82,3 +82,15 @@ def test_other_prefix_is_named(endpoint: str, bus: nedbus.Bus) -> None:
         "messages are published under nedbus/, but the prefix here is fleet/wrong/: use --prefix nedbus"
         in shown.err
     )
+
+
+def test_source_that_publishes_does_not_explain_the_absence(
+    endpoint: str, zenoh_session: Session
+) -> None:
+    """A source that waits for further messages of a vehicle has received some."""
+    waiting = source(state="waiting", addresses=[f"1/{VLP}"])
+    with service_status(zenoh_session, sources=[waiting]):
+        shown = run_command("list", "-c", endpoint)
+    assert shown.err.endswith(
+        ": a service answers: see 'nedbus info' and the access rules for it and this client (docs/security.md)\n"
+    )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import typer
 
+import nedbus
 from nedbus.cli.app import make_app
 from tests.peers.command_line import run_command
 
@@ -65,3 +67,23 @@ def test_limit_proposes_count() -> None:
     assert ended.exit_code == 2
     assert "--count" in ended.err
     assert "--wait" not in ended.err
+
+
+def test_argument_selects_a_vehicle_and_an_instance(endpoint: str, bus: nedbus.Bus) -> None:
+    """VEHICLE/TOPIC/INSTANCE, as `nedbus list` prints it, selects one stream; several must agree on both parts."""
+    for vehicle in ("1", "2"):
+        for instance in (0, 1):
+            publisher = bus.publisher("sensor_gps", vehicle=vehicle, instance=instance)
+            publisher.publish(nedbus.SensorGps.model_validate({"timestamp": 1}))
+    got = run_command("get", "-c", endpoint, "--json", "2/sensor_gps/1")
+    assert [json.loads(line)["vehicle"] for line in got.out.splitlines()] == ["2"]
+    assert json.loads(got.out)["instance"] == 1
+    for other in ("1/sensor_gps/1", "2/sensor_gps/0"):
+        ended = run_command("get", "-c", endpoint, "2/sensor_gps/1", other)
+        assert ended.exit_code == 2
+        assert f"'2/sensor_gps/1' and '{other}' differ in vehicle or instance" in ended.err
+
+
+def test_flag_may_be_repeated() -> None:
+    """A flag says the same when it is given twice."""
+    assert run_command("schema", "--layouts", "--layouts").exit_code == 0

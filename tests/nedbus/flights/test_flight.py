@@ -267,3 +267,30 @@ def test_warning_names_the_first_reason_of_invalid_messages(tmp_path: Path) -> N
         assert len(list(samples)) == 8
         [warning] = samples.warnings
     assert warning.startswith(f"skipped 2 messages of 1/{VLP} as invalid (x: must be finite")
+
+
+def test_truncated_log_has_lost_nothing_to_damage(tmp_path: Path) -> None:
+    """A log whose end was not written is not damaged, unlike one with a message of no definition; both are warnings."""
+    path = write_log(tmp_path / "a.ulg", [1_000_000, 2_000_000, 3_000_000])
+    content = path.read_bytes()
+    path.write_bytes(content[:-5])
+    with nedbus.open(path) as flight:
+        assert flight.warnings == (f"{path}: truncated (the file ends inside a message)",)
+        assert not flight.damaged
+    unknown = b"\x0a\x00D" + b"\x63\x00" + bytes(8)  # message id 99 was not subscribed to
+    path.write_bytes(content + unknown)
+    with nedbus.open(path) as flight:
+        assert flight.warnings == (f"{path}: skipped messages without a definition (1)",)
+        assert flight.damaged
+
+
+@pytest.mark.parametrize(("system_id", "vehicle"), [(255, "255"), (0, "1"), (256, "1")])
+def test_system_id_outside_mavlinks_range_is_not_used(
+    tmp_path: Path, system_id: int, vehicle: str
+) -> None:
+    """A log is of the vehicle 1 unless MAV_SYS_ID is from 1 to 255."""
+    writer = UlogWriter(system_id=system_id)
+    writer.define([VLP])
+    writer.add(VLP, message())
+    with nedbus.open(writer.write(tmp_path / "a.ulg")) as flight:
+        assert [address.vehicle for address in flight.addresses] == [vehicle]

@@ -527,6 +527,8 @@ _OFF = 2_000_000
         ([_OFF, 0] * 10, None),  # two receivers in one stream
         ([300_000 * number for number in range(40)], None),  # a drift
         ([30_000_000] * 20 + [0] * 20, None),  # another boot
+        (sorted([-18_000_000, -12_000_000, -6_000_000, 0] * 20), None),  # three corrections
+        ([0] * 10 + [_OFF] * 2, None),  # two messages do not confirm a correction
     ],
 )
 def test_utc_after_a_correction_holds(offsets: Sequence[int], corrected: int | None) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from nedbus.vehicle_events import Event, Story, Times, stories_of
 
-from .flight import ARMED, Flight, lose_gps
+from .flight import ARMED, DISARMED, Flight, lose_gps
 
 
 def why(flight: Flight, *, at: float | None = None) -> list[Story]:
@@ -157,6 +157,24 @@ def test_active_watch_condition_is_a_story_after_ended_fault() -> None:
     assert [(each.what, each.until) for each in why(flight)][1:] == [("dead reckoning", None)]
     flight.wait(1.0).send(dead_reckoning=True, xy_valid=False)
     assert [each.what for each in why(flight)] == ["xy and vxy not valid", "xy not valid"]
+
+
+def test_fault_that_ended_before_the_arming_is_not_in_flight() -> None:
+    """A fault is in flight if it lasts into the time between arming and disarming."""
+    flight = Flight()
+    flight.status(DISARMED)
+    flight.send()
+    flight.wait(1.0).send(xy_valid=False)
+    flight.wait(3.0).send()
+    flight.wait(1.0).status(ARMED)
+    flight.fly(5)
+    flight.wait(0.1).send(xy_valid=False)
+    flight.wait(3.0).send()
+    flight.wait(1.0).status(DISARMED)
+    assert [(story.what, story.in_flight) for story in why(flight)] == [
+        ("xy not valid", False),
+        ("xy not valid", True),
+    ]
 
 
 def test_condition_without_begin_event_is_a_story() -> None:

@@ -822,3 +822,58 @@ def test_live_verdict_excludes_the_time_without_a_position() -> None:
     assert found.text.startswith(
         'position valid since 00:01:55.0 UTC, but PX4: "Baro sensor #0 failure: Timeout" at '
     )
+
+
+def test_condition_that_had_recovered_is_no_evidence() -> None:
+    """A condition that ended more than a second before a fault does not explain it, unlike one that lasts."""
+    flight = Flight()
+    flight.gps()
+    flight.fly(1)
+    flight.gps(fix_type=0)
+    flight.wait(1.0).gps()
+    flight.wait(3.0).send(dead_reckoning=True)
+    flight.wait(2.0).send(dead_reckoning=True, xy_valid=False)
+    flight.wait(1.0).send(dead_reckoning=True, xy_valid=False)
+    [story] = [story for story in verdict(flight).stories if story.kind == "xy_invalid"]
+    assert [event.kind for event in story.before] == ["dead_reckoning"]
+
+
+def test_texts_on_one_injected_failure_are_quoted_once() -> None:
+    """PX4 reports an injected failure in the words of the command and of each driver."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.fly(1)
+    px4_text(flight, "Failure injection: GPS off")
+    px4_text(flight, "CMD_INJECT_FAILURE, gnss off")
+    flight.wait(1.0).send(xy_valid=False)
+    flight.wait(1.0).send(xy_valid=False)
+    assert verdict(flight).text.lower().count("inject") == 1
+
+
+def test_warning_long_after_the_start_of_a_fault_is_no_evidence() -> None:
+    """A text is evidence for a fault until a second after its start."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.fly(1)
+    flight.send(xy_valid=False)
+    flight.wait(0.5)
+    px4_text(flight, "GPS 0 lost")
+    flight.wait(2.0)
+    px4_text(flight, "Battery hot")
+    flight.wait(1.0).send(xy_valid=False)
+    assert [event.text for event in verdict(flight).cause] == ["GPS 0 lost"]
+
+
+def test_second_bad_fault_is_named_before_a_large_correction() -> None:
+    """Of what else happened, another bad fault comes first, then the largest correction."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.fly(2)
+    for tenth in range(80):
+        fields: dict[str, Any] = {"xy_valid": tenth >= 40, "z_valid": not 20 <= tenth < 60}
+        if tenth >= 40:
+            fields |= {"x": 20.0, "xy_reset_counter": 1}
+        flight.wait(0.1).send(**fields)
+    found = verdict(flight)
+    assert len(found.stories) == 2
+    assert has_words(found.text, "Also", "not valid", "reset of xy by 20.0 m")

@@ -2,12 +2,12 @@
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus import Bus, Mode, Sample
+from nedbus import Bus, Counts, Mode, Sample
 from nedbus.cli.follow import follow
 from nedbus.cli.options import (
     POSITIONS,
@@ -61,7 +61,13 @@ def echo(
     if max_rate is not None:
         check_max_rate(max_rate)
     fields = parse_fields(field, selection)
-    form = to_json if json_output else to_fields if full else CsvLines() if csv_output else Lines()
+    form: Callable[[Sample[Any], Sequence[str]], str] = Lines()
+    if json_output:
+        form = to_json
+    if full:
+        form = to_fields
+    if csv_output:
+        form = CsvLines()
     due: dict[Address, float] = {}
 
     def print_one(sample: Sample[Any]) -> bool:
@@ -89,17 +95,18 @@ def echo(
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has read enough
                 counts = subscription.counts
-                if (
-                    csv_output
-                    or counts.lost
-                    or counts.dropped
-                    or counts.invalid
-                    or counts.discarded
-                ):
-                    unread = (
-                        f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"
-                    )
-                    text = f"{counts.received} received, {counts.lost} lost, {unread}, {counts.invalid} invalid"
-                    write_stderr(
-                        f"{text}, {counts.discarded} discarded" if counts.discarded else text
-                    )
+                if csv_output or _is_incomplete(counts):
+                    write_stderr(_describe_counts(counts, every=every))
+
+
+def _is_incomplete(counts: Counts) -> bool:
+    return any((counts.lost, counts.dropped, counts.invalid, counts.discarded))
+
+
+def _describe_counts(counts: Counts, *, every: bool) -> str:
+    """Describe which messages were shown, and which were not."""
+    unread = "dropped" if every else "skipped (--every prints all)"
+    text = f"{counts.received} received, {counts.lost} lost, {counts.dropped} {unread}, {counts.invalid} invalid"
+    if counts.discarded:
+        text += f", {counts.discarded} discarded"
+    return text

@@ -67,6 +67,14 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
         assert len(lines) == len(expected)
 
 
+def test_mistake_of_a_file_that_is_given_twice_is_reported_once(tmp_path: Path) -> None:
+    """The same file under two arguments has the same mistakes."""
+    file = tmp_path / "nedbus.toml"
+    file.write_text("conect = 1\n")
+    [line] = check("--offline", file, file)
+    assert line.startswith(f"{file}, line 1, column 1: unknown setting 'conect'")
+
+
 def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
     """If the file is unreadable, options and variables are still checked, but no setting is reported as missing."""
     broken = tmp_path / "broken.toml"

@@ -29,7 +29,7 @@ from tests.flights.replays import open_replay
 from tests.nedbus.cli.output.test_terminal import publishing
 from tests.peers.command_line import CommandResult, fork_command, run_command
 from tests.peers.processes import ForkedProcess, ForkServer, Start
-from tests.waits import DEADLINE, wait_for
+from tests.waits import DEADLINE, repeating, wait_for
 
 from .test_query import simulation
 
@@ -346,3 +346,20 @@ def test_echo_field_selects_fields(simulation: str) -> None:
         assert text in out
         assert "vx" not in out
         assert out.count("vehicle_local_position") == 1
+
+
+def test_notice_of_silence_is_written_once(endpoint: str, timings: Timings) -> None:
+    """`echo` says once that it waits, however long it does."""
+    timings.first_sample = 0.1
+    ended = run_command("echo", "-c", endpoint, "--duration", "2.2")
+    assert ended.exit_code == 1
+    assert ended.err.count("yet, still waiting") == 1
+
+
+def test_count_is_that_of_printed_messages(endpoint: str, bus: nedbus.Bus) -> None:
+    """With --interval, messages that are not printed do not count, so --count waits for further ones."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    with repeating(lambda: publisher.publish(message(1))):
+        ended = run_command("echo", "-c", endpoint, "--every", "--interval", "0.3", "-n", "3")
+    assert ended.exit_code == 0
+    assert len(ended.out.splitlines()) == 3

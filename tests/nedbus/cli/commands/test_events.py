@@ -469,6 +469,7 @@ def test_events_live_are_printed_as_they_happen(
         lambda: "gone: no publisher of vehicle_local_position" in follower.out,
         what="the end of the publisher",
     )
+    assert follower.err.count("z not valid, from the start") == 1
     lines = [line.split(None, 2)[1:] for line in follower.out.splitlines()]
     assert [line[0] for line in lines] == ["7"] * len(lines)
     assert lines[0][1].startswith("BAD    xy not valid")

@@ -1,0 +1,1 @@
+"""Tests of the time of a vehicle and of a flight."""
