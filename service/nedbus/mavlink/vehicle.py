@@ -33,6 +33,8 @@ _UNKNOWN_HEADING: Final = 65535
 _MAX_LATITUDE: Final = 90e7  # 1e-7 deg
 # s without a HEARTBEAT until a link with HIGH_LATENCY2 is a satellite link
 _HEARTBEAT_TIMEOUT: Final = 10.0
+# s from the first message within which the first HEARTBEAT is expected
+_FIRST_HEARTBEAT: Final = 1.5
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
@@ -267,7 +269,7 @@ class Vehicle:
                 return Rejection(str(address), "more than 100 log messages per second", address)
             self._texts.add(message, now)
         if fields_of is None:
-            topic, fields_of = LOG_MESSAGE.name, lambda _: self._texts.pop(now)
+            topic, fields_of = LOG_MESSAGE.name, lambda _: self._next_text(now)
             timestamp = self.clock.newest
         if topic not in self._topics or is_redundant or timestamp is None:
             return None
@@ -333,6 +335,16 @@ class Vehicle:
         self._add_stored_fields(address.topic, fields, timestamp, now)
         source = self._text_source if address == self._text_address else None
         return self.report(SourceMessage(0.0, address, fields, source=source, arrived=now), log)
+
+    def _next_text(self, now: float) -> dict[str, object]:
+        """Return the fields of the next text; {} if there is none, or if its source is not known yet.
+
+        A .tlog may begin with texts, before the first HEARTBEAT, which comes once a second and names their source.
+        """
+        is_anonymous = self._last_heartbeat == -math.inf
+        if is_anonymous and now - self._started < _FIRST_HEARTBEAT:
+            return {}
+        return self._texts.pop(now)
 
     def _place_sample(self, address: Address, sampled: int) -> int | None:
         """Return the time of a message whose sensor sampled at `sampled` [us since boot]; None for a copy.
