@@ -278,12 +278,12 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
         ),
         (  # a service that has ended: its losses on the network were counted by stream before, and fired no alert
             "NedbusMessagesLost",
-            'nedbus_source_lost_total{instance="a"} 0x60 stale; nedbus_messages_lost_total{instance="a"} 0x30 5x29 stale',
+            'nedbus_source_lost_total{job="a"} 0x60 stale; nedbus_messages_lost_total{job="a"} 0x30 5x29 stale',
             {"45s": False, "1m15s": False},
         ),
         (  # an exporter
             "NedbusMessagesLost",
-            'nedbus_messages_lost_total{instance="a"} 0x30 5x30',
+            'nedbus_messages_lost_total{job="a"} 0x30 5x30',
             {"25s": False, "45s": True},
         ),
         (  # a replay waiting for a reader
