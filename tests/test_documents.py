@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Final
@@ -406,10 +407,42 @@ def test_every_finding_is_listed() -> None:
         r"^\| `([\w-]+)` \|", (ROOT / "findings" / "README.md").read_text(), re.MULTILINE
     )
     assert listed == scripts
-    named = re.findall(
-        r"^\|.*, `([\w-]+)` \|$", (DOCS / "beside-other-tools.md").read_text(), re.MULTILINE
-    )
-    assert sorted(set(named)) == scripts
+    assert sorted({row.script for row in differences()}) == scripts
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A row of the page of differences: the packages that show it, with versions, and the script."""
+
+    packages: str
+    script: str
+
+
+def differences() -> list[Difference]:
+    """Return the rows of the page of differences, each of which has five columns and ends with a script."""
+    page = (DOCS / "beside-other-tools.md").read_text()
+    head, _, *rows = re.findall(r"^\|.*\|$", page.partition("## Differences")[2], re.MULTILINE)
+    columns = head.count(" | ") + 1
+    found = []
+    for row in rows:
+        cells = row.strip("| ").split(" | ")
+        assert len(cells) == columns, row
+        source = re.fullmatch(r"(.+), `([\w-]+)`", cells[-1])
+        assert source, f"no script at the end of: {row}"
+        found.append(Difference(*source.groups()))
+    return found
+
+
+def test_every_difference_has_a_script_that_installs_its_versions() -> None:
+    """Each row of the page of differences names an existing script, which installs the versions that the row names."""
+    rows = differences()
+    assert len(rows) > 50
+    for row in rows:
+        script = ROOT / "findings" / f"{row.script}.sh"
+        assert script.is_file(), row
+        text = script.read_text()
+        for version in re.findall(r"(?<![\w.-])\d+(?:\.\d+)*(?![\w.-])", row.packages):
+            assert version in text, f"{row.script} does not install {version}"
 
 
 def test_relative_links_resolve() -> None:

@@ -23,6 +23,8 @@ _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is res
 _QUATERNION_TIMEOUT: Final = 2.0  # s without ATTITUDE_QUATERNION after which ATTITUDE replaces it
 # s without a HEARTBEAT until a link with HIGH_LATENCY2 is a satellite link
 _HEARTBEAT_TIMEOUT: Final = 10.0
+# s from the first message within which the first HEARTBEAT is expected
+_FIRST_HEARTBEAT: Final = 1.5
 # s without a new message on the first link after which another one is the first
 _HANDOVER: Final = 0.5
 # s without a new message on the first link after which messages without a time are used
@@ -102,6 +104,7 @@ class Vehicle:
 
     def _reset(self, now: float) -> None:
         """Discard all state and request everything again, after silence or a reboot."""
+        self._started = now
         self._stored = StoredFields()
         # newest timestamps, and the links that delivered them
         self._last: dict[Address, tuple[int, int]] = {}
@@ -233,7 +236,16 @@ class Vehicle:
         newest = self.clock.newest
         if self._text_address.topic not in self._topics or newest is None:
             return None
+        if self._is_anonymous(now):
+            return None
         return self._publish(self._text_address, self._texts.pop(now), newest, now, log)
+
+    def _is_anonymous(self, now: float) -> bool:
+        """Return True while the first HEARTBEAT, which names the source of texts, is expected.
+
+        A .tlog may begin with texts. A HEARTBEAT comes once a second.
+        """
+        return self._last_heartbeat == -math.inf and now - self._started < _FIRST_HEARTBEAT
 
     def _has_quaternion(self, now: float) -> bool:
         """Return whether ATTITUDE_QUATERNION arrives, so that ATTITUDE is not needed."""

@@ -281,6 +281,41 @@ def test_signal_stops_the_service(
     assert "lost" not in service.err
 
 
+@pytest.mark.parametrize("has_own_router", [True, False])
+def test_stopped_service_delivers_what_it_has_published(
+    tmp_path: Path, run_nedbus: Start, serve: Serve, endpoint: str, has_own_router: bool
+) -> None:
+    """A reader receives each message that a service published before SIGTERM, in order, and learns of the end.
+
+    The replay runs at full speed. In the end the reader has no link, if the router was the service's own one, or else
+    no vehicle.
+    """
+    path = write_log(tmp_path / "a.ulg", range(0, 10_000_000, 1000))
+    source = "-s", f"ulog:{path}?speed=max&wait=1"
+    with ExitStack() as closing:
+        if has_own_router:
+            service, bus = serve(*source)
+        else:
+            service = run_nedbus("serve", "-c", endpoint, *source)
+            bus = closing.enter_context(connect(endpoint))
+        subscription = closing.enter_context(bus.subscribe(VLP, mode="every"))
+        received = [subscription.receive(DEADLINE).message.timestamp for _ in range(1000)]
+        published = source_of(bus).published
+        service.signal(signal.SIGTERM)
+        assert service.wait() == 0, service.err
+        while len(received) < published:
+            received.append(subscription.receive(DEADLINE).message.timestamp)
+        if has_own_router:
+            wait_for(lambda: not bus.connected, what="the end of the link")
+        else:
+            wait_for(lambda: not bus.vehicles(), what="the end of the vehicle")
+        while subscription.waiting:
+            received.append(subscription.receive(DEADLINE).message.timestamp)
+        assert received == [1000 * number for number in range(len(received))]
+        assert 1000 <= published <= len(received) < 10_000
+        assert subscription.counts.lost == 0
+
+
 def test_signal_stops_a_replay_blocked_by_a_stuck_reader(tmp_path: Path, serve: Serve) -> None:
     """A stuck reader blocks a replay at full speed for up to ten minutes, but not the exit of the service."""
     path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000))

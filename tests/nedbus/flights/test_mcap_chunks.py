@@ -18,10 +18,13 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
+    Header,
     McapRecord,
     Message,
+    MessageIndex,
     Metadata,
     Schema,
+    Statistics,
 )
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
@@ -172,3 +175,53 @@ def test_chunks_that_together_unpack_too_far_are_skipped(
     assert 0 < count < 20
     assert damaged
     assert "together claim more than 16000 bytes" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("library", "read_without_index"), [("pymcap-cli", True), ("libmcap 2.1.1", False)]
+)
+def test_indexes_that_may_be_partial_are_not_used(
+    tmp_path: Path, library: str, read_without_index: bool
+) -> None:
+    """A chunk of which `pymcap-cli recover` kept one of two indexes is read for the topic that lacks one, too.
+
+    Other libraries write all indexes of a chunk, so one whose indexes lack a channel has none of its messages.
+    """
+    path = tmp_path / "recovered.mcap"
+    begin = MCAP0_MAGIC + encode(Header("ros2", library))
+    messages = encode(
+        *(Channel(number, f"/{number}", "cdr", {}, 0) for number in (1, 2)),
+        *(Message(number, 0, b"", 0, 0) for number in (1, 2, 2)),
+    )
+    kept = encode(MessageIndex(1, [(0, 0)]))
+    data = begin + chunk(messages) + kept + encode(DataEnd(0))
+    indexed = ChunkIndex(
+        chunk_length=len(chunk(messages)),
+        chunk_start_offset=len(begin),
+        compression="",
+        compressed_size=len(messages),
+        message_end_time=0,
+        message_index_length=len(kept),
+        message_index_offsets={1: len(begin) + len(chunk(messages))},
+        message_start_time=0,
+        uncompressed_size=len(messages),
+    )
+    totals = Statistics(
+        attachment_count=0,
+        channel_count=1,
+        channel_message_counts={1: 1},
+        chunk_count=1,
+        message_count=1,
+        message_end_time=0,
+        message_start_time=0,
+        metadata_count=0,
+        schema_count=0,
+    )
+    summary = encode(indexed, totals)
+    path.write_bytes(data + summary + encode(Footer(len(data), 0, 0)) + MCAP0_MAGIC)
+    file = ChunkFile(path)
+    read = [record for block in file.blocks({2}) for record in records_of(block, Opcode.MESSAGE)]
+    file.close()
+    assert len(read) == (3 if read_without_index else 0)
+    assert bool(file.summary) != read_without_index
+    assert file.warnings == []

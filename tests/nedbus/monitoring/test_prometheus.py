@@ -276,6 +276,16 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
             "nedbus_source_rejected_total 0x30 1x500; nedbus_messages_rejected_total _x30 1x500",
             {"25s": False, "45s": True, "5m45s": False},
         ),
+        (  # a service that has ended: its losses on the network were counted by stream before, and fired no alert
+            "NedbusMessagesLost",
+            'nedbus_source_lost_total{job="a"} 0x60 stale; nedbus_messages_lost_total{job="a"} 0x30 5x29 stale',
+            {"45s": False, "1m15s": False},
+        ),
+        (  # an exporter
+            "NedbusMessagesLost",
+            'nedbus_messages_lost_total{job="a"} 0x30 5x30',
+            {"25s": False, "45s": True},
+        ),
         (  # a replay waiting for a reader
             "NedbusSourceSilent",
             'nedbus_source_state{state="waiting"} 1x100; nedbus_source_addresses 5x100',

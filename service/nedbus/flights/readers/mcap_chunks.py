@@ -1,6 +1,7 @@
 """MCAP file reader that reads chunk by chunk, and skips and reports damaged parts.
 
-The summary, which has its own CRC, lists the chunks; without it the records are scanned one by one. Decompression
+The summary, which has its own CRC, lists the chunks; without it, and in files of a library whose indexes may lack
+messages, the records are scanned one by one. Decompression
 uses bounded memory. The readers of the `mcap` package have no limit and stop at the first damage.
 """
 
@@ -21,7 +22,16 @@ from lz4.frame import LZ4FrameDecompressor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema, Statistics
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    McapRecord,
+    Message,
+    Schema,
+    Statistics,
+)
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
@@ -51,6 +61,10 @@ _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 # opcode, length, start of summary and summary offsets, CRC, magic
 _FOOTER: Final = struct.Struct("<BQQQI8s")
+# pymcap-cli 0.34.0 `recover`: a chunk keeps the part of its indexes that was left, which lacks the messages of other
+# channels; the statistics lack them as well
+_PARTIAL_INDEXES: Final = "pymcap-cli"
+_HEADER_BYTES: Final = 1000  # a longer header is not one of that library
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
     Opcode.SCHEMA: Schema,
@@ -106,10 +120,11 @@ class ChunkFile:
         self._chunks: list[_IndexedChunk] = []
         self._end = 0  # of the data, before the summary
         self.summary = b""
-        try:
-            self._read_summary()
-        except READ_ERRORS:
-            self.warn("the index is damaged; reading without it")
+        if not self._library().startswith(_PARTIAL_INDEXES):
+            try:
+                self._read_summary()
+            except READ_ERRORS:
+                self.warn("the index is damaged; reading without it")
 
     def blocks(self, only: Collection[int] | None = None) -> Iterator[bytes]:
         """Yield each intact chunk, decompressed, and each record outside chunks, in file order.
@@ -189,6 +204,17 @@ class ChunkFile:
     def _read(self, start: int, size: int) -> bytes:
         self._file.seek(start)
         return self._file.read(size)
+
+    def _library(self) -> str:
+        """Return the name of the library that wrote the file; "" if its header is damaged or too long."""
+        begin = len(MCAP0_MAGIC)
+        header = self._read(begin, _HEADER_BYTES)
+        if header[:1] != bytes([Opcode.HEADER]):
+            return ""
+        try:
+            return str(Header.read(ReadDataStream(BytesIO(header[_RECORD_HEAD.size :]))).library)
+        except READ_ERRORS:
+            return ""
 
     def _read_summary(self) -> None:
         """Read the summary if there is one; raise one of READ_ERRORS if it is damaged."""

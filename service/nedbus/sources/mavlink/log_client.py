@@ -448,22 +448,10 @@ class LogStreamClient:
             if is_accepted:
                 return self._send("stop", now)
             self._enter("stopped", None, now)
-<<<<<<< HEAD
-        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:
-            # the stream exists, but is slow
-            if state == "header":
-                self._end_header(now)
-            elif state != "streaming":
-                self._resume(now)
-            self._due = now + self._silence_limit()
-=======
         elif is_accepted:
             self._await_data(now)
         elif is_taken and self._has_header:
             self._keep_stream(now)
-        elif is_taken and "take" in self._log and not self._took_over:
-            return self._take_over(now)
->>>>>>> h2
         else:
             reason = _REFUSALS.get(result, "failed")
             self._enter("refused", reason, now, _name("MAV_RESULT", result))

@@ -283,6 +283,34 @@ def test_gps_of_a_second_link_is_a_copy_also_without_a_fix() -> None:
     assert vehicle.copies == 3 + 3
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "source"),
+    [(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "mavlink-ardupilot"), (None, None)],
+)
+def test_texts_wait_for_the_first_heartbeat(autopilot: int | None, source: str | None) -> None:
+    """Texts from before the first HEARTBEAT have the source that it names; without one they are published after 1.5 s.
+
+    A log of ArduSub 4.1.1 begins with four texts, half a second before the first HEARTBEAT.
+    """
+    vehicle, texts = new_vehicle("*"), []
+    text = "ArduSub V4.1.1"
+    messages: list[tuple[float, Any]] = [
+        (100.0, position(10_000)),
+        (100.1, chunk(text.encode(), 0)),
+        (101.6, dialect.MAVLink_scaled_pressure_message(11_600, 0, 0, 0)),
+    ]
+    if autopilot is not None:
+        messages.insert(2, (100.6, dialect.MAVLink_heartbeat_message(12, autopilot, 0, 0, 4, 3)))
+        messages.insert(3, (100.7, dialect.MAVLink_scaled_pressure_message(10_700, 0, 0, 0)))
+    for now, message in messages:
+        vehicle.count_lost(0, now)
+        for each in vehicle.handle_all(message, now):
+            if isinstance(each, SourceMessage) and each.address.topic == "log_message":
+                texts.append((now, each.fields["text"], each.source))
+    published = 101.6 if autopilot is None else 100.7
+    assert texts == [(published, text, source)]
+
+
 def numbered_texts(
     packets: Iterable[tuple[float, int, int]], *, offset: int = 0
 ) -> tuple[Counter[object], int]:
@@ -292,6 +320,8 @@ def numbered_texts(
     others are positions; the second link numbers its packets from `offset`.
     """
     vehicle, counter, texts = new_vehicle("*"), SequenceCounter(), Counter[object]()
+    vehicle.count_lost(0, 99.9)
+    vehicle.handle_all(heartbeat(), 99.9)
     for now, number, link in packets:
         lost = counter.add((number + offset * link) % 256, now)
         vehicle.count_lost(lost, now, link=counter.link)
@@ -338,6 +368,8 @@ def test_texts_of_two_links_are_published_once(late: float, offset: int) -> None
 def test_repeated_text_of_two_links_is_published_as_often_as_it_was_sent() -> None:
     """A vehicle that sends a text twice within a second sends it twice over each link: it is published twice."""
     vehicle, published = new_vehicle("*"), 0
+    vehicle.count_lost(0, 99.9)
+    vehicle.handle_all(heartbeat(), 99.9)
     for now, link in ((100.0, 0), (100.3, 1), (100.5, 0), (100.8, 1)):
         vehicle.count_lost(0, now, link=link)
         vehicle.handle(position(round(1000 * now - 90_000 - 300 * link)), now)
