@@ -196,6 +196,10 @@ UNREADABLE_TOPICS: Final = 100
 MAVLINK_VEHICLES: Final = 100
 """Vehicles per link, because a stranger could send with many ids. Messages of further ones are rejected."""
 
+MAVLINK_TEXTS: Final = 256
+"""STATUSTEXT messages of a vehicle that wait, and those of the last 10 s among which copies are searched. \
+Beyond it the oldest are dropped, or forgotten."""
+
 MAVLINK_WAITING: Final = 16_384
 """Received messages of all vehicles that wait for the source. Beyond it the oldest of the longest queue is dropped."""
 

@@ -352,58 +352,29 @@ def _read_text(path: Path) -> str:
 
 
 def _read_toml(path: Path) -> dict[str, object]:
-    text = _read_text(path)
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as exc:
-        position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
-        reason = re.sub(r" \(at .*\)", "", str(exc))
-        if position is None:  # the error is at the end of the document
-            raise ConfigError.in_text(path, reason, text, len(text.rstrip("\n"))) from exc
-        line, column = map(int, position.groups())
-        raise ConfigError.in_file(path, reason, line=line, column=column) from exc
+        return tomllib.loads(_read_text(path))
+    except tomllib.TOMLDecodeError as exc:  # whose text ends with line and column
+        raise ConfigError.in_file(path, str(exc)) from exc
 
 
-def _find_key(text: str, name: str) -> int:
-    """Return the index of a key or table, which `tomllib` does not report; -1 if it is not in the text."""
-    pattern = rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]"
-    match = re.search(pattern, text, re.MULTILINE)
+def _find_key(text: str, name: str, start: int = 0) -> int:
+    """Return the index of a key or table from `start` on, which `tomllib` does not report; -1 if there is none."""
+    key = re.compile(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", re.MULTILINE)
+    match = key.search(text, start)
     return match.start(1) if match else -1
 
 
-def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> int:
-    """Return the index of a source (a table, or a string in a list) or of one of its options."""
+def _find_source(text: str, sources: Sequence[object], index: int, option: str) -> int:
+    """Return the index of a source: of its string in a list, or of its table or the option in it."""
     source = sources[index]
-    place = -1
-    if isinstance(source, str):
-        place = _find_string(text, source, number=sources[:index].count(source))
-    else:
-        place = _find_table(text, index, key)
-    if place < 0:
+    if isinstance(source, str):  # equal sources have equal mistakes
+        quoted = re.search(rf"[\"']({re.escape(source)})[\"']", text)
+        return quoted.start(1) if quoted else _find_key(text, "source")
+    tables = [
+        match.start(1) for match in re.finditer(r"^[ \t]*\[\[[ \t]*(source)\b", text, re.MULTILINE)
+    ]
+    if index >= len(tables):  # tables within a list
         return _find_key(text, "source")
-    return place
-
-
-def _find_string(text: str, source: str, *, number: int) -> int:
-    """Return the index of a quoted source, which may be there several times; -1 if it is not in the text."""
-    quoted = re.compile(rf"(?<=[\"'])({re.escape(source)})[\"']")
-    places = [match.start(1) for match in quoted.finditer(text)]
-    if number < len(places):
-        return places[number]
-    return -1
-
-
-def _find_table(text: str, index: int, key: str) -> int:
-    """Return the index of a table of sources, or of one of its keys; -1 if it is not in the text."""
-    headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
-    if index >= len(headers):
-        return -1
-    start = headers[index].start(1)
-    if not key:
-        return start
-    end = len(text)
-    if index + 1 < len(headers):
-        end = headers[index + 1].start()
-    pattern = rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*="
-    option = re.search(pattern, text[start:end], re.MULTILINE)
-    return start + option.start(1) if option else start
+    table, end = [*tables, len(text)][index : index + 2]
+    return max(table, _find_key(text[:end], option, table) if option else table)

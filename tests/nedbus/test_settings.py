@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from nedbus import Tls
 from nedbus.endpoints import is_loopback, resolution_error
 from nedbus.errors import ConfigError, ConnectError, ListenError
 from nedbus.pki import make_authority, make_certificate
-from nedbus.settings import load_client_settings, load_settings
+from nedbus.settings import Settings, load_client_settings, load_settings, locate_source
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
 from tests.peers.command_line import run_command
@@ -96,8 +97,6 @@ def test_settings_file_is_found_by_flag_variable_or_default(
 @pytest.mark.parametrize(
     ("text", "position", "reason"),
     [
-        ('connect = ["tcp/a:1"', "line 1, column 21", "Unclosed array"),
-        ("vehicle = 1\nx y", "line 2, column 3", "Expected '=' after a key"),
         (
             "vehicle = 1\n\n  conect = 3",
             "line 3, column 3",
@@ -134,6 +133,69 @@ def test_error_in_a_file_has_line_and_column(
         load_settings(file) if file.suffix == ".toml" else open_router(config_file=file)
     assert re.match(rf"{re.escape(str(file))}, {position}: {reason}", str(info.value))
     assert not re.search(r"/root/|\.rs", str(info.value))
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ('connect = ["tcp/a:1"', r"Unclosed array \(at .*\)"),
+        (
+            "vehicle = 1\nx y",
+            r"Expected '=' after a key in a key/value pair \(at line 2, column 3\)",
+        ),
+        ("[[source", r"Expected .* \(at .*\)"),
+    ],
+)
+def test_syntax_error_has_file_and_position(tmp_path: Path, text: str, error: str) -> None:
+    """The error for a file that is no TOML states the file, and the position that Python's parser reports."""
+    file = tmp_path / "nedbus.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=rf"^{re.escape(str(file))}: {error}$"):
+        load_settings(file)
+
+
+TABLES = """# source = "sim:?b=1"
+[[source]]
+kind = "sim"
+rate = 2
+
+[[ source ]]
+kind = "sim"
+rat = 1
+
+[[source]]
+kind = "sim"
+rate = "fast"
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "index", "option", "position"),
+    [
+        (TABLES, 1, "rat", ", line 8, column 1"),
+        (TABLES, 0, "rat", ", line 2, column 3"),  # an option of another table
+        (TABLES, 2, "rate", ", line 12, column 1"),
+        (TABLES, 2, "", ", line 10, column 3"),
+        ('prefix = "sim:x"\nsource = ["sim:a", "sim:"]', 1, "", ", line 2, column 21"),
+        ("source = 'sim:'", 0, "rate", ", line 1, column 11"),
+        ('source = [\n  {kind = "sim"},\n  {kind = "ulog"},\n]', 1, "kind", ", line 1, column 1"),
+        (r'source = ["sim\u003a"]', 0, "", ", line 1, column 1"),
+        ('source."kind" = "sim"', 0, "", ", line 1, column 1"),
+    ],
+)
+def test_error_of_a_source_has_its_line(
+    tmp_path: Path, text: str, index: int, option: str, position: str
+) -> None:
+    """The error of a source names the line of its string, table or option; that of `source` for other spellings."""
+    file = tmp_path / "nedbus.toml"
+    file.write_text(text)
+    sources = tomllib.loads(text)["source"]
+    given = sources if isinstance(sources, list) else [sources]
+    settings = Settings(source=given)
+    settings._file = file
+    settings._set_by["source"] = str(file)
+    error = locate_source(settings, index, ConfigError("source", "wrong", key=option))
+    assert str(error) == f"{file}{position}: source: wrong"
 
 
 def test_missing_or_unreadable_settings_file_raises(

@@ -5,7 +5,7 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final, Literal
 
 from nedbus import clock
@@ -17,6 +17,7 @@ from nedbus.settings import Settings, locate_setting, locate_source
 from nedbus.sources import SOURCE_KINDS, ReplaySource, Source, parse_source
 from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
 from nedbus.vehicle_events import AccountReport, EventLog, report_of
+from nedbus_msgs import Address
 
 from .status_replies import StatusReplies
 from .worker import PlannedSource, SourceMeasures, Worker, stop_workers
@@ -48,15 +49,12 @@ def plan_sources(
         tls = settings.tls
     except ConfigError as exc:
         if not settings.left_out.intersection(_TLS):
-            mistakes.append(
-                locate_setting(
-                    settings, next(name for name in _TLS if getattr(settings, name)), exc.reason
-                )
-            )
+            given = [name for name in _TLS if getattr(settings, name)]
+            mistakes.append(locate_setting(settings, given[0], exc.reason))
     routers = tuple(map(dial_endpoint, endpoints))
-    for index, given in enumerate(settings.source):
+    for index, text in enumerate(settings.source):
         try:
-            spec = parse_source(given)
+            spec = parse_source(text)
             source = spec.open_source(
                 vehicle=settings.vehicle, routers=routers, tls=tls, prefix=settings.prefix
             )
@@ -64,12 +62,8 @@ def plan_sources(
             mistakes.append(locate_source(settings, index, exc))
         else:
             plan.append(PlannedSource(index, spec.text, settings.vehicle, source))
-    if (
-        settings.until_done
-        and plan
-        and not mistakes
-        and not any(is_finite(planned.source) for planned in plan)
-    ):
+    is_endless = plan and not any(is_finite(planned.source) for planned in plan)
+    if settings.until_done and is_endless and not mistakes:
         reason = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
         mistakes.append(ConfigError("until_done", reason))
     return plan, mistakes
@@ -103,14 +97,16 @@ class Daemon:
         self._refused_at_end: list[str] = []
         self.event_log = EventLog(reader="service")
         # Random, because services in containers may all be PID 1 on hosts of the same name.
-        self.id = re.sub(
-            r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
-        )
+        name = f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
+        self.id = re.sub(r"[^A-Za-z0-9_-]", "-", name)
         self.max_sessions: int | None = None  # session limit of the embedded router, once open
-        # closing: only the session is still open
-        self.ready, self.closing = threading.Event(), threading.Event()
-        self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
-        self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
+        self.ready = threading.Event()
+        self.closing = threading.Event()  # only the session is still open
+        self.role: Literal["router", "client"] = "router"
+        self.endpoints = settings.router_endpoints
+        if settings.is_client:
+            self.role = "client"
+            self.endpoints = settings.connect
         self._plan = self._make_plan(settings)
 
     @property
@@ -141,7 +137,9 @@ class Daemon:
     @property
     def refused(self) -> Mapping[str, bool]:
         """Whether access rules deny each published vehicle; vehicles whose permission is unknown are omitted."""
-        return {} if self._permission is None else self._permission.refused
+        if self._permission is None:
+            return {}
+        return self._permission.refused
 
     @property
     def measures(self) -> list[SourceMeasures]:
@@ -156,42 +154,47 @@ class Daemon:
     @property
     def sessions(self) -> int:
         """Number of sessions connected to the embedded router, or of a client's links to its router."""
-        return 0 if self._session is None else len(self._session.info.transports())
+        if self._session is None:
+            return 0
+        return len(self._session.info.transports())
 
     def update_events(self, measures: Sequence[SourceMeasures] | None = None) -> EventLog:
         """Update and return the event log; `measures`: current measurements, if already available."""
+        if measures is None:
+            measures = self.measures
         measured: dict[str, str] = {}
-        measures = self.measures if measures is None else measures
         for source in measures:
             measured |= source.states
-        dropped = sum(each.status.dropped for each in measures)
-        is_behind = any(each.status.overload for each in measures)
-        mains = [
-            vehicle.main
-            for vehicle in list(self.event_log.vehicles.values())
-            if vehicle.main is not None
-        ]
-        shared = set() if self._registry is None else self._registry.shared_vehicles()
-        present = (
-            set()
-            if self._registry is None
-            else {each.vehicle for each in tuple(self._registry.publishers)}
-        )
-        states = {main: measured[str(main)] for main in mains if str(main) in measured}
-        states |= {main: "duplicate" for main in states if main.vehicle in shared}
-        is_link_lost = self.role == "client" and self._session is not None and not self.sessions
-        link = f"no link to {' or '.join(self.endpoints)}" if is_link_lost else ""
+        present = set[str]()
+        shared: Collection[str] = ()
+        if self._registry is not None:
+            present = {address.vehicle for address in tuple(self._registry.publishers)}
+            shared = self._registry.shared_vehicles()
+        states = dict[Address, str]()
+        for vehicle in list(self.event_log.vehicles.values()):
+            main = vehicle.main
+            if main is None or str(main) not in measured:
+                continue
+            states[main] = "duplicate" if main.vehicle in shared else measured[str(main)]
+        link = ""
+        if self.role == "client" and self._session is not None and not self.sessions:
+            link = f"no link to {' or '.join(self.endpoints)}"
         self.event_log.update(
-            clock.steady(), states, link=link, dropped=dropped, is_behind=is_behind, present=present
+            clock.steady(),
+            states,
+            link=link,
+            dropped=sum(source.status.dropped for source in measures),
+            is_behind=any(source.status.overload for source in measures),
+            present=present,
         )
         return self.event_log
 
     def report(self, *, within: float = 0.0) -> AccountReport:
         """Return the events of the last `within` seconds and the current state of each vehicle."""
-        event_log, host = self.update_events(), socket.gethostname()
-        return report_of(
-            event_log, self.id, host, clock.steady(), within=within, to_utc=clock.to_utc()
-        )
+        event_log = self.update_events()
+        host = socket.gethostname()
+        now = clock.steady()
+        return report_of(event_log, self.id, host, now, within=within, to_utc=clock.to_utc())
 
     def stop(self) -> None:
         """Stop `run`; safe to call from any thread and from signal handlers."""
@@ -206,19 +209,20 @@ class Daemon:
         """
         for name in type(settings).model_fields:
             if name not in _RELOADABLE and getattr(settings, name) != getattr(self._settings, name):
-                raise locate_setting(
-                    settings, name, f"{name} cannot be changed by a reload: restart the service"
-                )
+                reason = f"{name} cannot be changed by a reload: restart the service"
+                raise locate_setting(settings, name, reason)
         plan = self._make_plan(settings)
         with self._workers_lock:
-            self._settings, self._plan = settings, plan
+            self._settings = settings
+            self._plan = plan
             if self._registry is None:
                 return "no source is running yet"
-            before, unchanged = len(self._workers), self._apply_plan(self._registry)
+            before = len(self._workers)
+            unchanged = self._apply_plan(self._registry)
         self._changed.set()
-        return (
-            f"{len(plan) - unchanged} started, {before - unchanged} stopped, {unchanged} unchanged"
-        )
+        started = len(plan) - unchanged
+        stopped = before - unchanged
+        return f"{started} started, {stopped} stopped, {unchanged} unchanged"
 
     def run(self) -> bool:
         """Publish until done or stopped; return False if a source failed, or the router refused what was published.
@@ -262,9 +266,8 @@ class Daemon:
             session.close()
             if self._permission is not None:
                 self._permission.close()
-        return not self._refused_at_end and not any(
-            source.state == "failed" for source in self.sources
-        )
+        has_failed = any(source.state == "failed" for source in self.sources)
+        return not (self._refused_at_end or has_failed)
 
     def _apply_plan(self, registry: PublisherRegistry) -> int:
         """Stop removed sources and start new ones, in the order of the plan; return the number of unchanged sources."""
@@ -273,20 +276,20 @@ class Daemon:
         new = list[Worker]()
         router = self._session if self.role == "router" else None
         for planned in self._plan:
-            worker = next((each for each in removed if each.planned == planned), None)
-            if worker is not None:
-                removed.remove(worker)
-            else:
-                retry, on_end = not self.until_done, self._changed.set
-                worker = Worker(
-                    planned,
-                    registry,
-                    router=router,
-                    event_log=self.event_log,
-                    retry=retry,
-                    on_end=on_end,
-                )
-                new.append(worker)
+            unchanged = [worker for worker in removed if worker.planned == planned]
+            if unchanged:
+                removed.remove(unchanged[0])
+                ordered.append(unchanged[0])
+                continue
+            worker = Worker(
+                planned,
+                registry,
+                router=router,
+                event_log=self.event_log,
+                retry=not self.until_done,
+                on_end=self._changed.set,
+            )
+            new.append(worker)
             ordered.append(worker)
         stop_workers(removed, _RETIRE_TIMEOUT, release=True)
         for worker in removed:
@@ -308,54 +311,64 @@ class Daemon:
 
     def _open(self) -> Session | None:
         """Open the session; a client waits for its router. Return None if stopped during the wait."""
-        settings, endpoints = self._settings, ", ".join(self.endpoints)
         if self.role == "router":
-            session = open_router(
-                listen=settings.listen,
-                connect=settings.connect,
-                config_file=settings.router_config,
-                tls=settings.tls if settings.connect else None,
-            )
-            self.max_sessions = read_router_config(settings.router_config).max_sessions
-            joining = f", joining {', '.join(settings.connect)}" if settings.connect else ""
-            _log.info("router on %s%s", endpoints, joining, extra=about("router"))
-            return session
-        setter = settings.set_by("connect")  # NEDBUS_CONNECT may have been set for scripts
-        hint = (
-            ""
-            if setter == "connect"
-            else f", set by {setter}; use --listen to run a router instead"
-        )
-        _log.info("connecting to a router at %s%s", endpoints, hint, extra=about("client"))
-        logged = False
+            return self._open_router()
+        settings = self._settings
+        setter = settings.set_by("connect")
+        hint = ""
+        if setter != "connect":  # NEDBUS_CONNECT may have been set for scripts
+            hint = f", set by {setter}; use --listen to run a router instead"
+        text = "connecting to a router at %s%s"
+        _log.info(text, ", ".join(self.endpoints), hint, extra=about("client"))
+        is_logged = False
         while not self._stop.is_set():
             try:
                 return open_client(self.endpoints, timeout=1.0, tls=settings.tls, stop=self._stop)
             except ConnectError as exc:
-                if not logged:
+                if not is_logged:
                     _log.warning("%s; still trying", exc, extra=about("link_lost"))
-                logged = True
+                is_logged = True
         return None
+
+    def _open_router(self) -> Session:
+        settings = self._settings
+        session = open_router(
+            listen=settings.listen,
+            connect=settings.connect,
+            config_file=settings.router_config,
+            tls=settings.tls if settings.connect else None,
+        )
+        self.max_sessions = read_router_config(settings.router_config).max_sessions
+        joining = f", joining {', '.join(settings.connect)}" if settings.connect else ""
+        _log.info("router on %s%s", ", ".join(self.endpoints), joining, extra=about("router"))
+        return session
 
     def _wait(self, registry: PublisherRegistry, replies: StatusReplies, uplinks: Uplinks) -> None:
         """Wait for `stop`, or until all finite sources have ended and their messages are acknowledged."""
         while not self._stop.is_set():
-            if self._settings.until_done:
-                finite = [worker for worker in self._workers if is_finite(worker.source)]
-                if all(worker.status().ended for worker in finite):
-                    # Heartbeats let readers detect the loss of the last message.
-                    speeds = [
-                        each.source.options.speed
-                        for each in finite
-                        if isinstance(each.source, ReplaySource)
-                    ]
-                    self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
-                    registry.flush(tuple(registry.publishers.values()), stop=self._stop)
-                    if self._permission is not None:
-                        self._refused_at_end = self._permission.decide()
-                    return
+            if self._settings.until_done and self._is_done():
+                self._flush(registry)
+                return
             self._changed.wait(_POLL)
             self._changed.clear()
             for vehicle in list(self.update_events().vehicles):
                 replies.add(vehicle)
             uplinks.check()
+
+    def _is_done(self) -> bool:
+        """Return whether all finite sources have ended."""
+        return all(worker.status().ended for worker in self._workers if is_finite(worker.source))
+
+    def _flush(self, registry: PublisherRegistry) -> None:
+        """Wait until readers have acknowledged all messages; note the vehicles that reached none."""
+        sources = [worker.source for worker in self._workers]
+        if any(
+            isinstance(source, ReplaySource) and source.finite and source.options.speed
+            for source in sources
+        ):
+            self._stop.wait(
+                2 * HEARTBEAT
+            )  # heartbeats let readers detect the loss of the last message
+        registry.flush(tuple(registry.publishers.values()), stop=self._stop)
+        if self._permission is not None:
+            self._refused_at_end = self._permission.decide()

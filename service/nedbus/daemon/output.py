@@ -1,6 +1,7 @@
 """Output of a source: validate, publish or reject its messages, and track the health of each stream."""
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable, Container
 from contextlib import suppress
@@ -43,15 +44,39 @@ class _Stream:
 
     health: StreamHealth
     publisher: Publisher | None = None
-    last_received: float | None = None
+    last_received: float = -math.inf  # of a live source
     last: SourceMessage | None = None
     settled: float = 0.0  # a stream that is stale again before then flaps, which is logged once
     flaps: int = 0
 
     @property
+    def is_live(self) -> bool:
+        """Whether a live source has delivered a message."""
+        return self.last_received > -math.inf
+
+    @property
     def patience(self) -> float:
         """Seconds without a message until the stream is stale."""
-        return max(TIMINGS.stale, 3 * (self.health.usual_interval or 0.0))
+        usual = self.health.usual_interval
+        if usual is None:
+            return TIMINGS.stale
+        return max(TIMINGS.stale, 3 * usual)
+
+    def carries(self, definition: Definition[Any] | None) -> bool:
+        """Return whether the publisher is open for messages of a definition; None for that of the topic."""
+        if self.publisher is None:
+            return False
+        known = self.publisher.definition
+        if definition is None or definition is known:
+            return True
+        # the same fields in the same order
+        return [*definition.types.items()] == [*known.types.items()]
+
+    def close(self) -> None:
+        """Close the publisher, if it is open."""
+        if self.publisher is not None:
+            self.publisher.close()
+            self.publisher = None
 
 
 class SourceOutput:
@@ -65,7 +90,10 @@ class SourceOutput:
         now: Callable[[], float],
         event_log: EventLog,
     ) -> None:
-        self.published = self.rejected = self.lost = self.reboots = 0
+        self.published = 0
+        self.rejected = 0
+        self.lost = 0
+        self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
         # topics that vehicles publish but a live source does not deliver now
         self.unavailable = UnavailableTopics()
@@ -100,18 +128,18 @@ class SourceOutput:
     @property
     def stale(self) -> list[Address]:
         """Addresses of a live source that are no longer published."""
-        streams = list(self._streams.items())
         return [
             address
-            for address, stream in streams
-            if stream.publisher is None and stream.last_received is not None
+            for address, stream in list(self._streams.items())
+            if stream.publisher is None and stream.is_live
         ]
 
     def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
         """Return the health of all streams, or of the first `limit`."""
-        streams, now = list(self._streams.items())[:limit], round(self._now() * 1e9)
+        now = round(self._now() * 1e9)
         return tuple(
-            StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams
+            StreamStatus(str(address), stream.health.snapshot(now))
+            for address, stream in list(self._streams.items())[:limit]
         )
 
     @property
@@ -137,11 +165,9 @@ class SourceOutput:
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
-        if stream.publisher is not None:
-            if not _differs(definition, stream.publisher.definition):
-                return stream
-            stream.publisher.close()  # another layout, for example of new firmware
-            stream.publisher = None
+        if stream.carries(definition):
+            return stream
+        stream.close()  # perhaps another layout, for example of new firmware
         stream.publisher = self._registry.publisher(
             address, definition, lossless=lossless, short_history=True, source=self._kind
         )
@@ -150,25 +176,21 @@ class SourceOutput:
     def release(self, *, keep: Container[Address] = ()) -> None:
         """Close the publishers of all addresses except `keep`."""
         for address, stream in self._streams.items():
-            if address not in keep and stream.publisher is not None:
-                stream.publisher.close()
-                stream.publisher = None
+            if address not in keep:
+                stream.close()
 
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
-        stream, definition = self._streams.get(message.address), message.definition
+        address = message.address
+        stream = self._streams.get(address)
         if stream is None and len(self._streams) >= limits.REPLAYED_ADDRESSES:
-            self._reject_excess(message.address, limits.REPLAYED_ADDRESSES)
+            self._reject_excess(address, limits.REPLAYED_ADDRESSES)
             return
-        if (
-            stream is None
-            or stream.publisher is None
-            or definition is not stream.publisher.definition
-        ):
+        if stream is None or not stream.carries(message.definition):
             try:
-                stream = self.claim(message.address, definition, lossless=lossless)
+                stream = self.claim(address, message.definition, lossless=lossless)
             except AddressInUseError as exc:
-                self.reject(Rejection(str(message.address), str(exc)))
+                self.reject(Rejection(str(address), str(exc)))
                 return
         self._publish(message, stream)
 
@@ -178,13 +200,13 @@ class SourceOutput:
         """Validate a message of a claimed address, and publish or reject it; `received`: time, by default now."""
         address = message.address
         publisher = stream.publisher
-        lost = message.lost
         if publisher is None:
             raise KeyError(address)
         if message.error is not None:
             self._reject_invalid(message, _NO_MESSAGE, message.error)
             return
-        if (source := message.source or self._kind) != publisher.source:
+        source = message.source or self._kind
+        if source != publisher.source:
             publisher.relabel(source)
         start = None if self.published % _TIMED else self._now()
         try:
@@ -192,31 +214,35 @@ class SourceOutput:
             publisher.publish_encoded(payload, provided)
         except InvalidMessageError as exc:
             field, violation = exc.violations[0]
-            # without values
-            self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)
+            rule, _, _ = violation.partition(" (")  # without values
+            self._reject_invalid(message, f"{field}: {rule}", exc.reason)
             return
         now = self._now()
         if start is not None:
             self.durations.add(now - start)
         self.published += 1
-        received = now if received is None else received
-        # it waited in this service
-        latency = now - received if now - received > TIMINGS.lateness else None
+        if received is None:
+            received = now
+        waited = now - received  # in this service
+        lost = message.lost
         stream.health.add(
-            row, received=round(received * 1e9), latency=latency, lost=lost, missing=missing
+            row,
+            received=round(received * 1e9),
+            latency=waited if waited > TIMINGS.lateness else None,
+            lost=lost,
+            missing=missing,
         )
+        steady = clock.steady()
         if message.dropout:
-            self._event_log.add_dropout(
-                address.vehicle, message.dropout, clock.steady() - message.dropout
-            )
-        is_estimate = message.source == _ULOG_STREAM
+            begin = steady - message.dropout
+            self._event_log.add_dropout(address.vehicle, message.dropout, begin)
         self._event_log.add(
             address,
             row,
-            clock.steady(),
+            steady,
             missing=missing,
             lost=lost,
-            is_estimate=is_estimate,
+            is_estimate=message.source == _ULOG_STREAM,
             source=message.source,
         )
 
@@ -226,34 +252,34 @@ class SourceOutput:
         self.reboots += message.rebooted
         address = message.address
         stream = self._streams.get(address)
-        publisher = stream.publisher if stream is not None else None
-        if (
-            stream is None
-            or publisher is None
-            or _differs(message.definition, publisher.definition)
-        ):
-            resumed = stream is not None and stream.last_received is not None
-            if (
-                not resumed
-                and len(self._streams) >= limits.LIVE_ADDRESSES
-                and not self._evict_stale()
-            ):
-                self._reject_excess(address, limits.LIVE_ADDRESSES)
+        if stream is None or not stream.carries(message.definition):
+            stream = self._claim_live(message, stream)
+            if stream is None:
                 return
-            try:
-                stream = self.claim(address, message.definition)
-            except AddressInUseError as exc:
-                self.reject(Rejection(str(address), str(exc)))
-                return
-            if not stream.flaps:
-                text = f"{address} is published{' again' if resumed else ''}"
-                event = "stream_resumed" if resumed else "published"
-                _log.info(
-                    "%s: %s", self._name, text, extra=about(event, address, source=self._name)
-                )
-            self._republish_retained(message)
-        stream.last_received, stream.last = message.arrived or self._now(), message
-        self._publish(message, stream, stream.last_received)
+        received = message.arrived or self._now()
+        stream.last_received = received
+        stream.last = message
+        self._publish(message, stream, received)
+
+    def _claim_live(self, message: SourceMessage, known: _Stream | None) -> _Stream | None:
+        """Claim the address of a message; return None if it is rejected. `known`: its stream, if it was published."""
+        address = message.address
+        is_resumed = known is not None and known.is_live
+        is_excess = not is_resumed and len(self._streams) >= limits.LIVE_ADDRESSES
+        if is_excess and not self._evict_stale():
+            self._reject_excess(address, limits.LIVE_ADDRESSES)
+            return None
+        try:
+            stream = self.claim(address, message.definition)
+        except AddressInUseError as exc:
+            self.reject(Rejection(str(address), str(exc)))
+            return None
+        if not stream.flaps:
+            text = f"{address} is published again" if is_resumed else f"{address} is published"
+            event = "stream_resumed" if is_resumed else "published"
+            _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
+        self._republish_retained(message)
+        return stream
 
     def expire_stale(self) -> bool:
         """Stop publishing stale live addresses; return True if any address is still published.
@@ -265,61 +291,69 @@ class SourceOutput:
         fresh = {
             address
             for address, stream in self._streams.items()
-            if stream.last_received is not None and now - stream.last_received < stream.patience
+            if now - stream.last_received < stream.patience
         }
         vehicles = {address.vehicle for address in fresh}
-        fresh |= {
-            each
-            for each in self._streams
-            if each.vehicle in vehicles and not get_topic(each.topic).rate
-        }
-        for address in [each for each in self.addresses if each not in fresh]:
-            stream = self._streams[address]
-            stream.flaps = stream.flaps + 1 if now < stream.settled else 0
-            stream.settled = now + _UNSETTLED
-            if stream.flaps < 2:
-                text = f"{address} is stale: no message for {now - (stream.last_received or 0.0):.0f} s"
-                text += (
-                    f"; it flaps, logged again once stable for {_UNSETTLED:.0f} s" * stream.flaps
-                )
-                _log.warning(
-                    "%s: %s", self._name, text, extra=about("stale", address, source=self._name)
-                )
+        for address in self._streams:
+            if address.vehicle in vehicles and not get_topic(address.topic).rate:
+                fresh.add(address)
+        for address in self.addresses:
+            if address not in fresh:
+                self._note_stale(address, self._streams[address], now)
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
-            stream.flaps *= now < stream.settled
-            is_known = (
-                address.vehicle in self._event_log.vehicles and stream.last_received is not None
-            )
-            if stream.publisher is None and not (
-                is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten
-            ):
+            if now >= stream.settled:
+                stream.flaps = 0
+            if stream.publisher is None and not self._is_remembered(address, stream, now):
                 del self._streams[address]
         self._is_full = False
         return bool(fresh)
 
+    def _note_stale(self, address: Address, stream: _Stream, now: float) -> None:
+        """Log that a stream is stale, but only once while it flaps."""
+        stream.flaps = stream.flaps + 1 if now < stream.settled else 0
+        stream.settled = now + _UNSETTLED
+        if stream.flaps > 1:
+            return
+        silence = now - max(0.0, stream.last_received)
+        text = f"{address} is stale: no message for {silence:.0f} s"
+        if stream.flaps:
+            text += f"; it flaps, logged again once stable for {_UNSETTLED:.0f} s"
+        _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
+
+    def _is_remembered(self, address: Address, stream: _Stream, now: float) -> bool:
+        """Return whether a stale stream is kept: its vehicle has events, and its last message is recent."""
+        is_recent = now - stream.last_received < TIMINGS.forgotten
+        return is_recent and address.vehicle in self._event_log.vehicles
+
     def _evict_stale(self) -> bool:
         """Delete the address that has been stale the longest; return False if all are published."""
-        stale = () if self._is_full else {*self._streams}.difference(self.addresses)
-        if stale:
-            del self._streams[min(stale, key=lambda each: self._streams[each].last_received or 0.0)]
-        self._is_full = not stale
-        return not self._is_full
+        if self._is_full:
+            return False
+        stale = {*self._streams}.difference(self.addresses)
+        if not stale:
+            self._is_full = True
+            return False
+        oldest = min(stale, key=lambda address: self._streams[address].last_received)
+        del self._streams[oldest]
+        return True
 
     def reject(self, rejection: Rejection, rule: str = _NO_MESSAGE) -> None:
         """Count invalid input, log it once per origin, and publish a rejection report if it has an address."""
         self._count_rejected(rule, rejection.count)
-        where, reason = rejection.where[: limits.PEER_TEXT], rejection.reason[: limits.PEER_TEXT]
+        where = rejection.where[: limits.PEER_TEXT]
+        reason = rejection.reason[: limits.PEER_TEXT]
         if where not in self._warnings and len(self._warnings) < limits.REJECTION_ORIGINS:
-            self._warnings[where] = f"{where}: {reason}"
-            text = f"{where} rejected: {reason}" if rejection.count else f"{where}: {reason}"
+            text = f"{where}: {reason}"
+            self._warnings[where] = text
+            if rejection.count:
+                text = f"{where} rejected: {reason}"
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
             self._event_log.reject(rejection.address, reason, clock.steady())
-            self._registry.reject(
-                rejection.address, {"source": self._text, "where": where, "reason": reason}
-            )
+            report = {"source": self._text, "where": where, "reason": reason}
+            self._registry.reject(rejection.address, report)
 
     def _reject_excess(self, address: Address, limit: int) -> None:
         reason = f"the limit is {limit}, and {address} is the first one ignored"
@@ -329,7 +363,8 @@ class SourceOutput:
         """Store the unavailable topics of a live source; log each silent address once, up to the address limit."""
         self.unavailable = unavailable
         new = [address for address in unavailable.silent if address not in self._silent]
-        if new := new[: limits.LIVE_ADDRESSES - len(self._silent)]:
+        new = new[: limits.LIVE_ADDRESSES - len(self._silent)]
+        if new:
             self._silent.update(new)
             text = f"announced, nothing arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
@@ -344,53 +379,41 @@ class SourceOutput:
     def _republish_retained(self, message: SourceMessage) -> None:
         """After an outage, republish the last messages of topics without a rate, unless the vehicle has rebooted."""
         vehicle = message.address.vehicle
-        streams = [
-            (address, stream)
-            for address, stream in self._streams.items()
-            if address.vehicle == vehicle
-        ]
-        known = [
-            (address, stream, stream.last) for address, stream in streams if stream.last is not None
-        ]
-        newest = max((last.timestamp or 0 for *_, last in known), default=0)
-        rebooted = message.rebooted or (message.timestamp or 0) < newest
-        for address, stream, last in known:
+        retained = dict[Address, SourceMessage]()
+        for address, stream in self._streams.items():
+            if address.vehicle == vehicle and stream.last is not None:
+                retained[address] = stream.last
+        newest = max((last.timestamp or 0 for last in retained.values()), default=0)
+        has_rebooted = message.rebooted or (message.timestamp or 0) < newest
+        for address, last in retained.items():
+            stream = self._streams[address]
             if stream.publisher is not None or get_topic(address.topic).rate:
                 continue
-            if rebooted:
+            if has_rebooted:
                 stream.last = None
                 continue
             with suppress(AddressInUseError):
-                claimed = self.claim(address, last.definition)
+                self.claim(address, last.definition)
                 extra = about("stream_resumed", address, source=self._name)
                 _log.info("%s: %s is published again", self._name, address, extra=extra)
-                self._publish(replace(last, lost=0), claimed)
+                self._publish(replace(last, lost=0), stream)
 
     def _count_rejected(self, rule: str, count: int = 1) -> None:
         self.rejected += count
-        self.rejections[
-            rule
-            if rule in self.rejections or len(self.rejections) < limits.REJECTION_RULES
-            else "other"
-        ] += count
+        if rule not in self.rejections and len(self.rejections) >= limits.REJECTION_RULES:
+            rule = "other"
+        self.rejections[rule] += count
 
     def _reject_invalid(self, message: SourceMessage, rule: str, reason: str) -> None:
+        address = message.address
         self._count_rejected(rule)
         self._invalid += 1
         if self._invalid <= limits.LOGGED_INVALID:
-            last = (
-                "; further rejections are counted but not logged"
-                if self._invalid == limits.LOGGED_INVALID
-                else ""
-            )
-            text = f"{message.address} rejected: {reason}{last}"
-            extra = about("rejected", message.address, source=self._name, reason=reason)
+            text = f"{address} rejected: {reason}"
+            if self._invalid == limits.LOGGED_INVALID:
+                text += "; further rejections are counted but not logged"
+            extra = about("rejected", address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
-        self._event_log.reject(message.address, reason, clock.steady())
-        self._registry.reject(message.address, report)
-
-
-def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
-    """Return True if a definition has different fields, or the same fields in another order."""
-    return new is not None and new is not known and [*new.types.items()] != [*known.types.items()]
+        self._event_log.reject(address, reason, clock.steady())
+        self._registry.reject(address, report)

@@ -93,12 +93,13 @@ class SourceMeasures:
     @property
     def states(self) -> dict[str, str]:
         """State of each stream by address; all are ok after the end of the source."""
+        streams = self.status.streams
         if self.status.ended:
-            return {stream.address: "ok" for stream in self.status.streams}
-        alive, streams = frozenset(self.status.addresses), self.status.streams
+            return {stream.address: "ok" for stream in streams}
+        alive = frozenset(self.status.addresses)
         return {
-            each.address: stream_state(each.health, publishers=each.address in alive).name
-            for each in streams
+            stream.address: stream_state(stream.health, publishers=stream.address in alive).name
+            for stream in streams
         }
 
 
@@ -126,7 +127,8 @@ class Worker:
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
-        self.planned, self.source = planned, planned.source
+        self.planned = planned
+        self.source = planned.source
         # file names may be invalid UTF-8
         self.text = planned.text.encode(errors="backslashreplace").decode()
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
@@ -140,7 +142,8 @@ class Worker:
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None
-        self._done = self._retries = 0
+        self._done = 0
+        self._retries = 0
         # when publishing of the current message began; None while waiting
         self._message_start: float | None = None
         self._release = False
@@ -149,8 +152,10 @@ class Worker:
     @property
     def busy(self) -> float:
         """Time spent on the current message [s]; 0 while opening a source or waiting for the next message."""
-        since = self._message_start
-        return 0.0 if since is None else self._clock.now() - since
+        since = self._message_start  # changed on another thread
+        if since is None:
+            return 0.0
+        return self._clock.now() - since
 
     @property
     def measures(self) -> SourceMeasures:
@@ -191,12 +196,10 @@ class Worker:
         try:
             self._run_until_done()
         except BaseException as exc:  # noqa: BLE001 - the state must not stay "running" when the thread ends
-            _log.exception(
-                "%s: stopped by an unexpected error",
-                self._name,
-                extra=about("failed", source=self._name),
-            )
-            self._state, self._error = "failed", _describe(exc)
+            extra = about("failed", source=self._name)
+            _log.exception("%s: stopped by an unexpected error", self._name, extra=extra)
+            self._state = "failed"
+            self._error = _describe(exc)
         finally:
             self._on_end()
 
@@ -210,19 +213,15 @@ class Worker:
         self._clock.wait(None)
         if self._release:
             self._output.release()
-            _log.info(
-                "%s: stopped, because it is no longer configured", self.text, extra=about("reload")
-            )
+            text = "%s: stopped, because it is no longer configured"
+            _log.info(text, self.text, extra=about("reload"))
 
     def _run_until_done(self) -> None:
         failures = 0
         while not self._clock.is_set():
             start = self._clock.now()
             try:
-                if isinstance(self.source, LiveSource):
-                    self._listen(self.source)
-                else:
-                    self._run_replay(self.source)
+                self._run_once()
             except ClosedError as exc:
                 self._end("failed", str(exc))
                 return
@@ -242,74 +241,84 @@ class Worker:
                 return
             if self._clock.now() - start > TIMINGS.backoff[-1]:
                 failures = 0  # it ran for longer than the maximum backoff
-            self._clock.wait(TIMINGS.backoff[min(failures, len(TIMINGS.backoff) - 1)])
+            last_step = len(TIMINGS.backoff) - 1
+            self._clock.wait(TIMINGS.backoff[min(failures, last_step)])
             failures += 1
 
+    def _run_once(self) -> None:
+        if isinstance(self.source, LiveSource):
+            self._listen(self.source)
+        else:
+            self._run_replay(self.source)
+
     def _run_replay(self, source: ReplaySource) -> None:
+        speed = source.options.speed
+        run = self._open_run(source)
+        self._output.release(keep=run.addresses)
+        self._output.claim_all(run, lossless=speed is None)
+        self._set_state("running")
+        pace = Pace(speed or 1.0)
+        start = self._clock.now()
+        for message in run.messages:
+            due = pace.publish_at(message.at)
+            if speed is not None:
+                start += self._wait_until(start + due)
+            if self._clock.is_set():
+                return
+            if speed is not None:  # a lossless publisher may wait for its readers
+                self._message_start = self._clock.now()
+            self._output.publish_replay(message, lossless=speed is None)
+            self._message_start = None
+            self._done += 1
+        if pace.skipped:
+            warning = f"skipped pauses of more than {SKIPPED_PAUSE:.0f} s ({pace.skipped})"
+            run.warnings = (*run.warnings, warning)
+        self._warn(run)
+        self._error = run.damage
+
+    def _open_run(self, source: ReplaySource) -> ReplayRun:
+        """Open a replay, and wait for a subscriber if the source shall; log both."""
         run = source.open()
         last = self._run
-        speed = source.options.speed
         if last is None or last.summary != run.summary:
-            _log.info(
-                "%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name)
-            )
+            extra = about("replay_opened", source=self._name)
+            _log.info("%s: %s", self._name, run.summary, extra=extra)
             self._warned.clear()
         else:
             # so a loop keeps the publishers of streams that start later
             run.addresses.update(last.addresses)
         self._warn(run)
-        self._run, self._done = run, 0
+        self._run = run
+        self._done = 0
         if source.options.wait and last is None:
             self._state = "waiting"
-            _log.info(
-                "%s: waiting for a subscriber",
-                self._name,
-                extra=about("replay_waiting", source=self._name),
-            )
-            while not self._registry.has_subscriber(run.addresses) and not self._clock.wait(
-                _READER_POLL
-            ):
-                pass
-        self._output.release(keep=run.addresses)
-        self._output.claim_all(run, lossless=speed is None)
-        self._set_state("running")
-        start, pace = self._clock.now(), Pace(speed or 1.0)
-        for message in run.messages:
-            due = pace.publish_at(message.at)
-            if speed is not None:
-                early = start + due - self._clock.now()
-                if early < -_TOLERATED_DELAY:
-                    extra = about("replay_late", source=self._name)
-                    text = "%s: the replay is %.1f s behind its schedule, so later messages are delayed by as much"
-                    _log.warning(text, self._name, -early, extra=extra)
-                    start -= early
-                elif early > 0:
-                    self._clock.wait(early)
-            if self._clock.is_set():
-                return
-            # A lossless publisher may wait for its readers.
-            self._message_start = None if speed is None else self._clock.now()
-            self._output.publish_replay(message, lossless=speed is None)
-            self._message_start = None
-            self._done += 1
-        if pace.skipped:
-            run.warnings = (
-                *run.warnings,
-                f"skipped pauses of more than {SKIPPED_PAUSE:.0f} s ({pace.skipped})",
-            )
-        self._warn(run)
-        self._error = run.damage
+            extra = about("replay_waiting", source=self._name)
+            _log.info("%s: waiting for a subscriber", self._name, extra=extra)
+            while not self._registry.has_subscriber(run.addresses):
+                if self._clock.wait(_READER_POLL):
+                    break
+        return run
+
+    def _wait_until(self, due: float) -> float:
+        """Wait until a message is due; return how much later all are due from now on, because it is too late [s]."""
+        early = due - self._clock.now()
+        if early > 0:
+            self._clock.wait(early)
+        if early >= -_TOLERATED_DELAY:
+            return 0.0
+        text = (
+            "%s: the replay is %.1f s behind its schedule, so later messages are delayed by as much"
+        )
+        _log.warning(text, self._name, -early, extra=about("replay_late", source=self._name))
+        return -early
 
     def _warn(self, run: ReplayRun) -> None:
         for warning in run.warnings:
-            if warning not in self._warned:
-                self._warned.add(warning)
-                _log.warning(
-                    "%s: %s",
-                    self._name,
-                    warning,
-                    extra=about("damaged", source=self._name, reason=warning),
-                )
+            if warning in self._warned:
+                continue
+            self._warned.add(warning)
+            extra = about("damaged", source=self._name, reason=warning)
+            _log.warning("%s: %s", self._name, warning, extra=extra)
 
     def _listen(self, source: LiveSource) -> None:
         """Publish the messages of a live source, which yields None several times a second while no message arrives."""
@@ -317,62 +326,69 @@ class Worker:
         with closing(cast("Generator[LiveItem]", source.listen(self._router))) as items:
             next_poll = 0.0
             for item in items:
-                now = self._message_start = self._clock.now()
+                now = self._clock.now()
+                self._message_start = now
                 if self._clock.is_set():
                     return
-                if isinstance(item, SourceMessage):
-                    self._output.publish_live(item)
-                    if self._state != "running":
-                        self._set_state("running")
-                elif isinstance(item, Rejection):
-                    self._output.reject(item)
-                elif isinstance(item, UnavailableTopics):
-                    self._output.note(item)
-                elif isinstance(item, LinkLoad):
-                    self._output.note_load(item)
-                elif isinstance(item, LinkCopies):
-                    self._output.copies = item.count
-                elif isinstance(item, PositionStatus):
-                    self._output.positions[item.address] = item
-                elif item is not None:
-                    self._output.log_streams[item.vehicle] = item
+                self._handle(item)
                 if now >= next_poll:
                     next_poll = now + _STALE_POLL
                     if not self._output.expire_stale():
                         self._set_state("waiting")
 
+    def _handle(self, item: LiveItem) -> None:
+        output = self._output
+        if isinstance(item, SourceMessage):
+            output.publish_live(item)
+            if self._state != "running":
+                self._set_state("running")
+        elif isinstance(item, Rejection):
+            output.reject(item)
+        elif isinstance(item, UnavailableTopics):
+            output.note(item)
+        elif isinstance(item, LinkLoad):
+            output.note_load(item)
+        elif isinstance(item, LinkCopies):
+            output.copies = item.count
+        elif isinstance(item, PositionStatus):
+            output.positions[item.address] = item
+        elif item is not None:
+            output.log_streams[item.vehicle] = item
+
     def _set_state(self, state: State) -> None:
         if isinstance(self.source, LiveSource) and self._state in {"starting", "retrying"}:
             _log.info("%s: listening", self._name, extra=about("listening", source=self._name))
-        self._state, self._error = state, None
+        self._state = state
+        self._error = None
 
     def _end(self, state: Literal["done", "failed"], reason: str | None) -> None:
-        if not self._clock.is_set():
-            self._state, self._error = state, reason
-            text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
-            event = "failed" if state == "failed" else "done"
-            _log.info(
-                "%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason)
-            )
+        if self._clock.is_set():
+            return
+        self._state = state
+        self._error = reason
+        text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
+        _log.info("%s: %s", self._name, text, extra=about(state, source=self._name, reason=reason))
 
     def _fail(self, error: BaseException) -> None:
         """Log and store the reason; release all addresses, because another source may use them during the backoff."""
-        reason, bug = _describe(error), None if isinstance(error, NedbusError) else error
-        self._state, self._error = "retrying", reason
+        reason = _describe(error)
+        self._state = "retrying"
+        self._error = reason
         self._retries += 1
         text = reason if isinstance(error, SourceError) else f"{self._name}: {reason}"
-        event = "retrying" if self._retry else "failed"
-        text += "; trying again" * self._retry
+        event = "failed"
+        if self._retry:
+            text += "; trying again"
+            event = "retrying"
+        bug = None if isinstance(error, NedbusError) else error
         _log.error("%s", text, exc_info=bug, extra=about(event, source=self._name, reason=reason))
         self._output.release()
 
 
 def _describe(error: BaseException) -> str:
-    return (
-        str(error)
-        if isinstance(error, NedbusError)
-        else f"unexpected {type(error).__name__}: {error}"
-    )
+    if isinstance(error, NedbusError):
+        return str(error)
+    return f"unexpected {type(error).__name__}: {error}"
 
 
 def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:
@@ -381,6 +397,5 @@ def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = Fal
         worker.stop(release=release)
     deadline = time.monotonic() + grace
     for worker in workers:
-        if worker.thread.ident is None:  # not started, because another one could not be
-            continue
-        worker.thread.join(max(0.0, deadline - time.monotonic()))
+        if worker.thread.ident is not None:  # None: not started, because another one could not be
+            worker.thread.join(max(0.0, deadline - time.monotonic()))

@@ -9,7 +9,13 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .boot_time import new_clock, read_time
-    from .external_position import MAX_AGE, MAX_RATE, MIN_RATE, UNKNOWN_VARIANCE, ExternalPosition
+    from .external_position import (
+        AGE_LIMIT,
+        FUSION_RATE,
+        RATE_LIMIT,
+        UNKNOWN_VARIANCE,
+        ExternalPosition,
+    )
     from .fields import CONVERSIONS, HIGH_LATENCY
     from .log_reassembly import Chunk, Reassembly
     from .parser import Received, new_parser, parse
@@ -19,7 +25,7 @@ if TYPE_CHECKING:
 else:
     _NAMES = {
         "boot_time": "new_clock read_time",
-        "external_position": "ExternalPosition MAX_AGE MAX_RATE MIN_RATE UNKNOWN_VARIANCE",
+        "external_position": "ExternalPosition AGE_LIMIT FUSION_RATE RATE_LIMIT UNKNOWN_VARIANCE",
         "fields": "CONVERSIONS HIGH_LATENCY", "log_reassembly": "Chunk Reassembly",
         "parser": "Received new_parser parse", "senders": "AUTOPILOT NO_HEARTBEAT Senders",
         "sequence": "PacketRate SequenceCounter", "vehicle": "Vehicle",

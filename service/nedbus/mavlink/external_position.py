@@ -10,11 +10,11 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus_msgs.messages import VehicleLocalPosition, VehicleOdometry
 
-MAX_RATE: Final = 50.0
+RATE_LIMIT: Final = 50.0
 """Messages per second to send at most; PX4 drops what is faster than its buffer."""
-MIN_RATE: Final = 5.0
+FUSION_RATE: Final = 5.0
 """Messages per second below which PX4 does not start to fuse: it needs two within 200 ms."""
-MAX_AGE: Final = 0.1
+AGE_LIMIT: Final = 0.1
 """Seconds between the measurement and its transmission beyond which a position is left out."""
 UNKNOWN_VARIANCE: Final = 1e6
 """Variance of a quantity that is unknown: PX4 accepts it without an effect on the estimate."""
@@ -23,19 +23,18 @@ _EXACT_NORM: Final = 1e-5  # error of the norm of q that EKF2 accepts
 _REPAIRED_NORM: Final = 1e-2  # ... that is normalised, as of quaternions with few decimals
 _EARLY: Final = 0.3  # share of an interval by which a message may be early
 # s between timestamp_sample and timestamp; more means that their clocks differ
-_MAX_SENSOR_AGE: Final = 10.0
+_PLAUSIBLE_AGE: Final = 10.0
 # s by which the way on the bus may vary; a larger change is a step of the publisher's clock
-_MAX_DELAY: Final = 1.0
+_DELAY_TOLERANCE: Final = 1.0
 _STEADY: Final = 0.05  # s by which it varies after such a step ...
 # s ... for this time, until the step counts: a backlog does not last as long
 _STEADY_TIME: Final = 0.3
 _WINDOW: Final = 30.0  # s after which the shortest delay is measured anew, because clocks drift
 _TAKEOVER: Final = 1.0  # s of silence of a sender until another one is used
 _JUMP: Final = 1.0  # m
-_MAX_SPEED: Final = 20.0  # m/s of positions without a velocity
-_COUNTS_MESSAGES: Final = 5  # messages in a row with a new reset_counter
+_PLAUSIBLE_SPEED: Final = 20.0  # m/s of positions without a velocity
+_COUNTED_MESSAGES: Final = 5  # messages in a row with a new reset_counter
 _RATE_WINDOW: Final = 10  # messages over which the rate is measured
-_MAX_REASONS: Final = 20
 
 _POSE_FRAMES: Final = {
     VehicleOdometry.POSE_FRAME_NED: dialect.MAV_FRAME_LOCAL_NED,
@@ -58,10 +57,10 @@ _CHECKSUM: Final = struct.Struct("<H")
 _COVARIANCES: Final = 21  # elements of the upper triangle of a 6x6 matrix
 _DIAGONAL: Final = (0, 6, 11, 15, 18, 20)  # those of the variances
 
-_NAN3: Final = (math.nan,) * 3
-_NAN4: Final = (math.nan,) * 4
-_ZERO3: Final = (0.0,) * 3
-_UNKNOWN3: Final = (UNKNOWN_VARIANCE,) * 3
+_NAN3: Final = (math.nan, math.nan, math.nan)
+_NAN4: Final = (math.nan, math.nan, math.nan, math.nan)
+_ORIGIN: Final = (0.0, 0.0, 0.0)
+_UNKNOWN3: Final = (UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE)
 
 Position = VehicleOdometry | VehicleLocalPosition
 """Messages that can be sent into a vehicle."""
@@ -101,13 +100,25 @@ class Odometry(NamedTuple):
 
         It is packed here, because the message object of pymavlink takes three times as long.
         """
-        payload = _PAYLOAD.pack(
-            time_usec, *self.position, *self.q, *self.velocity, *self.rates, *_covariance(self.pose_variances),
-            *_covariance(self.velocity_variances), self.frame_id, self.child_frame_id, self.reset_counter,
-            dialect.MAV_ESTIMATOR_TYPE_VISION, self.quality,
-        ).rstrip(b"\0")  # fmt: skip
-        body = _HEADER.pack(len(payload), 0, 0, sequence, system, COMPONENT, *_MESSAGE_ID) + payload
-        return _MAGIC + body + _CHECKSUM.pack(dialect.x25crc(body + _CRC_EXTRA).crc)
+        complete = _PAYLOAD.pack(
+            time_usec,
+            *self.position,
+            *self.q,
+            *self.velocity,
+            *self.rates,
+            *_covariance(self.pose_variances),
+            *_covariance(self.velocity_variances),
+            self.frame_id,
+            self.child_frame_id,
+            self.reset_counter,
+            dialect.MAV_ESTIMATOR_TYPE_VISION,
+            self.quality,
+        )
+        payload = complete.rstrip(b"\0")
+        header = _HEADER.pack(len(payload), 0, 0, sequence, system, COMPONENT, *_MESSAGE_ID)
+        body = header + payload
+        checksum = dialect.x25crc(body + _CRC_EXTRA).crc
+        return _MAGIC + body + _CHECKSUM.pack(checksum)
 
 
 class Outcome(NamedTuple):
@@ -150,19 +161,22 @@ class ExternalPosition:
         self._stamp = -1
         self._due = -math.inf
         self._last: tuple[Odometry, int] | None = None
-        self._changes: deque[bool] = deque(maxlen=_COUNTS_MESSAGES)
+        self._changes = 0  # messages in a row with a new reset_counter
 
     @property
     def last_sent(self) -> float:
         """Time of the last position sent; minus infinity before the first."""
-        return self._sent_times[-1] if self._sent_times else -math.inf
+        if not self._sent_times:
+            return -math.inf
+        return self._sent_times[-1]
 
     @property
     def rate(self) -> float:
         """Messages sent per second, over the last ten; 0 before the second one."""
-        if len(self._sent_times) < 2:
+        times = self._sent_times
+        if len(times) < 2:
             return 0.0
-        return (len(self._sent_times) - 1) / max(1e-6, self._sent_times[-1] - self._sent_times[0])
+        return (len(times) - 1) / max(1e-6, times[-1] - times[0])
 
     def add(self, position: Position, sender: str, now: float) -> Outcome:
         """Decide on a position that `sender` published, and that arrived at time `now`."""
@@ -178,11 +192,8 @@ class ExternalPosition:
 
     def refuse(self, kind: str, text: str) -> Refusal:
         """Count a position that is not sent."""
-        if kind in self.reasons or len(self.reasons) < _MAX_REASONS:
-            self.reasons[kind] = text
-            self.left_out[kind] += 1
-        else:
-            self.left_out["other"] += 1
+        self.reasons[kind] = text
+        self.left_out[kind] += 1
         return Refusal(kind, text)
 
     def _accept(self, position: Position, sender: str, now: float) -> Odometry:
@@ -191,22 +202,24 @@ class ExternalPosition:
         age = delay + self._sensor_age(position)
         odometry = odometry_of(position)
         self._check_reset_counter(odometry, position.timestamp)
-        if age > MAX_AGE:
-            text = f"it is {1e3 * age:.0f} ms old, more than {1e3 * MAX_AGE:.0f}: send each position at once"
+        if age > AGE_LIMIT:
+            text = f"it is {1e3 * age:.0f} ms old, more than {1e3 * AGE_LIMIT:.0f}: send each position at once"
             raise _RefusedError("age", text)
         self._check_rate(now)
         self.age = age
         return odometry
 
     def _check_sender(self, sender: str, now: float) -> None:
-        if sender != self.sender:
-            if now - self._last_heard < _TAKEOVER:
-                text = f"{sender} publishes, too, but {self.sender} is the sender: stop one of them"
-                raise _RefusedError("sender", text)
-            self.sender = sender
-            self.warnings.clear()
-            self._reset()
+        if sender == self.sender:
+            self._last_heard = now
+            return
+        if now - self._last_heard < _TAKEOVER:
+            text = f"{sender} publishes, too, but {self.sender} is the sender: stop one of them"
+            raise _RefusedError("sender", text)
+        self.sender = sender
         self._last_heard = now
+        self.warnings.clear()
+        self._reset()
 
     def _delay_of(self, timestamp: int, now: float) -> float:
         """Return how long a message was under way [s], beyond the shortest way."""
@@ -218,7 +231,8 @@ class ExternalPosition:
             )
             raise _RefusedError("clock", f"{text}; use a monotonic clock")
         if self._delay.was_stepped:
-            self._stamp, self._last = -1, None
+            self._stamp = -1
+            self._last = None
         if timestamp <= self._stamp:
             text = f"timestamp {timestamp} follows {self._stamp}: it must rise with each message"
             raise _RefusedError("time", text)
@@ -230,7 +244,7 @@ class ExternalPosition:
         if not position.timestamp_sample:
             return 0.0
         age = (position.timestamp - position.timestamp_sample) / 1e6
-        if 0 <= age <= _MAX_SENSOR_AGE:
+        if 0 <= age <= _PLAUSIBLE_AGE:
             self.warnings.pop("sample", None)
             return age
         order = "before" if age > 0 else "after"
@@ -242,24 +256,22 @@ class ExternalPosition:
 
     def _check_reset_counter(self, odometry: Odometry, timestamp: int) -> None:
         """Refuse a counter that counts messages; warn of a jump without a new counter."""
-        last, self._last = self._last, (odometry, timestamp)
+        last = self._last
+        self._last = (odometry, timestamp)
         if last is None:
             return
         before, then = last
         has_changed = odometry.reset_counter != before.reset_counter
-        self._changes.append(has_changed)
-        if len(self._changes) == _COUNTS_MESSAGES and all(self._changes):
+        self._changes = self._changes + 1 if has_changed else 0
+        if self._changes >= _COUNTED_MESSAGES:
             text = (
                 f"reset_counter {odometry.reset_counter} changes with each message: "
                 "raise it only when position jumps"
             )
             raise _RefusedError("reset_counter", text)
         distance = math.dist(before.position, odometry.position)
-        if (
-            has_changed
-            or distance <= _JUMP
-            or not _is_jump(before, odometry, distance, (timestamp - then) / 1e6)
-        ):
+        seconds = (timestamp - then) / 1e6
+        if has_changed or not _is_jump(before, odometry, distance, seconds):
             self.warnings.pop("jump", None)
             return
         self.warnings["jump"] = (
@@ -268,32 +280,30 @@ class ExternalPosition:
         )
 
     def _check_rate(self, now: float) -> None:
-        interval = 1 / MAX_RATE
+        interval = 1 / RATE_LIMIT
         if now < self._due - _EARLY * interval:
-            raise _RefusedError(
-                "rate", f"more than {MAX_RATE:.0f} per second: the others are left out"
-            )
+            text = f"more than {RATE_LIMIT:.0f} per second: the others are left out"
+            raise _RefusedError("rate", text)
         self._due = max(self._due, now - interval) + interval
 
     def _warn_of_rate(self) -> None:
         self.warnings.pop("rate", None)
-        if len(self._sent_times) == _RATE_WINDOW and self.rate < MIN_RATE:
+        if len(self._sent_times) == _RATE_WINDOW and self.rate < FUSION_RATE:
             self.warnings["rate"] = (
-                f"{self.rate:.1f} messages per second: PX4 fuses none below {MIN_RATE:.0f}; send 20 to 50"
+                f"{self.rate:.1f} messages per second: PX4 fuses none below {FUSION_RATE:.0f}; send 20 to 50"
             )
 
 
-def _is_jump(before: Odometry, odometry: Odometry, distance: float, seconds: float) -> bool:
+def _is_jump(before: Odometry, after: Odometry, distance: float, seconds: float) -> bool:
     """Return whether a vehicle cannot have moved by this distance [m] between two known positions."""
-    if (
-        before.pose_variances[0] >= UNKNOWN_VARIANCE
-        or odometry.pose_variances[0] >= UNKNOWN_VARIANCE
-    ):
+    if distance <= _JUMP:
         return False
-    speed = _MAX_SPEED
-    for each in (before, odometry):
-        if _known(each.velocity):
-            speed = max(speed, 2 * math.hypot(*each.velocity))
+    speed = _PLAUSIBLE_SPEED
+    for odometry in (before, after):
+        if odometry.pose_variances[0] >= UNKNOWN_VARIANCE:
+            return False
+        if _known(odometry.velocity):
+            speed = max(speed, 2 * math.hypot(*odometry.velocity))
     return distance > _JUMP + speed * seconds
 
 
@@ -305,20 +315,24 @@ class _Delay:
 
     def __init__(self) -> None:
         self.was_stepped = False
-        # offset between the clocks, in this and the previous window
-        self._shortest = self._previous = math.inf
+        # the shortest offset between the clocks [s], in this and the previous window
+        self._shortest = math.inf
+        self._previous = math.inf
         self._window = -math.inf
-        self._candidate, self._since = math.inf, 0.0
+        self._candidate = math.inf  # offset after a step that is not certain yet ...
+        self._since = 0.0  # ... and its first time
 
     def add(self, stamp: float, now: float) -> float | None:
         """Return the delay of a message [s]; None if it does not fit the ones before."""
-        offset, base = now - stamp, min(self._shortest, self._previous)
+        offset = now - stamp
+        shortest = min(self._shortest, self._previous)
         self.was_stepped = False
-        if math.isinf(base):
+        if math.isinf(shortest):
             self._start(offset, now)
-        elif abs(offset - base) > _MAX_DELAY:
+        elif abs(offset - shortest) > _DELAY_TOLERANCE:
             if abs(offset - self._candidate) > _STEADY:
-                self._candidate, self._since = offset, now
+                self._candidate = offset
+                self._since = now
             if now - self._since < _STEADY_TIME:
                 return None
             self.was_stepped = True
@@ -349,73 +363,104 @@ def _of_odometry(position: VehicleOdometry) -> Odometry:
         raise _RefusedError("pose_frame", text)
     velocity = _vector("velocity", position.velocity)
     child_frame = _VELOCITY_FRAMES.get(position.velocity_frame)
-    if child_frame is None:
-        if velocity is not _NAN3:
-            text = f"velocity_frame is {position.velocity_frame}: set it to 1 (NED), 2 (FRD) or 3 (BODY_FRD)"
-            raise _RefusedError("velocity_frame", text)
-        child_frame = dialect.MAV_FRAME_BODY_FRD
+    if child_frame is None and velocity is not _NAN3:
+        text = f"velocity_frame is {position.velocity_frame}: set it to 1 (NED), 2 (FRD) or 3 (BODY_FRD)"
+        raise _RefusedError("velocity_frame", text)
     where = _vector("position", position.position)
-    variance = _variances("position_variance", position.position_variance)
+    variances = _variances("position_variance", position.position_variance)
     if where is _NAN3:
-        where = _ZERO3
-        variance = _UNKNOWN3
-    rates = position.angular_velocity if _known(position.angular_velocity) else _NAN3
+        where = _ORIGIN
+        variances = _UNKNOWN3
     attitude = _variances("orientation_variance", position.orientation_variance)
     return Odometry(
-        frame, child_frame, where, _quaternion(position.q), velocity, rates, (*variance, *attitude),
-        _variances("velocity_variance", position.velocity_variance), position.reset_counter,
-        max(-1, min(100, position.quality)),
-    )  # fmt: skip
+        frame_id=frame,
+        child_frame_id=dialect.MAV_FRAME_BODY_FRD if child_frame is None else child_frame,
+        position=where,
+        q=_quaternion(position.q),
+        velocity=velocity,
+        rates=position.angular_velocity if _known(position.angular_velocity) else _NAN3,
+        pose_variances=(*variances, *attitude),
+        velocity_variances=_variances("velocity_variance", position.velocity_variance),
+        reset_counter=position.reset_counter,
+        quality=max(-1, min(100, position.quality)),
+    )
 
 
 def _of_local_position(position: VehicleLocalPosition) -> Odometry:
     """Convert a position in NED, with the attitude of a level vehicle; what is not valid gets UNKNOWN_VARIANCE."""
-    if not (position.xy_valid or position.z_valid or position.v_xy_valid or position.v_z_valid):
-        raise _RefusedError(
-            "validity",
-            "xy_valid, z_valid, v_xy_valid and v_z_valid are false: there is nothing to send",
+    has_velocity = position.v_xy_valid or position.v_z_valid
+    if not (position.xy_valid or position.z_valid or has_velocity):
+        text = "xy_valid, z_valid, v_xy_valid and v_z_valid are false: there is nothing to send"
+        raise _RefusedError("validity", text)
+    horizontal = _square("eph", position.eph) / 2
+    vertical = _square("epv", position.epv)
+    axes = (
+        _Axis("x", position.x, horizontal, position.xy_valid),
+        _Axis("y", position.y, horizontal, position.xy_valid),
+        _Axis("z", position.z, vertical, position.z_valid),
+    )
+    where = [axis.known_value for axis in axes]
+    velocity: Sequence[float] = _NAN3
+    velocity_variances: Sequence[float] = _NAN3
+    if has_velocity:
+        horizontal = _square("evh", position.evh) / 2
+        vertical = _square("evv", position.evv)
+        velocity_axes = (
+            _Axis("vx", position.vx, horizontal, position.v_xy_valid),
+            _Axis("vy", position.vy, horizontal, position.v_xy_valid),
+            _Axis("vz", position.vz, vertical, position.v_z_valid),
         )
-    horizontal, vertical = _square("eph", position.eph) / 2, _square("epv", position.epv)
-    where, variances = _valid(
-        ("x", position.x, horizontal, position.xy_valid), ("y", position.y, horizontal, position.xy_valid),
-        ("z", position.z, vertical, position.z_valid),
-    )  # fmt: skip
-    velocity, velocity_variances = _NAN3, _NAN3
-    if position.v_xy_valid or position.v_z_valid:
-        horizontal, vertical = _square("evh", position.evh) / 2, _square("evv", position.evv)
-        velocity, velocity_variances = _valid(
-            ("vx", position.vx, horizontal, position.v_xy_valid), ("vy", position.vy, horizontal, position.v_xy_valid),
-            ("vz", position.vz, vertical, position.v_z_valid),
-        )  # fmt: skip
+        velocity = [axis.known_value for axis in velocity_axes]
+        velocity_variances = [axis.known_variance for axis in velocity_axes]
     q: Sequence[float] = _NAN4
     if position.heading_good_for_control and math.isfinite(position.heading):
-        q = math.cos(position.heading / 2), 0.0, 0.0, math.sin(position.heading / 2)
-    counters = (
-        position.xy_reset_counter, position.z_reset_counter, position.vxy_reset_counter, position.vz_reset_counter,
-        position.heading_reset_counter,
-    )  # fmt: skip
-    heading_variances = _variances("heading_var", [position.heading_var])
+        q = (math.cos(position.heading / 2), 0.0, 0.0, math.sin(position.heading / 2))
+    resets = (
+        position.xy_reset_counter
+        + position.z_reset_counter
+        + position.vxy_reset_counter
+        + position.vz_reset_counter
+        + position.heading_reset_counter
+    )
+    [heading] = _variances("heading_var", [position.heading_var])
+    variances = [axis.known_variance for axis in axes]
     return Odometry(
-        dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_LOCAL_NED, where, q, velocity, _NAN3,
-        (*variances, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, *heading_variances), velocity_variances,
-        sum(counters) % 256, 0,
-    )  # fmt: skip
+        frame_id=dialect.MAV_FRAME_LOCAL_NED,
+        child_frame_id=dialect.MAV_FRAME_LOCAL_NED,
+        position=where,
+        q=q,
+        velocity=velocity,
+        rates=_NAN3,
+        pose_variances=(*variances, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, heading),
+        velocity_variances=velocity_variances,
+        reset_counter=resets % 256,
+        quality=0,
+    )
 
 
-def _valid(
-    *axes: tuple[str, float, float, bool],
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return values and variances of three axes, each (field, value, variance, is valid)."""
-    values, variances = list[float](), list[float]()
-    for name, value, variance, is_valid in axes:
-        if is_valid and not math.isfinite(value):
-            raise _RefusedError(
-                name,
-                f"{name} is {value} although it is valid: mark it as not valid, or leave it out",
-            )
-        values.append(value if math.isfinite(value) else 0.0)
-        variances.append(variance if is_valid else UNKNOWN_VARIANCE)
-    return (values[0], values[1], values[2]), (variances[0], variances[1], variances[2])
+class _Axis(NamedTuple):
+    """One coordinate of a position or velocity."""
+
+    field: str
+    value: float
+    variance: float
+    is_valid: bool
+
+    @property
+    def known_value(self) -> float:
+        """The value, 0 if it is not valid and not finite; raises ValueError if it is valid and not finite."""
+        if math.isfinite(self.value):
+            return self.value
+        if self.is_valid:
+            text = f"{self.field} is {self.value} although it is valid: mark it as not valid, or leave it out"
+            raise _RefusedError(self.field, text)
+        return 0.0
+
+    @property
+    def known_variance(self) -> float:
+        if self.is_valid:
+            return self.variance
+        return UNKNOWN_VARIANCE
 
 
 def _vector(name: str, values: Sequence[float]) -> Sequence[float]:
@@ -451,10 +496,11 @@ def _variances(name: str, values: Sequence[float]) -> Sequence[float]:
 def _square(name: str, deviation: float) -> float:
     """Return the variance of a standard deviation."""
     if deviation < 0:
-        raise _RefusedError(
-            "variance", f"{name} is {deviation:g}: set a standard deviation above 0, or NaN"
-        )
-    return min(deviation * deviation, UNKNOWN_VARIANCE) if math.isfinite(deviation) else math.nan
+        text = f"{name} is {deviation:g}: set a standard deviation above 0, or NaN"
+        raise _RefusedError("variance", text)
+    if not math.isfinite(deviation):
+        return math.nan
+    return min(deviation * deviation, UNKNOWN_VARIANCE)
 
 
 def _covariance(variances: Sequence[float]) -> list[float]:

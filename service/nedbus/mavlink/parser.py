@@ -12,9 +12,14 @@ from .fields import DECODED, HIGH_LATENCY
 from .log_reassembly import Chunk
 from .senders import Senders
 
+_V1: Final[int] = dialect.PROTOCOL_MARKER_V1
+_V2: Final[int] = dialect.PROTOCOL_MARKER_V2
+_SIGNED: Final[int] = dialect.MAVLINK_IFLAG_SIGNED
 _SIGNATURE: Final = 13  # bytes
 _CHECKSUM: Final = 2  # bytes
-_HEADER, _OLD_HEADER = 10, 6  # bytes, of MAVLink 2 and 1
+_HEADER: Final = 10  # bytes, of MAVLink 2
+_OLD_HEADER: Final = 6  # bytes, of MAVLink 1
+_LONGEST_PAYLOAD: Final = 255  # bytes
 _LOG_HEADER: Final = struct.Struct("<H4B")  # the fields of ULog data before the data
 
 
@@ -41,20 +46,16 @@ class Received(NamedTuple):
 
         Acknowledged data is never joined, because it may wait longer.
         """
-        one, two = before.chunk, self.chunk
-        if (
-            one is None
-            or two is None
-            or two.begins
-            or two.lost
-            or self.lost
-            or self.peer != before.peer
-        ):
+        chunk = self.chunk
+        earlier = before.chunk
+        if chunk is None or earlier is None or self.peer != before.peer:
             return False
-        if not one.verdict == two.verdict == "delivered":
+        if chunk.begins or chunk.lost or self.lost:
             return False
-        kinds = before.message.get_type(), self.message.get_type()
-        return kinds == ("LOGGING_DATA", "LOGGING_DATA")
+        if not chunk.verdict == earlier.verdict == "delivered":
+            return False
+        kinds = {before.message.get_type(), self.message.get_type()}
+        return kinds == {"LOGGING_DATA"}
 
 
 def parse(
@@ -66,81 +67,92 @@ def parse(
     """
     senders: Senders = parser.senders
     for message in parser.parse_buffer(data) or ():
-        kind, raw = message.get_type(), message.get_msgbuf()
+        raw = message.get_msgbuf()
+        kind = message.get_type()
         if kind == "BAD_DATA":
             if not (_is_frame(raw) and senders.ignores(*_ids(raw))):
                 yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue
-        # Only the header of a message can be parsed if the dialect lacks its definition.
         system, component = _ids(raw)
-        if not (reason := senders.ignore_reason(message, system, component)):
-            sequence = raw[4] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2]
+        reason = senders.ignore_reason(message, system, component)
+        if not reason:
+            sequence = raw[4] if raw[0] == _V2 else raw[2]
             yield Received(message, system, sequence, peer, now)
-        elif not ((system and component) or kind.startswith("UNKNOWN")):  # cameras etc. are normal
+            continue
+        # Other components, such as cameras, are normal, and so are messages that the dialect lacks.
+        is_normal = (system and component) or kind.startswith("UNKNOWN")
+        if not is_normal:
             yield Rejection(f"{name} system {system} component {component}", reason)
 
 
 def _ids(frame: bytes) -> tuple[int, int]:
     """Return system and component id of a frame."""
-    start = 5 if frame[0] == dialect.PROTOCOL_MARKER_V2 else 3
-    return frame[start], frame[start + 1]
+    if frame[0] == _V2:
+        return frame[5], frame[6]
+    return frame[3], frame[4]
 
 
 def _is_frame(data: bytes) -> bool:
     """Return whether these bytes are as long as the frame that they begin with."""
-    if len(data) < _OLD_HEADER + 2:
+    if len(data) < _OLD_HEADER + _CHECKSUM:
         return False
-    if data[0] == dialect.PROTOCOL_MARKER_V2:
-        signature = _SIGNATURE if data[2] & dialect.MAVLINK_IFLAG_SIGNED else 0
-        return len(data) == _HEADER + data[1] + 2 + signature
-    return data[0] == dialect.PROTOCOL_MARKER_V1 and len(data) == _OLD_HEADER + data[1] + 2
+    length = data[1] + _CHECKSUM
+    if data[0] == _V1:
+        return len(data) == _OLD_HEADER + length
+    if data[0] != _V2:
+        return False
+    if data[2] & _SIGNED:
+        length += _SIGNATURE
+    return len(data) == _HEADER + length
+
+
+class _Field(NamedTuple):
+    """How to read a field: `unpack`: from a complete payload; the first value, unless it is an array."""
+
+    unpack: Callable[[bytes], tuple[Any, ...]]
+    is_array: bool = False
 
 
 class _Layout(NamedTuple):
-    """What the dialect says about a message. `extra`: what its checksum adds; `size`: of the payload.
-
-    `fields`: the function that unpacks each field from a complete payload, and whether it is an array.
-    """
+    """What the dialect says about a message. `extra`: what its checksum adds; `size`: of the payload [bytes]."""
 
     name: str
     extra: bytes
     instance_field: str | None
     size: int
-    fields: Mapping[str, tuple[Callable[[bytes], tuple[Any, ...]], bool]]
+    fields: Mapping[str, _Field]
 
 
 def _layout_of(message: Any) -> _Layout:
     """Return the layout of a message; without fields, as if the dialect lacked it, if nedbus does not use it."""
+    name = message.msgname
+    extra = bytes([message.crc_extra])
     # Pymavlink would raise an AttributeError for absent times, which takes longer than to read present ones.
-    fields: dict[str, Any] = {
-        "time_boot_ms": (lambda _: (None,), False),
-        "time_usec": (lambda _: (0,), False),
-    }
-    if message.msgname not in DECODED:
-        return _Layout(f"UNKNOWN_{message.id}", bytes([message.crc_extra]), None, 0, fields)
+    fields = {"time_boot_ms": _Field(lambda _: (None,)), "time_usec": _Field(lambda _: (0,))}
+    if name not in DECODED:
+        return _Layout(f"UNKNOWN_{message.id}", extra, None, 0, fields)
     offset = 0
-    for name, code, length in zip(
-        message.ordered_fieldnames,
-        message.native_format.decode()[1:],
-        message.array_lengths,
-        strict=True,
-    ):
-        unpack = struct.Struct(f"<{offset}x{length or 1}{'s' if code == 'c' else code}")
-        key = f"_{name}_raw" if code == "c" else name  # pymavlink's name of the bytes of a text
-        fields[key] = unpack.unpack_from, bool(length) and code != "c"
-        offset = unpack.size
-    if message.msgname == HIGH_LATENCY:
+    codes = message.native_format.decode()[1:]
+    lengths = message.array_lengths
+    for field, code, length in zip(message.ordered_fieldnames, codes, lengths, strict=True):
+        if code == "c":
+            reader = struct.Struct(f"<{offset}x{length}s")
+            # pymavlink's name of the bytes of a text
+            fields[f"_{field}_raw"] = _Field(reader.unpack_from)
+        else:
+            reader = struct.Struct(f"<{offset}x{length or 1}{code}")
+            fields[field] = _Field(reader.unpack_from, is_array=length > 0)
+        offset = reader.size
+    if name == HIGH_LATENCY:
         fields["time_boot_ms"] = fields["timestamp"]
-    return _Layout(
-        message.msgname, bytes([message.crc_extra]), message.instance_field, offset, fields
-    )
+    return _Layout(name, extra, message.instance_field, offset, fields)
 
 
 _LAYOUTS: Final[Mapping[int, _Layout]] = {
-    number: _layout_of(each) for number, each in dialect.mavlink_map.items()
+    number: _layout_of(message) for number, message in dialect.mavlink_map.items()
 }
 _LOG_DATA: Final = {
-    number for number, each in _LAYOUTS.items() if each.name.startswith("LOGGING_DATA")
+    number for number, layout in _LAYOUTS.items() if layout.name.startswith("LOGGING_DATA")
 }
 
 
@@ -160,11 +172,13 @@ class _Frame:
         self._payload = payload.ljust(layout.size, b"\0")  # zeros are not sent
 
     def __getattr__(self, name: str) -> Any:
-        if (found := self._layout.fields.get(name)) is None:
+        field = self._layout.fields.get(name)
+        if field is None:
             raise AttributeError(name)
-        unpack, is_array = found
-        values = unpack(self._payload)
-        return [*values] if is_array else values[0]
+        values = field.unpack(self._payload)
+        if field.is_array:
+            return [*values]
+        return values[0]
 
     @property
     def instance_field(self) -> str | None:
@@ -185,11 +199,11 @@ class _Frame:
 
     def get_srcSystem(self) -> int:  # noqa: N802 - pymavlink's name
         """Return the system id of the sender."""
-        return self._frame[5 if self._frame[0] == dialect.PROTOCOL_MARKER_V2 else 3]
+        return _ids(self._frame)[0]
 
     def get_srcComponent(self) -> int:  # noqa: N802 - pymavlink's name
         """Return the component id of the sender."""
-        return self._frame[6 if self._frame[0] == dialect.PROTOCOL_MARKER_V2 else 4]
+        return _ids(self._frame)[1]
 
 
 class _LogData(_Frame):
@@ -205,18 +219,15 @@ class _LogData(_Frame):
     )
 
     def __init__(self, number: int, layout: _Layout, frame: bytes, payload: bytes) -> None:
-        self._number = number
-        self._layout = layout
-        self._frame = frame
+        super().__init__(number, layout, frame, b"")
         payload = payload.ljust(_LOG_HEADER.size, b"\0")  # zeros are not sent
-        fields = _LOG_HEADER.unpack_from(payload)
         (
             self.sequence,
             self.target_system,
             self.target_component,
             self.length,
             self.first_message_offset,
-        ) = fields
+        ) = _LOG_HEADER.unpack_from(payload)
         self.data = payload[_LOG_HEADER.size :]
 
 
@@ -225,13 +236,7 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
 
     def parse_buffer(self, data: bytes) -> Any:
         """Return the messages that these bytes complete, None without any."""
-        size = len(data) - _HEADER - 2
-        if (
-            size < 0
-            or data[:3] != bytes([dialect.PROTOCOL_MARKER_V2, size % 256, 0])
-            or size > 255
-            or self.buf_len()
-        ):
+        if self.buf_len() or not _is_unsigned_frame(data):
             return super().parse_buffer(data)
         try:
             return (self.decode(data),)
@@ -240,21 +245,28 @@ class _Parser(dialect.MAVLink):  # type: ignore[misc] # pymavlink has no types
 
     def decode(self, msgbuf: bytes | bytearray) -> Any:
         """Return a message; raise MAVError if it is damaged."""
-        is_v2 = msgbuf[0] == dialect.PROTOCOL_MARKER_V2
-        number = int.from_bytes(msgbuf[7:10], "little") if is_v2 else msgbuf[5]
-        if (layout := _LAYOUTS.get(number)) is None:
-            return super().decode(bytearray(msgbuf))
+        header = _OLD_HEADER
+        number = msgbuf[5]
         end = len(msgbuf) - _CHECKSUM
-        if is_v2 and msgbuf[2] & dialect.MAVLINK_IFLAG_SIGNED:
-            end -= _SIGNATURE
-        if dialect.x25crc(msgbuf[1:end] + layout.extra).crc != int.from_bytes(
-            msgbuf[end : end + _CHECKSUM], "little"
-        ):
+        if msgbuf[0] == _V2:
+            header = _HEADER
+            number = int.from_bytes(msgbuf[7:10], "little")
+            if msgbuf[2] & _SIGNED:
+                end -= _SIGNATURE
+        layout = _LAYOUTS.get(number)
+        if layout is None:
+            return super().decode(bytearray(msgbuf))
+        checksum = int.from_bytes(msgbuf[end : end + _CHECKSUM], "little")
+        if checksum != dialect.x25crc(msgbuf[1:end] + layout.extra).crc:
             raise dialect.MAVError("invalid CRC")
         kind = _LogData if number in _LOG_DATA else _Frame
-        return kind(
-            number, layout, bytes(msgbuf), bytes(msgbuf[_HEADER if is_v2 else _OLD_HEADER : end])
-        )
+        return kind(number, layout, bytes(msgbuf), bytes(msgbuf[header:end]))
+
+
+def _is_unsigned_frame(data: bytes) -> bool:
+    """Return whether these bytes are one frame of MAVLink 2 without a signature, as in most datagrams."""
+    size = len(data) - _HEADER - _CHECKSUM
+    return 0 <= size <= _LONGEST_PAYLOAD and data[:3] == bytes((_V2, size, 0))
 
 
 def new_parser(senders: Senders | None = None) -> Any:

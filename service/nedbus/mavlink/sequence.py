@@ -7,7 +7,7 @@ _MODULUS: Final = 256  # of MAVLink's sequence
 # times the usual rate; a faster jump of the sequence is a restart of the sender's counter
 _FACTOR: Final = 4.0
 _MARGIN: Final = 20  # packets that may be lost at once, whatever the rate
-_MAX_OVERTAKEN: Final = 8  # packets that one packet of the same link overtakes
+_OVERTAKEN: Final = 8  # packets that one packet of the same link may overtake
 _SILENCE: Final = 3.0  # s after which the sequence has no relation to the earlier one
 _WINDOW: Final = 10.0  # s over which the rate is measured
 
@@ -27,14 +27,18 @@ class PacketRate:
         """Add a packet; lost ones would let wrong losses explain further ones."""
         if not self._count:
             self._first = now
-        self._count, self._last = self._count + 1, now
+        self._count += 1
+        self._last = now
         if now - self._first > _WINDOW:
-            self._count, self._first = self._count / 2, (self._first + now) / 2
+            self._count /= 2
+            self._first = (self._first + now) / 2
 
     def expected(self, now: float) -> float:
         """Return the number of packets that usually arrive in the time since the last one."""
         seconds = self._last - self._first
-        return self._count / seconds * max(0.0, now - self._last) if seconds > 0 else 0.0
+        if seconds <= 0:
+            return 0.0
+        return self._count / seconds * max(0.0, now - self._last)
 
     def explains(self, lost: int, now: float, *, margin: int = _MARGIN) -> bool:
         """Return whether this number of packets can be lost since the last one; if not, the sender restarted.
@@ -62,6 +66,23 @@ class _Link:
         """Return the number of packets from the last one to one with this sequence number."""
         return (sequence - self.last) % _MODULUS
 
+    def go_on(self, sequence: int, now: float) -> None:
+        """Note the last packet."""
+        self.last = sequence
+        self.time = now
+
+
+@dataclass(slots=True)
+class _Gap:
+    """The last gap of the main link. `before`: that link as it was, because it may go on.
+
+    `end`: the packet behind the gap; None if the sender restarted, and no packets were counted as lost.
+    """
+
+    before: _Link
+    end: int | None = None
+    is_late: bool = False  # the last packet was in the gap
+
 
 class SequenceCounter:
     """Count the MAVLink messages of one sender that were lost, and tell its links apart.
@@ -75,14 +96,12 @@ class SequenceCounter:
     """
 
     def __init__(self) -> None:
-        self.link = self._links = 0
+        self.link = 0
+        self._links = 0  # number of links so far
         self._main: _Link | None = None
         self._second: _Link | None = None
-        self._earlier: _Link | None = None  # the main link before the last gap, which may go on
-        self._has_gap = False  # packets of that gap counted as lost
-        self._gap_end = 0  # the packet behind that gap
-        self._early: set[int] = set()  # packets of that gap that overtook others of it
-        self._is_late = False  # the last packet was in that gap
+        self._gap: _Gap | None = None
+        self._early: set[int] = set()  # packets of a gap that overtook others of it
         self._is_numbered = False  # two packets of the main link followed each other
         self._missing: set[int] = set()  # sequence numbers that the main link skipped
         self._rate = PacketRate()
@@ -99,44 +118,51 @@ class SequenceCounter:
             self._is_numbered = False
             self.link = main.number
             return self._go_on(main, sequence, now)
-        second, earlier = self._second, self._earlier
         self.link = main.number
-        if main.step_to(sequence) == 1:
+        step = main.step_to(sequence)
+        if step == 1:
             self._is_numbered = True
-            self._tell_apart(main, second, sequence)
+            self._tell_apart(main, sequence)
             return self._go_on(main, sequence, now)
+        second = self._second
         if second is not None and second.step_to(sequence) == 1:
             return self._add_to_second(main, second, sequence, now)
-        if earlier is not None and earlier.step_to(sequence) == 1:
-            return self._add_to_earlier(main, earlier, sequence, now)
-        if main.step_to(sequence) == 0:
+        gap = self._gap
+        if gap is not None and gap.before.step_to(sequence) == 1:
+            return self._add_to_earlier(main, gap, sequence, now)
+        if step == 0:
             return self._add_late(sequence)
         return self._add_after_gap(main, sequence, now)
 
     def _main_at(self, now: float) -> _Link | None:
         """Return the main link; the second one replaces it after a silence."""
-        main, second = self._main, self._second
+        main = self._main
         if main is None or now - main.time <= _SILENCE:
             return main
-        self._main = self._second = self._earlier = None
+        second = self._second
+        self._main = None
+        self._second = None
+        self._gap = None
         if second is not None and now - second.time <= _SILENCE:
             second.first = None
             self._main = second
         return self._main
 
-    def _new_link(self, sequence: int, now: float) -> _Link:
-        number = self._links
+    def _new_number(self) -> int:
         self._links += 1
-        return _Link(number, sequence, now)
+        return self._links - 1
 
-    def _tell_apart(self, main: _Link, second: _Link | None, sequence: int) -> None:
+    def _new_link(self, sequence: int, now: float) -> _Link:
+        return _Link(self._new_number(), sequence, now)
+
+    def _tell_apart(self, main: _Link, sequence: int) -> None:
         """Give the second link a number of its own if the main one, with this packet, sends a number of it again."""
+        second = self._second
         if second is None or second.first is None:
             return
         if main.step_to(second.first) <= main.step_to(sequence):
             second.first = None
-            second.number = self._links
-            self._links += 1
+            second.number = self._new_number()
 
     def _go_on(self, main: _Link, sequence: int, now: float) -> int:
         lost = 0
@@ -145,7 +171,7 @@ class SequenceCounter:
             self._missing |= skipped
             lost = len(skipped)
         self._missing.discard(sequence)
-        main.last, main.time = sequence, now
+        main.go_on(sequence, now)
         self._rate.add(now)
         return lost
 
@@ -161,11 +187,11 @@ class SequenceCounter:
     def _add_to_second(self, main: _Link, second: _Link, sequence: int, now: float) -> int:
         """Add a packet of the second link, which replaces the main one once it shows that they are one."""
         self.link = second.number
+        skipped = _between(second.last, sequence)
+        second.go_on(sequence, now)
         if second.first is None:
-            second.last, second.time = sequence, now
             return 0
-        second.skipped |= _between(second.last, sequence)
-        second.last, second.time = sequence, now
+        second.skipped |= skipped
         overtaken = self._missing & _between(main.last, second.first)
         ahead = (sequence - second.first) % _MODULUS
         is_main_silent = ahead > _MODULUS // 2  # the rest of the overtaken packets was lost
@@ -179,39 +205,38 @@ class SequenceCounter:
         self._rate.add(now)
         return len(lost)
 
-    def _add_to_earlier(self, main: _Link, earlier: _Link, sequence: int, now: float) -> int:
+    def _add_to_earlier(self, main: _Link, gap: _Gap, sequence: int, now: float) -> int:
         """Add a packet that follows the main link from before the last gap.
 
         One packet may have been overtaken. If the next one follows too, there was no gap: the link went on, and the
         packets behind the gap have overtaken several, or are those of another link.
         """
+        earlier = gap.before
         self.link = earlier.number
-        earlier.last, earlier.time = sequence, now
-        if self._has_gap and not self._is_late:
-            self._is_late = True
+        earlier.go_on(sequence, now)
+        if gap.end is not None and not gap.is_late:
+            gap.is_late = True
             return self._add_late(sequence)
         self._main = earlier
         self._second = main
-        self._earlier = None
-        if main.number != earlier.number:
+        self._gap = None
+        if gap.end is None:  # another link, which counted no losses
             return 0
-        gap = _between(sequence, self._gap_end)
-        self._early = gap - self._missing
-        main.first = self._gap_end
+        inside = _between(sequence, gap.end)
+        self._early = inside - self._missing
+        main.first = gap.end
         main.skipped = set()
-        counted = len(gap & self._missing)
+        not_lost = inside & self._missing
         if sequence in self._missing:
             self._missing.discard(sequence)
-            counted += 1
-        return -counted
+            not_lost.add(sequence)
+        return -len(not_lost)
 
     def _add_after_gap(self, main: _Link, sequence: int, now: float) -> int:
         """Add a packet that follows none: after a loss, late, the first one of another link, or after a restart."""
-        second = self._second
         ahead = main.step_to(sequence)
         behind = _MODULUS - ahead
-        margin = _MARGIN if self._is_numbered else _MAX_OVERTAKEN
-        is_loss = ahead <= _MODULUS // 2 and self._rate.explains(ahead - 1, now, margin=margin)
+        second = self._second
         if second is not None:
             if second.first is not None and sequence in second.skipped:
                 second.skipped.discard(sequence)
@@ -224,26 +249,26 @@ class SequenceCounter:
                     return self._add_to_second(main, second, sequence, now)
                 self.link = second.number
                 return 0
-        if is_loss:
+        if self._is_loss(ahead, now):
             if second is None:
-                self._earlier = _Link(main.number, main.last, main.time)
-                self._has_gap = True
-                self._gap_end = sequence
+                self._gap = _Gap(_Link(main.number, main.last, main.time), sequence)
                 self._early = set()
-                self._is_late = False
-            self._tell_apart(main, second, sequence)
+            self._tell_apart(main, sequence)
             return self._go_on(main, sequence, now)
         is_missing = behind <= _MARGIN and sequence in self._missing
-        if is_missing or behind <= _MAX_OVERTAKEN:
+        if is_missing or behind <= _OVERTAKEN:
             return self._add_late(sequence)
-        self._earlier = main
-        self._has_gap = False
-        self._is_late = False
+        self._gap = _Gap(main)
         self._is_numbered = False
         self._main = self._new_link(sequence, now)
         self.link = self._main.number
         self._rate.add(now)
         return 0
+
+    def _is_loss(self, ahead: int, now: float) -> bool:
+        """Return whether the packets between the last one and one so far ahead can be lost."""
+        margin = _MARGIN if self._is_numbered else _OVERTAKEN
+        return ahead <= _MODULUS // 2 and self._rate.explains(ahead - 1, now, margin=margin)
 
 
 def _between(first: int, last: int) -> set[int]:

@@ -221,3 +221,31 @@ def test_flapping_stream_is_logged_once(caplog: pytest.LogCaptureFixture) -> Non
     for _ in range(120):
         fake.receive(0.5, POSITION)
     assert flap() == ["stale: no message for 4 s", "published again"]
+
+
+def test_stream_with_another_layout_gets_another_publisher() -> None:
+    """A stream whose definition has other fields than before, as of new firmware, is published with the new one."""
+    fake = FakeOutput()
+    known = BY_TOPIC[VLP]
+    other = BY_TOPIC["vehicle_attitude"]
+    stream = fake.output.claim(POSITION)
+    first = stream.publisher
+    assert fake.output.claim(POSITION, known).publisher is first
+    second = fake.output.claim(POSITION, other).publisher
+    assert second is not None
+    assert second is not first
+    assert second.definition is other
+    assert fake.output.claim(POSITION).publisher is second, "no definition is that of the topic"
+
+
+def test_message_that_waited_in_the_service_has_a_latency() -> None:
+    """A message that is published more than 1 s after its arrival, as on a busy host, has this latency."""
+    fake = FakeOutput()
+    fake.now = 100.0
+    for arrived in (99.5, 97.0):
+        message = SourceMessage(0.0, POSITION, {"timestamp": round(arrived * 1e6)}, arrived=arrived)
+        fake.output.publish_live(message)
+    fake.now = 101.5
+    latencies = fake.output._streams[POSITION].health.latencies
+    assert sum(latencies.counts) == 1
+    assert latencies.sum == 3.0

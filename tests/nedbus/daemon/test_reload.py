@@ -87,7 +87,7 @@ def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> N
         reason = "prefix cannot be changed by a reload: restart the service"
         assert f"{file}, line 1, column 1: {reason}" in reload(service, 2)
         file.write_text("[[source")
-        assert f"{file}, line 1, column 9: " in reload(service, 3)
+        assert f"{file}: Expected ']]' at the end of" in reload(service, 3)
         file.unlink()
         assert "there is no such file" in reload(service, 4)
         assert list(bus.vehicles()) == ["1"]

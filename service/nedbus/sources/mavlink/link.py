@@ -1,6 +1,7 @@
 """Links to MAVLink vehicles over UDP, TCP or a serial port, and checks of sender ids."""
 
 import errno
+import math
 import os
 import re
 import select
@@ -35,8 +36,9 @@ _DROPS: Final = 40  # Linux's SO_RXQ_OVFL: the number of datagrams dropped befor
 _TIME: Final = struct.Struct("qq")  # s and ns since the epoch
 _CONTROL_BYTES: Final = socket.CMSG_SPACE(_TIME.size) + socket.CMSG_SPACE(4)  # bytes
 _LINK: Final = re.compile(
-    r"(udpin|tcp):(.+):(\d{1,5})|(udpout):(.+):(\d{1,5})(?:@(\d{1,5}))?|(serial):(/.+)"
+    r"(?P<kind>udpin|udpout|tcp):(?P<host>.+):(?P<port>\d{1,5})(?:@(?P<local_port>\d{1,5}))?"
 )
+_SERIAL: Final = re.compile(r"serial:(?P<device>/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 # below those that Linux gives to sockets without a port
 _LOCAL_PORTS: Final = range(20_000, 30_000)
@@ -66,22 +68,26 @@ class _UdpLink:
     restarted service would receive nothing at another port.
     """
 
-    stream, baud = False, None
+    stream = False
+    baud = None
 
     def __init__(self, link: LinkAddress) -> None:
-        family, _, _, _, address = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)[
-            0
-        ]
-        listens = link.kind == "udpin"
-        local = address if listens else ("", link.local_port)
+        addresses = socket.getaddrinfo(link.host, link.port, type=socket.SOCK_DGRAM)
+        family, _, _, _, address = addresses[0]
+        self.peer: Peer = address
+        local: Any = ("", link.local_port)
+        if link.kind == "udpin":
+            self.peer = None
+            local = address
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        for option in (_TIMESTAMPS, _DROPS) if sys.platform == "linux" else ():
-            self._socket.setsockopt(socket.SOL_SOCKET, option, 1)
-        self.dropped, self._drained = 0, time.monotonic()
+        if sys.platform == "linux":
+            self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, _DROPS, 1)
+        self.dropped = 0
+        self._drained = time.monotonic()  # when no datagram waited
         self.close = self._socket.close
-        self.peer: Peer = None if listens else address
         try:
             self._socket.bind(local)
         except OSError:
@@ -126,11 +132,13 @@ class _UdpLink:
 class _StreamLink:
     """A TCP connection, or a serial port if `baud` is set; a read may return a partial message."""
 
-    stream, dropped = True, 0
+    stream = True
+    dropped = 0
 
     def __init__(self, file: Any, peer: Peer, baud: int | None = None) -> None:
         os.set_blocking(file.fileno(), False)
-        self.peer, self.baud = peer, baud
+        self.peer = peer
+        self.baud = baud
         self.close = file.close
         self._file = file
         self._unsent = bytearray()  # whole frames; the first may be sent in part
@@ -138,14 +146,19 @@ class _StreamLink:
 
     def read(self, timeout: float) -> Iterator[Packet]:
         """Yield received bytes, and send queued frames; wait up to `timeout` seconds."""
-        if ready := _wait(self._file, timeout, select.POLLOUT * bool(self._unsent)):
+        awaited = select.POLLIN
+        if self._unsent:
+            awaited |= select.POLLOUT
+        ready = _wait(self._file, timeout, awaited)
+        if ready:
             self._flush()
-        if ready & ~select.POLLOUT:
-            with suppress(BlockingIOError):
-                data = os.read(self._file.fileno(), _READ_BYTES)
-                if not data:
-                    raise ConnectionResetError(None, "the peer closed the connection")
-                yield Packet(data, self.peer, time.monotonic())
+        if not ready & ~select.POLLOUT:
+            return
+        with suppress(BlockingIOError):
+            data = os.read(self._file.fileno(), _READ_BYTES)
+            if not data:
+                raise ConnectionResetError(None, "the peer closed the connection")
+            yield Packet(data, self.peer, time.monotonic())
 
     def send(self, frame: bytes, _: Peer) -> bool:
         """Send or queue a whole frame without blocking; return False if the queue is full. Raises OSError."""
@@ -159,7 +172,8 @@ class _StreamLink:
     def _flush(self) -> None:
         with self._sending, suppress(BlockingIOError):
             while self._unsent:
-                del self._unsent[: os.write(self._file.fileno(), self._unsent)]
+                written = os.write(self._file.fileno(), self._unsent)
+                del self._unsent[:written]
 
 
 Link = _UdpLink | _StreamLink
@@ -168,20 +182,28 @@ Link = _UdpLink | _StreamLink
 
 def parse_link(text: str) -> LinkAddress:
     """Parse a link; raise ConfigError if it is invalid."""
-    error = ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link; write {_FORMS}")
-    found = _LINK.fullmatch(text)
-    if found is None:
-        raise error
-    if found[8]:
-        return LinkAddress("serial", found[9])
-    if found[1]:
-        link = LinkAddress(found[1], found[2].strip("[]"), int(found[3]))
-    else:
-        local_port = int(found[7]) if found[7] else _local_port(f"{found[5]}:{found[6]}")
-        link = LinkAddress("udpout", found[5].strip("[]"), int(found[6]), local_port)
-    if not 0 < link.port < 2**16 or link.local_port >= 2**16:
-        raise error
-    return link
+    serial = _SERIAL.fullmatch(text)
+    if serial is not None:
+        return LinkAddress("serial", serial["device"])
+    link = _LINK.fullmatch(text)
+    if link is not None and _is_valid(link):
+        kind = link["kind"]
+        local_port = 0
+        if kind == "udpout":
+            target = f"{link['host']}:{link['port']}"
+            local_port = int(link["local_port"] or _local_port(target))
+        return LinkAddress(kind, link["host"].strip("[]"), int(link["port"]), local_port)
+    raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link; write {_FORMS}")
+
+
+def _is_valid(link: re.Match[str]) -> bool:
+    """Return whether the ports of a link exist; only udpout has a local one."""
+    if not 0 < int(link["port"]) < 2**16:
+        return False
+    local_port = link["local_port"]
+    if local_port is None:
+        return True
+    return link["kind"] == "udpout" and int(local_port) < 2**16
 
 
 def _local_port(target: str) -> int:
@@ -204,26 +226,39 @@ def open_link(text: str, *, baud: int) -> Link:
                 return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))
         return _UdpLink(link)
     except (OSError, UnicodeError) as exc:
-        number = exc.errno if isinstance(exc, OSError) else None
-        reason = os.strerror(number).lower() if number and number > 0 else str(exc)
-        remedy = ""
-        if number == errno.EADDRINUSE and link.kind == "udpout":
-            remedy = f" at local port {link.local_port}: close the other program or use another one, as in {text}@14555"
-        elif number == errno.EADDRINUSE:
-            remedy = ": close the other program or use another port"
-        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason}){remedy}") from exc
+        raise SourceError(f"mavlink:{text}", _why_not_opened(text, link, exc)) from exc
 
 
-def _wait(file: Any, timeout: float, events: int = 0) -> int:
-    """Wait for data, the end of the stream, or other events; return them, 0 after a timeout."""
+def _why_not_opened(text: str, link: LinkAddress, error: OSError | UnicodeError) -> str:
+    """Return why a link cannot be opened, and the remedy for a port in use."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number is None or number <= 0:  # such as an unknown host
+        return f"cannot be opened ({error})"
+    reason = f"cannot be opened ({os.strerror(number).lower()})"
+    if number != errno.EADDRINUSE:
+        return reason
+    if link.kind != "udpout":
+        return f"{reason}: close the other program or use another port"
+    target, _, _ = text.partition("@")
+    remedy = f"close the other program or use another one, as in {target}@14555"
+    return f"{reason} at local port {link.local_port}: {remedy}"
+
+
+def _wait(file: Any, timeout: float, events: int = select.POLLIN) -> int:
+    """Wait for events, such as data, or the end of the stream; return them, 0 after a timeout."""
     poll = select.poll()  # unlike select(), without a limit on file descriptors
-    poll.register(file, select.POLLIN | events)
-    return next((found for _, found in poll.poll(timeout * 1000)), 0)
+    poll.register(file, events)
+    for _, happened in poll.poll(timeout * 1000):
+        return happened
+    return 0
 
 
 def name_of(peer: Peer) -> str:
     """Return an address as text."""
-    return ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
+    if not isinstance(peer, tuple):
+        return str(peer)
+    host, port, *_ = peer
+    return f"{host}:{port}"
 
 
 class PeerChoice:
@@ -236,38 +271,44 @@ class PeerChoice:
     """
 
     def __init__(self, peer: Peer, now: float) -> None:
-        self.peer, self.second = peer, None
+        self.peer = peer
+        self.second: Peer = None
         self._last = now  # time of the last message from the chosen address
-        # last message from another address since then, and its time
-        self._other: tuple[Peer, float] | None = None
-        self._run = 0  # messages from that address since then
+        # since that message: another address, the time of its last message, and their number
+        self._other: Peer = None
+        self._other_last = -math.inf
+        self._run = 0
 
     def add(self, peer: Peer, now: float) -> None:
         """Add a message from an address, at monotonic time `now` [s]."""
         if peer == self.peer:
-            if self._other is not None and now - self._other[1] < _PEER_TIMEOUT:
-                self.second = self._other[0]
-            self._other = None
-            self._run = 0
-            self._last = now
+            if now - self._other_last < _PEER_TIMEOUT:
+                self.second = self._other
+            self._choose(peer, now)
             return
-        self._run = self._run + 1 if self._other is not None and self._other[0] == peer else 1
-        self._other = peer, now
-        if now - self._last > _PEER_TIMEOUT or self._run >= _PEER_RUN:
-            self.peer = peer
-            self._other = None
+        if peer != self._other:
+            self._other = peer
             self._run = 0
-            self._last = now
+        self._run += 1
+        self._other_last = now
+        if now - self._last > _PEER_TIMEOUT or self._run >= _PEER_RUN:
+            self._choose(peer, now)
+
+    def _choose(self, peer: Peer, now: float) -> None:
+        self.peer = peer
+        self._last = now
+        self._other = None
+        self._other_last = -math.inf
+        self._run = 0
 
 
 class DuplicateIds:
     """Detect system ids with two senders, whose messages arrive alternately from two addresses."""
 
     def __init__(self) -> None:
-        self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(
-            lambda: deque(maxlen=_CHANGES)
-        )
-        self._found: set[int] = set()
+        # the last changes of the address from which each system sends, with their times
+        self._changes = defaultdict[int, deque[tuple[Peer, float]]](lambda: deque(maxlen=_CHANGES))
+        self._reported: set[int] = set()
 
     def add(self, system: int, peer: Peer, now: float) -> str:
         """Add a message at monotonic time `now` [s]; return a warning about two senders, once per system, or ""."""
@@ -275,8 +316,10 @@ class DuplicateIds:
         if changes and changes[-1][0] == peer:
             return ""
         changes.append((peer, now))
-        if len(changes) < _CHANGES or now - changes[0][1] > _WINDOW or system in self._found:
+        _, first_time = changes[0]
+        if len(changes) < _CHANGES or now - first_time > _WINDOW or system in self._reported:
             return ""
-        self._found.add(system)
-        both = f"{name_of(changes[-2][0])} and {name_of(peer)}"
+        self._reported.add(system)
+        before, _ = changes[-2]
+        both = f"{name_of(before)} and {name_of(peer)}"
         return f"{both} both send as system {system}, and their messages are mixed; give each its own MAV_SYS_ID"

@@ -56,6 +56,10 @@ _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_DENIED: "bandwidth",
     dialect.MAV_RESULT_UNSUPPORTED: "unsupported",
 }
+_SLOW_RETRY: Final[Set[LogReason | None]] = {
+    "bandwidth", "unsupported", "slow_link", "stalled", "no_data", "unreadable",
+}  # fmt: skip
+"""Reasons that hardly end by themselves: START is retried later."""
 LogState = Literal[
     "idle",
     "waiting_for_disarm",
@@ -113,7 +117,9 @@ class LogStreamClient:
         self._longest_header = header
         self._owner = "another client"
         self.header_seconds: float | None = None
-        self._is_px4 = self._armed = self._is_left = False
+        self._is_px4 = False
+        self._armed = False
+        self._is_left = False
         self._reset()
 
     def _reset(self) -> None:
@@ -125,15 +131,20 @@ class LogStreamClient:
         self._measurements = 0  # of the link, since START became due
         self._expected_count = DEFAULT_COUNT  # messages of the next header
         self._due = 0.0  # deadline of the awaited event, or else time of the next START
-        self._tries = self._restarts = 0
-        self._has_sent_command = self._took_over = False
+        self._tries = 0
+        self._restarts = 0
+        self._has_sent_command = False
+        self._took_over = False
         self._has_header = False  # definitions of the current stream have arrived, at least in part
-        self._header_messages = self._acked_in_row = 0
-        # `_interval`: longest recent time between messages
-        self._header_start = self._interval = 0.0
+        self._header_messages = 0
+        self._header_start = 0.0
+        self._acked_in_row = 0
+        self._interval = 0.0  # longest recent time between messages
         # longest pause in the header, not part of the round trip: it may be a burst of losses
         self._header_pause = 0.0
-        self._last_heartbeat = self._last_data = self._last_acked = -math.inf
+        self._last_heartbeat = -math.inf
+        self._last_data = -math.inf
+        self._last_acked = -math.inf
         self._sequence = -1
 
     def accepts(self, target_system: int, target_component: int) -> bool:
@@ -174,40 +185,44 @@ class LogStreamClient:
 
     def on_data(self, sequence: int, now: float, *, acked: bool, begins: bool) -> list[Command]:
         """Handle a message that `accepts` accepted; `acked`: LOGGING_DATA_ACKED; `begins`: `Chunk.begins`."""
-        state, reason, _ = self.status
-        is_new, self._sequence = sequence != self._sequence, sequence
+        is_new = sequence != self._sequence
+        self._sequence = sequence
         self._interval = max(now - self._last_data, _DECAY * self._interval)
         self._last_data = now
-        self._acked_in_row = self._acked_in_row + is_new if acked else 0
-        # During the header PX4 obeys STOP only if an acknowledgement is missing.
-        is_aborted = self._awaited == "stop" and reason in ("slow_link", "unreadable")
-        commands = [Command("acknowledge", sequence)] if acked and not is_aborted else []
-        is_rejected = reason == "unreadable" and self._awaited is None
-        if self._awaited == "stop" or is_rejected or state in ("stopping", "stopped"):
-            pass
-        elif begins:
-            self._awaited = None
-            self._has_header = True
-            self._restarts = 0
-            self.header_seconds = None
-            self._unreadable = ""
-            self._enter("header", None, now)
-            self._header_start = now
-            self._last_acked = now
-            self._header_messages = 1
-            self._header_pause = self._interval = 0.0
+        if not acked:
+            self._acked_in_row = 0
+        elif is_new:
+            self._acked_in_row += 1
+        commands = list[Command]()
+        if acked and not self._is_aborting:
+            commands.append(Command("acknowledge", sequence))
+        if self._is_ending:
+            return commands
+        state, reason, _ = self.status
+        if begins:
+            self._begin_header(now)
         elif state == "header" and not acked:
             self._end_header(now)
         elif state == "header" and is_new:
-            self._header_pause = max(now - self._last_acked, self._header_pause)
-            self._last_acked, self._header_messages = now, self._header_messages + 1
-            return self._check_header(now) or commands
+            return self._continue_header(now) or commands
         elif state in ("refused", "ended") and self._has_header:
             self._awaited = None
             self._enter("streaming", None, now)
         elif reason == "taken" and self._may_start() and not self._took_over:
             commands += self._take_over(now)
         return commands
+
+    @property
+    def _is_aborting(self) -> bool:
+        """True while PX4 shall stop a header, which it does only if an acknowledgement is missing."""
+        return self._awaited == "stop" and self.status.reason in ("slow_link", "unreadable")
+
+    @property
+    def _is_ending(self) -> bool:
+        """True while data changes nothing, because the stream was stopped, or shall be."""
+        if self._awaited == "stop" or self.status.state in ("stopping", "stopped"):
+            return True
+        return self._awaited is None and self.status.reason == "unreadable"
 
     def on_command_ack(
         self, command: int, result: int, target_system: int, target_component: int, now: float
@@ -231,7 +246,9 @@ class LogStreamClient:
             return []
         self._pings.remove(sent)
         self._round_trips.append(now - sent / 1e9)
-        return self._ping(now) if self._tries < _PINGS else self._start(now)
+        if self._tries < _PINGS:
+            return self._ping(now)
+        return self._start(now)
 
     def tick(self, now: float) -> list[Command]:
         """Return the commands that are due."""
@@ -240,18 +257,23 @@ class LogStreamClient:
             self._enter("refused", "unreadable", now, self._unreadable)
             self._unreadable = ""
             return self._send("stop", now)
-        state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
+        state = self.status.state
+        is_receiving = state in ("header", "streaming")
+        silence = now - max(self._last_heartbeat, self._last_data)
         is_lost = silence > TIMINGS.log_link
-        if is_lost and state in ("header", "streaming"):
-            # PX4 gave up on the header
-            self._awaited, self._has_header = None, state == "streaming"
-            self._enter("ended", "link_lost" if self._has_header else "stalled", now, silence)
-        elif self._awaited is not None:
+        if is_lost and is_receiving:
+            self._lose_link(silence, now)
+            return []
+        if self._awaited is not None:
             return self._on_timeout(now, is_lost=is_lost) if now >= self._due else []
-        elif state in ("header", "streaming"):
+        if is_receiving:
             return self._check_silence(now)
         if state in ("stopping", "stopped") or not self._is_px4 or is_lost or now < self._due:
             return []
+        return self._begin_start(now)
+
+    def _begin_start(self, now: float) -> list[Command]:
+        state = self.status.state
         if self._may_start():
             if state in ("idle", "waiting_for_disarm"):
                 self._enter("starting", None, now)
@@ -259,6 +281,12 @@ class LogStreamClient:
         if state in ("idle", "starting"):
             self._enter("waiting_for_disarm", "armed", now)
         return []
+
+    def _lose_link(self, silence: float, now: float) -> None:
+        """End the stream; PX4 continues it without a client, but gives up on a header."""
+        self._awaited = None
+        self._has_header = self.status.state == "streaming"
+        self._enter("ended", "link_lost" if self._has_header else "stalled", now, silence)
 
     def reject(self, reason: str) -> None:
         """Stop the current stream, which cannot be read; unlike most methods, may be called on any thread."""
@@ -283,27 +311,25 @@ class LogStreamClient:
     ) -> None:
         """Change the state, and set the time of the next START unless an answer is awaited."""
         if (state, reason) != self.status[:2]:
-            values = (self._owner,) if reason == "taken" else values
-            self.status = LogStatus(state, reason, _TEXTS[reason].format(*values) if reason else "")
-        if self._awaited is None:
-            is_slow = reason in (
-                "bandwidth",
-                "unsupported",
-                "slow_link",
-                "stalled",
-                "no_data",
-                "unreadable",
-            )
-            is_over = state in ("refused", "ended")
-            self._due = now + (
-                TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0
-            )
+            if reason == "taken":
+                values = (self._owner,)
+            text = _TEXTS[reason].format(*values) if reason else ""
+            self.status = LogStatus(state, reason, text)
+        if self._awaited is not None:
+            return
+        self._due = now
+        if reason in _SLOW_RETRY:
+            self._due += TIMINGS.log_slow_retry
+        elif state in ("refused", "ended"):
+            self._due += TIMINGS.log_retry
 
     def _send(self, kind: Literal["start", "stop"], now: float, *, tries: int = 0) -> list[Command]:
         self._awaited = kind
         self._tries = tries + 1
         self._has_sent_command = True
-        self._due = now + TIMINGS.log_answer * (2**tries if kind == "start" else 1)
+        self._due = now + TIMINGS.log_answer
+        if kind == "start":
+            self._due = now + TIMINGS.log_answer * 2**tries
         return [Command(kind)]
 
     def _ping(self, now: float) -> list[Command]:
@@ -352,23 +378,16 @@ class LogStreamClient:
         expected = elapsed + count * interval
         if expected <= limit:
             return True
-        topics = int((limit / interval - FIXED_COUNT) / COUNT_PER_TOPIC) if interval else 0
-        fit = (
-            f"the header of {topics} topics"
-            if topics > 0
-            else "none, because of the vehicle's parameters alone"
-        )
+        topics = 0
+        if interval:
+            topics = int((limit / interval - FIXED_COUNT) / COUNT_PER_TOPIC)
+        fit = "none, because of the vehicle's parameters alone"
+        if topics > 0:
+            fit = f"the header of {topics} topics"
         self._has_header = False
-        self._enter(
-            "refused",
-            "slow_link",
-            now,
-            expected,
-            1e3 * interval,
-            limit,
-            fit,
-            math.ceil(1.2 * expected),
-        )
+        remedy = math.ceil(1.2 * expected)
+        values = (expected, 1e3 * interval, limit, fit, remedy)
+        self._enter("refused", "slow_link", now, *values)
         return False
 
     def _end_stop(self, now: float) -> None:
@@ -379,95 +398,132 @@ class LogStreamClient:
 
     def _take_over(self, now: float) -> list[Command]:
         """Send STOP now, and START after its acknowledgement or timeout."""
-        self._took_over, self._has_header = True, False
+        self._took_over = True
+        self._has_header = False
         self._enter("starting", None, now)
         return self._send("stop", now)
 
     def _resume(self, now: float) -> None:
         """Assume that a silent stream continues, until `_check_silence` finds that it does not."""
-        self._last_data, self._acked_in_row = now, 0
+        self._last_data = now
+        self._acked_in_row = 0
         self._enter("streaming", None, now)
+
+    def _begin_header(self, now: float) -> None:
+        self._awaited = None
+        self._has_header = True
+        self._restarts = 0
+        self.header_seconds = None
+        self._unreadable = ""
+        self._header_start = now
+        self._header_messages = 1
+        self._header_pause = 0.0
+        self._last_acked = now
+        self._interval = 0.0
+        self._enter("header", None, now)
 
     def _end_header(self, now: float) -> None:
-        self.header_seconds, self._acked_in_row = self._last_acked - self._header_start, 0
+        self.header_seconds = self._last_acked - self._header_start
         self._expected_count = self._header_messages
+        self._acked_in_row = 0
         self._enter("streaming", None, now)
 
-    def _check_header(self, now: float) -> list[Command]:
-        """Stop a stream whose header takes too long, or is expected to."""
-        elapsed, count = now - self._header_start, self._header_messages
+    def _continue_header(self, now: float) -> list[Command]:
+        """Count a message of the header; stop a stream whose header takes too long, or is expected to."""
+        self._header_pause = max(now - self._last_acked, self._header_pause)
+        self._last_acked = now
+        self._header_messages += 1
+        count = self._header_messages
+        elapsed = now - self._header_start
         interval = (elapsed - self._header_pause) / max(1, count - 2)
-        is_known = count >= _MIN_COUNT or elapsed >= _MIN_TIME
-        remaining = max(0, self._expected_count - count) if is_known else 0
-        return [] if self._allows(remaining, interval, now, elapsed) else self._send("stop", now)
+        remaining = 0
+        if count >= _MIN_COUNT or elapsed >= _MIN_TIME:
+            remaining = max(0, self._expected_count - count)
+        if self._allows(remaining, interval, now, elapsed):
+            return []
+        return self._send("stop", now)
 
     def _on_start_result(self, result: int, now: float) -> list[Command]:
-        state, self._awaited = self.status.state, None
-        if result == dialect.MAV_RESULT_ACCEPTED:
-            if state == "stopping":
+        self._awaited = None
+        is_accepted = result == dialect.MAV_RESULT_ACCEPTED
+        is_taken = result == dialect.MAV_RESULT_TEMPORARILY_REJECTED
+        if self.status.state == "stopping":
+            if is_accepted:
                 return self._send("stop", now)
-            if state in ("header", "streaming"):
-                self._enter("starting", "silent", now, now - self._last_data)
-            elif self.status.reason != "no_data":  # "no_data" stays while START is retried
-                self._enter("starting", None, now)
-            self._awaited = "data"
-            self._has_header = False
-            self._due = now + TIMINGS.log_answer
-        elif state == "stopping":
             self._enter("stopped", None, now)
-        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:
-            # the stream exists, but is slow
-            if state == "header":
-                self._end_header(now)
-            elif state != "streaming":
-                self._resume(now)
-            self._due = now + self._silence_limit()
-        elif (
-            result == dialect.MAV_RESULT_TEMPORARILY_REJECTED
-            and "take" in self._log
-            and not self._took_over
-        ):
+        elif is_accepted:
+            self._await_data(now)
+        elif is_taken and self._has_header:
+            self._keep_stream(now)
+        elif is_taken and "take" in self._log and not self._took_over:
             return self._take_over(now)
         else:
-            self._enter(
-                "refused", _REFUSALS.get(result, "failed"), now, _name("MAV_RESULT", result)
-            )
+            reason = _REFUSALS.get(result, "failed")
+            self._enter("refused", reason, now, _name("MAV_RESULT", result))
         return []
+
+    def _await_data(self, now: float) -> None:
+        """PX4 begins a new stream."""
+        if self.status.state in ("header", "streaming"):
+            self._enter("starting", "silent", now, now - self._last_data)
+        elif self.status.reason != "no_data":  # "no_data" stays while START is retried
+            self._enter("starting", None, now)
+        self._awaited = "data"
+        self._has_header = False
+        self._due = now + TIMINGS.log_answer
+
+    def _keep_stream(self, now: float) -> None:
+        """PX4 still has the stream, which is slow."""
+        if self.status.state == "header":
+            self._end_header(now)
+        elif self.status.state != "streaming":
+            self._resume(now)
+        self._due = now + self._silence_limit()
 
     def _on_timeout(self, now: float, *, is_lost: bool) -> list[Command]:
         state = self.status.state
         awaited = self._awaited
         self._awaited = None
-        is_repeated = self._tries < _TRIES
+        may_repeat = self._tries < _TRIES
         if awaited == "stop":
-            if is_repeated:
+            if may_repeat:
                 return self._send("stop", now, tries=self._tries)
             self._end_stop(now)
         elif state == "stopping":  # START was not answered, so there is no stream to stop
             self._enter("stopped", None, now)
-        elif awaited == "pong" and not is_lost:
+        elif is_lost:
+            self._cancel_start(now)
+        elif awaited == "pong":
             self._awaited = "pong"
-            return self._ping(now) if is_repeated else self._start(now)
-        elif awaited == "data" and not is_lost:
-            # The data may go to another client, so no STOP; without acknowledgements PX4 gives up.
-            self._restarts += 1
-            if self._restarts <= _RESTARTS:
-                self._enter("starting", None, now)
-                self._due = now + TIMINGS.log_timeout
-            else:
-                self._enter("refused", "no_data", now)
-        elif is_lost or not self._may_start():
-            if state == "starting":
-                self._enter("idle", None, now)
-        elif is_repeated:
+            return self._ping(now) if may_repeat else self._start(now)
+        elif awaited == "data":
+            self._restart(now)
+        elif not self._may_start():
+            self._cancel_start(now)
+        elif may_repeat:
             return self._send("start", now, tries=self._tries)
         elif state in ("header", "streaming"):
-            self._enter(
-                "ended", "stalled" if state == "header" else "silent", now, now - self._last_data
-            )
+            reason: LogReason = "stalled" if state == "header" else "silent"
+            self._enter("ended", reason, now, now - self._last_data)
         else:
             self._enter("refused", "no_answer", now)
         return []
+
+    def _cancel_start(self, now: float) -> None:
+        if self.status.state == "starting":
+            self._enter("idle", None, now)
+
+    def _restart(self, now: float) -> None:
+        """Repeat an accepted START without data, which may go to another client.
+
+        Therefore no STOP is sent; without acknowledgements PX4 gives up.
+        """
+        self._restarts += 1
+        if self._restarts > _RESTARTS:
+            self._enter("refused", "no_data", now)
+            return
+        self._enter("starting", None, now)
+        self._due = now + TIMINGS.log_timeout
 
     def _silence_limit(self) -> float:
         """Return the silence after which the stream may have ended [s]."""
@@ -475,24 +531,21 @@ class LogStreamClient:
 
     def _check_silence(self, now: float) -> list[Command]:
         """Probe a silent stream with START: PX4 rejects it and continues, or begins a new stream."""
-        state, limit = self.status.state, self._silence_limit()
-        silence, since_acked = now - self._last_data, now - self._last_acked
-        if (
-            state == "header"
-            and since_acked > TIMINGS.log_timeout
-            and since_acked - silence > TIMINGS.log_silence
-        ):
-            self._has_header = False  # only retransmissions arrived
-            self._enter("ended", "stalled", now, since_acked)
-        elif (
-            state == "streaming"
-            and self._acked_in_row >= _STOP_TAIL
-            and silence > TIMINGS.log_silence
-        ):
+        silence = now - self._last_data
+        since_acked = now - self._last_acked
+        if self.status.state == "header":
+            only_repeats = since_acked - silence > TIMINGS.log_silence
+            if since_acked > TIMINGS.log_timeout and only_repeats:
+                self._has_header = False
+                self._enter("ended", "stalled", now, since_acked)
+                return []
+        elif self._acked_in_row >= _STOP_TAIL and silence > TIMINGS.log_silence:
             self._has_header = False
             again = f"in {TIMINGS.log_retry:.0f} s" if self._may_start() else "after disarming"
             self._enter("ended", "stopped_elsewhere", now, again)
-        elif not self._may_start():
+            return []
+        limit = self._silence_limit()
+        if not self._may_start():
             if silence > max(TIMINGS.log_timeout, 2 * limit):
                 self._enter("ended", "silent", now, silence)
                 self._due = now

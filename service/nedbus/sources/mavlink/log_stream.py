@@ -6,7 +6,7 @@ import os
 import struct
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -63,19 +63,26 @@ class LogStream:
         self._next_file = -math.inf
         # the stream before its file: gaps [s], and what follows
         self._pending: deque[tuple[float, bytes]] = deque()
-        self._pending_size = self._unsaved = 0  # bytes
+        self._pending_size = 0  # bytes
+        self._unsaved = 0  # bytes
         self._is_pending = False
         self._logged = LogStatus("idle")
         self._streamed: set[Address] = set()
-        self._received = self._gaps = self._lost = self._undecodable = 0
+        self._received = 0  # bytes
+        self._gaps = 0
+        self._lost = 0  # LOGGING_DATA
+        self._undecodable = 0
         self._sizes = _MeanSize()  # of data messages, which estimates the number of lost ones
         self._lost_messages = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
         # times of unanswered TIMESYNC requests [ns]
         self._requests: deque[int] = deque(maxlen=limits.TIMESYNC_REQUESTS)
-        self._window_start = self._rate = self._delays = 0.0
-        self._window_bytes = self._delayed = 0
+        self._window_start = 0.0
+        self._window_bytes = 0
+        self._rate = 0.0  # bytes/s
+        self._delays = 0.0  # s, sum of those in the window
+        self._delayed = 0
         self._delay: float | None = None
         self._restart()
 
@@ -83,12 +90,13 @@ class LogStream:
         """Discard the definitions and the clock offset, because the vehicle may have rebooted."""
         self._streamed.clear()
         self._has_data = False
-        self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
+        self._parser = ulog.UlogParser(verify=False)
+        self._texts = ulog.LogMessageBuilder()
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()  # reasons for rejected records
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
-        # vehicle clock minus host clock [s]; how it was measured [s]
-        self._offset, self._round_trip = 0.0, math.inf
+        self._offset = 0.0  # vehicle clock minus host clock [s]
+        self._round_trip = math.inf  # in which it was measured [s]
         self._new_header = True  # not yet logged
 
     def serves(self, client: LogStreamClient) -> bool:
@@ -102,9 +110,9 @@ class LogStream:
 
     def delivers(self, address: Address) -> bool:
         """Return whether the stream has messages of an address, which replace those converted from MAVLink."""
-        return self.is_streaming and (
-            address in self._streamed or address.topic == ulog.LOG_MESSAGE.name
-        )
+        if not self.is_streaming:
+            return False
+        return address in self._streamed or address.topic == ulog.LOG_MESSAGE.name
 
     def add(self, chunk: Chunk, now: float) -> Iterator[SourceMessage | Rejection]:
         """Yield the messages that a chunk completes."""
@@ -118,9 +126,9 @@ class LogStream:
             return
         self._received += len(chunk.data)
         self._window_bytes += len(chunk.data)
-        undecodable = self._parser.undecodable
         omitted = self._texts.limit.omitted
         problem = self._texts.problem
+        undecodable = self._parser.undecodable
         try:
             records = self._parser.feed(chunk.data)
         except ulog.UlogError as exc:  # raised once for each stream
@@ -128,13 +136,11 @@ class LogStream:
             return
         self._undecodable += self._parser.undecodable - undecodable
         sizes = [
-            len(each.payload) + _DATA_HEADER for each in records if isinstance(each, ulog.Data)
+            _DATA_HEADER + len(record.payload)
+            for record in records
+            if isinstance(record, ulog.Data)
         ]
-        was_known = self._sizes.is_known
-        self._sizes.add(sizes)
-        if self._gaps and self._sizes.is_known and not was_known:
-            # a stream that continues that of an earlier process begins with a gap
-            self._estimate_lost()
+        self._add_sizes(sizes)
         yield from self._check_definitions(is_first=not undecodable)
         self._save_definitions(records, now, others=len(records) - len(sizes))
         for record in self._texts.merge(records):
@@ -145,11 +151,20 @@ class LogStream:
             elif isinstance(record, ulog.Damage):
                 yield self._reject(record.reason)
         where = f"{self._name} {ulog.LOG_MESSAGE.name}"
-        if self._texts.limit.omitted > omitted:
-            count = self._texts.limit.omitted - omitted
-            yield Rejection(where, "more than 100 log messages per second", count=count)
+        omitted = self._texts.limit.omitted - omitted
+        if omitted:
+            reason = f"more than {limits.LOG_MESSAGES} log messages per second"
+            yield Rejection(where, reason, count=omitted)
         if self._texts.problem != problem:
             yield Rejection(where, self._texts.problem, count=0)
+
+    def _add_sizes(self, sizes: Iterable[int]) -> None:
+        """Add the sizes of messages to their mean; estimate the losses of earlier gaps once it is known."""
+        was_known = self._sizes.is_known
+        self._sizes.add(sizes)
+        if self._sizes.is_known and not was_known:
+            # a stream that continues that of an earlier process begins with a gap
+            self._estimate_lost()
 
     def _messages(
         self, subscription: ulog.Subscription, payload: bytes, now: float
@@ -169,9 +184,9 @@ class LogStream:
         """Return the rejection of a damaged record; all beyond the first 100 reasons have the same one."""
         if len(self._damages) < limits.DAMAGE_REASONS:
             self._damages.add(reason)
-        return Rejection(
-            f"{self._name} ULog stream", reason if reason in self._damages else "further damage"
-        )
+        if reason not in self._damages:
+            reason = "further damage"
+        return Rejection(f"{self._name} ULog stream", reason)
 
     def _check_definitions(self, *, is_first: bool) -> Iterator[Rejection]:
         """Report messages without a definition once; reject a continued stream if a definition does not match."""
@@ -198,7 +213,8 @@ class LogStream:
         offset = vehicle_time / 1e9 - (now - round_trip / 2)
         tolerance = (round_trip + self._round_trip) / 2
         if round_trip <= self._round_trip or abs(offset - self._offset) > tolerance:
-            self._offset, self._round_trip = offset, round_trip
+            self._offset = offset
+            self._round_trip = round_trip
 
     def add_delay(self, timestamp: object, now: float) -> None:
         """Measure the age of a message that is published at time `now`, by the vehicle's clock."""
@@ -214,21 +230,25 @@ class LogStream:
         if status[:2] == self._logged[:2]:
             return
         self._logged = status
+        extra = about("log_stream", self._address)
         if status.state == "streaming":
-            header = self._client.header_seconds
-            text = f"; the log on the SD card lacks the {header or 0.0:.1f} s in which the header was sent"
-            if header is None:
-                text = "; it continues the one of an earlier process"
-            text, self._new_header = text if self._new_header else " again", False
-            extra = about("log_stream", self._address)
-            _log.info("vehicle %s: receiving the ULog stream%s", self._name, text, extra=extra)
+            text = f"vehicle %s: receiving the ULog stream{self._how_it_began()}"
+            _log.info(text, self._name, extra=extra)
         elif status.reason == "left":
-            _log.info(
-                "vehicle %s: %s", self._name, status.text, extra=about("log_stream", self._address)
-            )
+            _log.info("vehicle %s: %s", self._name, status.text, extra=extra)
         elif status.reason is not None:
             extra = about("log_stream", self._address, reason=status.text)
             _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)
+
+    def _how_it_began(self) -> str:
+        """Return what to add to the log of a stream that arrives."""
+        if not self._new_header:
+            return " again"
+        self._new_header = False
+        header = self._client.header_seconds
+        if header is None:
+            return "; it continues the one of an earlier process"
+        return f"; the log on the SD card lacks the {header:.1f} s in which the header was sent"
 
     def status(self, now: float) -> LogStreamStatus:
         """Return the status, with rate and delay measured since the last call."""
@@ -244,12 +264,24 @@ class LogStream:
             self._delayed = 0
         self._estimate_lost()  # a gap may precede the first message
         state = self._client.status
+        saved = ""
+        if self._file is not None and state.state != "refused":
+            saved = str(self._file.path)
         return LogStreamStatus(
-            vehicle=self._name, state=state.state, reason=state.text, received=self._received, rate=self._rate,
-            delay=self._delay, header_time=self._client.header_seconds, gaps=self._gaps, lost=self._lost,
-            lost_messages=self._lost_messages, undecodable=self._undecodable,
-            saved=str(self._file.path) if self._file and state.state != "refused" else "", unsaved=self._unsaved,
-        )  # fmt: skip
+            vehicle=self._name,
+            state=state.state,
+            reason=state.text,
+            received=self._received,
+            rate=self._rate,
+            delay=self._delay,
+            header_time=self._client.header_seconds,
+            gaps=self._gaps,
+            lost=self._lost,
+            lost_messages=self._lost_messages,
+            undecodable=self._undecodable,
+            saved=saved,
+            unsaved=self._unsaved,
+        )
 
     def leave(self) -> None:
         """Before `LogStreamClient.stop`: leave the stream of an armed vehicle running if its state is saved."""
@@ -264,9 +296,11 @@ class LogStream:
 
     def close(self) -> None:
         """Close the saved file."""
-        self._unsaved += self._pending_size if self._has_data else 0
+        if self._has_data:
+            self._unsaved += self._pending_size
         self._pending.clear()
-        self._pending_size, self._is_pending = 0, False
+        self._pending_size = 0
+        self._is_pending = False
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -288,7 +322,7 @@ class LogStream:
         given: Mapping[str, object] | None,
         now: float,
     ) -> SourceMessage:
-        address, definition = stream.address, stream.definition
+        address = stream.address
         self._streamed.add(address)
         lost = self._unreported
         self._unreported = 0
@@ -301,7 +335,7 @@ class LogStream:
             lost,
             False,
             None,
-            definition,
+            stream.definition,
             _SOURCE,
             dropout,
             stream,
@@ -313,11 +347,13 @@ class LogStream:
         self, stream: ulog.LoggedStream, payload: bytes
     ) -> Generator[Rejection, None, Mapping[str, object] | None]:
         """Return the fields of a message if they must be converted, and yield any new warnings about them."""
-        topic, reported = stream.subscription.name, len(stream.omitted)
+        topic = stream.subscription.name
+        reported = len(stream.omitted)
         given = stream.decode(payload) if stream.converted else None
         for name, reason in islice(stream.omitted.items(), reported, None):
             yield Rejection(f"{self._name} {topic}.{name}", reason, count=0)
-        if count := stream.subscription.layout.count_unset_bools(payload):
+        count = stream.subscription.layout.count_unset_bools(payload)
+        if count:
             reason = f"{ulog.UNSET_BOOLS.format(topic)} ({count} in the first such message)"
             yield Rejection(f"{self._name} {topic}", reason, count=0)
         return given
@@ -333,21 +369,28 @@ class LogStream:
 
         The number never decreases, so the others count only once the mean size is known.
         """
-        covered = _CHUNK_SIZE * self._lost / self._sizes.mean if self._sizes.is_known else 0.0
+        covered = 0.0
+        if self._sizes.is_known:
+            covered = _CHUNK_SIZE * self._lost / self._sizes.mean
         before = self._lost_messages
         self._lost_messages = max(self._lost_messages, round(self._gaps + covered))
         self._unreported += self._lost_messages - before
 
     def _save(self, chunk: Chunk, now: float) -> None:
         """Save a chunk; after an error stop saving, but continue publishing."""
-        gap = now - (self._last_chunk or now) if chunk.lost else 0.0
-        self._last_chunk, self._is_pending = now, self._is_pending or chunk.begins
+        gap = 0.0
+        if chunk.lost and self._last_chunk is not None:
+            gap = now - self._last_chunk
+        self._last_chunk = now
+        if chunk.begins:
+            self._is_pending = True
         if self._is_pending:
             self._pending.append((gap, chunk.data))
             self._pending_size += len(chunk.data)
-            if self._pending_size > limits.LOG_STREAM_PENDING:
+            limit = limits.LOG_STREAM_PENDING
+            if self._pending_size > limit:
                 self._stop_saving(
-                    f"the stream has more than {limits.LOG_STREAM_PENDING} bytes before its first message"
+                    f"the stream has more than {limit} bytes before its first message"
                 )
         elif self._file is not None:
             self._write(self._file, [(gap, chunk.data)])
@@ -377,37 +420,46 @@ class LogStream:
         for record in records:
             if isinstance(record, ulog.Data) and not self._has_data:
                 self._has_data = True
-                self.state.write(b"".join(data for _, data in [*self._pending][:-1]))
+                definitions = [data for _, data in self._pending]
+                self.state.write(b"".join(definitions[:-1]))  # the last chunk has the message
             elif isinstance(record, ulog.Subscription) and self._has_data:
-                body = struct.pack("<BH", record.multi_id, record.message_id) + record.name.encode()
-                self.state.append(struct.pack("<HB", len(body), ord("A")) + body)
-        if not (self._has_data and self._is_pending) or (self._folder and now < self._next_file):
+                self.state.append(_packed(record))
+        if not (self._has_data and self._is_pending):
+            return
+        if self._folder is not None and now < self._next_file:
             return
         pending = self._pending
         self._pending = deque()
-        self._is_pending = False
         self._pending_size = 0
-        if self._folder is None:
-            return
-        self._next_file = now + _FILE_INTERVAL
+        self._is_pending = False
+        if self._folder is not None:
+            self._next_file = now + _FILE_INTERVAL
+            self._open_file(self._folder, pending)
+
+    def _open_file(self, folder: Path, pending: Collection[tuple[float, bytes]]) -> None:
         try:
-            self._file = LogFile(self._folder, self._name)
+            self._file = LogFile(folder, self._name)
         except OSError as exc:
             self._unsaved += sum(len(data) for _, data in pending)
             self._stop_saving(str(OutputError(Path(exc.filename), exc)))
             return
         extra = about("log_stream", self._address)
-        _log.info(
-            "vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=extra
-        )
+        text = "vehicle %s: saving the ULog stream to %s"
+        _log.info(text, self._name, self._file.path, extra=extra)
         self._write(self._file, pending)
 
     def _stop_saving(self, reason: str) -> None:
         self.close()
         extra = about("log_stream", self._address, reason=reason)
-        _log.error(
-            "vehicle %s: stopped saving the ULog stream: %s", self._name, reason, extra=extra
-        )
+        text = "vehicle %s: stopped saving the ULog stream: %s"
+        _log.error(text, self._name, reason, extra=extra)
+
+
+def _packed(subscription: ulog.Subscription) -> bytes:
+    """Return the ULog record of a subscription."""
+    ids = struct.pack("<BH", subscription.multi_id, subscription.message_id)
+    body = ids + subscription.name.encode()
+    return struct.pack("<HB", len(body), ord("A")) + body
 
 
 class _MeanSize:
@@ -418,15 +470,17 @@ class _MeanSize:
     """
 
     def __init__(self) -> None:
-        self._count = self._sum = self._squares = 0
+        self._count = 0
+        self._sum = 0
+        self._squares = 0
         self.is_known = False
 
     def add(self, sizes: Iterable[int]) -> None:
         """Add the sizes of messages."""
         for size in sizes:
-            self._count = self._count + 1
-            self._sum = self._sum + size
-            self._squares = self._squares + size * size
+            self._count += 1
+            self._sum += size
+            self._squares += size * size
         if not self.is_known and self._count >= _MIN_SIZES:
             variance = max(0.0, self._squares / self._count - self.mean**2)
             self.is_known = math.sqrt(variance / self._count) <= _TOLERANCE * self.mean
@@ -457,21 +511,23 @@ class LogFile:
     def write(self, data: bytes) -> None:
         """Append bytes of the stream; only whole records reach the file."""
         self._partial += data
-        end, stop = 0, _FILE_HEADER if self._begins else 0
+        end = 0  # of the last complete record
+        stop = _FILE_HEADER if self._begins else 0
         while stop <= len(self._partial):
             end = stop
             stop += _RECORD_HEADER + int.from_bytes(self._partial[stop : stop + 2], "little")
-        self._begins = self._begins and not end
+        if end:
+            self._begins = False
         self._append(bytes(self._partial[:end]))
         del self._partial[:end]
 
     def mark_gap(self, seconds: float) -> None:
         """Discard the record that the gap truncated, and write a dropout of this duration."""
         self._partial.clear()
-        if not self._begins:
-            self._append(
-                _DROPOUT.pack(2, ord("O"), max(1, min(_LONGEST_DROPOUT, round(seconds * 1000))))
-            )
+        if self._begins:
+            return
+        milliseconds = max(1, min(_LONGEST_DROPOUT, round(seconds * 1000)))
+        self._append(_DROPOUT.pack(2, ord("O"), milliseconds))
 
     def _append(self, records: bytes) -> None:
         """Write complete records; if only a part can be written, remove it again."""

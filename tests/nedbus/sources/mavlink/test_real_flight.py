@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import common as dialect
 from pyulog import ULog
 
 from nedbus.mavlink.parser import new_parser
-from nedbus.mavlink.vehicle import STREAMS as REQUESTED, Vehicle
+from nedbus.mavlink.requests import STREAMS as REQUESTED
+from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, upgrade_with
 from tests.flights.messages import VLP
@@ -21,7 +22,7 @@ from tests.nedbus.sources.px4.test_real_flight import PX4, read_datagrams
 from tests.peers.px4_log_stream import STREAMS, datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
-TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
+TOPICS: Final = {topic for stream in REQUESTED.values() for topic in stream.topics} - {VLP}
 # s: maximum age of the logged value that equals a message without a timestamp
 UNTIMED_AGE: Final = 2.0
 STATUS_AGE: Final = 1.2  # s: ESTIMATOR_STATUS is sent once a second

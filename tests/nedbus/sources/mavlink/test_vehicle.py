@@ -14,8 +14,9 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.mavlink.fields import CONVERSIONS
 from nedbus.mavlink.parser import new_parser
+from nedbus.mavlink.requests import ORIGIN, STREAMS, request_rates
 from nedbus.mavlink.sequence import SequenceCounter
-from nedbus.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
+from nedbus.mavlink.vehicle import Vehicle
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
@@ -140,11 +141,7 @@ def test_only_needed_messages_are_requested_within_bandwidth(
     If the link cannot carry them, all but the position are reduced, to 2 Hz at the least, until 90 % of it are used.
     """
     rates = request_rates(rate, 57600, topics)
-    own = {
-        number: hertz or rate
-        for number, (_, hertz, of) in STREAMS.items()
-        if {*of.split()} & {*topics}
-    }
+    own = {number: hertz or rate for number, (_, hertz, of) in STREAMS.items() if of & {*topics}}
     if 230 in own:
         own[230] = max(2.0, rate)  # ESTIMATOR_STATUS, which has the flags
     least = {number: hertz if number == 32 else min(2.0, hertz) for number, hertz in own.items()}
@@ -159,7 +156,7 @@ def test_only_needed_messages_are_requested_within_bandwidth(
 
 def test_every_converted_topic_has_a_requested_message() -> None:
     """Each topic of CONVERSIONS is needed by a row of STREAMS, under the same name."""
-    needed = {topic for _, _, topics in STREAMS.values() for topic in topics.split()}
+    needed = {topic for stream in STREAMS.values() for topic in stream.topics}
     assert needed == {topic for topic, _ in CONVERSIONS.values()} <= TOPICS.keys()
 
 

@@ -22,7 +22,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 import nedbus
 from nedbus.doctor import examine
-from nedbus.mavlink.vehicle import Vehicle, request_rates
+from nedbus.mavlink.requests import request_rates
+from nedbus.mavlink.vehicle import Vehicle
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
 from nedbus.transport import Attachment, Session

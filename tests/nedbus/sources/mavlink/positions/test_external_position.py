@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus import VehicleLocalPosition, VehicleOdometry
-from nedbus.mavlink import MAX_AGE, MAX_RATE, UNKNOWN_VARIANCE, ExternalPosition
+from nedbus.mavlink import AGE_LIMIT, RATE_LIMIT, UNKNOWN_VARIANCE, ExternalPosition
 from nedbus.mavlink.external_position import Outcome, odometry_of
 from nedbus_msgs import codec_of
 
@@ -220,7 +220,7 @@ def test_rate_is_at_most_50_per_second() -> None:
     """Of 200 positions a second, 50 are sent; the others are counted."""
     core = ExternalPosition()
     play(core, [(each / 200, 100 + each / 200) for each in range(400)])
-    assert core.sent == pytest.approx(2 * MAX_RATE, abs=2)
+    assert core.sent == pytest.approx(2 * RATE_LIMIT, abs=2)
     assert core.sent + core.left_out["rate"] == 400
 
 
@@ -310,7 +310,7 @@ def test_nothing_is_stamped_ahead(messages: list[tuple[int, int, float]]) -> Non
         now += pause
         outcome = core.add(odometry(timestamp=stamp, timestamp_sample=sample), "a", now)
         if outcome.odometry is not None:
-            assert now - MAX_AGE - 1e-5 <= outcome.time_usec / 1e6 <= now
+            assert now - AGE_LIMIT - 1e-5 <= outcome.time_usec / 1e6 <= now
 
 
 @given(st.lists(st.tuples(st.floats(-1e5, 1e5), st.floats(0, 0.2)), min_size=1, max_size=50))

@@ -1,0 +1,42 @@
+"""The plan of a service: its sources, and the mistakes in its settings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from nedbus.daemon import plan_sources
+from nedbus.settings import load_settings
+
+ENDLESS = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
+
+
+@pytest.mark.parametrize(
+    ("settings", "mistakes"),
+    [
+        ({"source": ["sim:"], "until_done": True}, [f"until_done: {ENDLESS}"]),
+        ({"source": ["sim:", "sim:?duration=1&vehicle=2"], "until_done": True}, []),
+        ({"source": ["sim:"]}, []),
+        ({}, ["source: no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"]),
+        (
+            {"source": ["sim:"], "tls_certificate": "a.crt"},
+            ["tls_certificate: a certificate is set, but not the CA to trust; set both"],
+        ),
+    ],
+)  # fmt: skip
+def test_mistakes_name_the_setting(settings: dict[str, Any], mistakes: list[str]) -> None:
+    """A service without sources, or that never ends although it shall, and half of a TLS identity are mistakes."""
+    _, errors = plan_sources(load_settings(**settings), ["tcp/127.0.0.1:1"])
+    assert [str(error) for error in errors] == mistakes
+
+
+def test_order_and_texts_of_sources_are_kept() -> None:
+    """Each valid source is planned with its number in the settings, besides an invalid one."""
+    settings = load_settings(source=["sim:", "foo:", "sim:?vehicle=2"], vehicle="7")
+    plan, errors = plan_sources(settings, ["tcp/127.0.0.1:1"])
+    assert [(planned.index, planned.text, planned.vehicle) for planned in plan] == [
+        (0, "sim:", "7"),
+        (2, "sim:?vehicle=2", "7"),
+    ]
+    assert len(errors) == 1

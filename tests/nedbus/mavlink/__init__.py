@@ -1,0 +1,1 @@
+"""Conversion of MAVLink to PX4 messages, without links."""
