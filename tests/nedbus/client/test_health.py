@@ -88,7 +88,7 @@ def test_health_does_not_depend_on_when_it_is_read() -> None:
 def test_concurrent_add_does_not_break_a_snapshot() -> None:
     """A snapshot computes the jitter correctly even if another thread adds a message meanwhile."""
     stream = stream_at(0.0, 0.01, 0.02)
-    stream.snapshot(SECOND // 50)  # measures the messages
+    stream._measure()
     window = stream._window
     before = window.intervals
 
@@ -127,6 +127,28 @@ def test_silent_stream_has_age_but_no_rate() -> None:
     nothing = Health(None, 2.0, None, None, None, None, 0, 0, 0, 0, 0, None, None)
     assert dataclasses.replace(health, resets={}) == nothing
     assert set(health.resets.values()) == {0}
+
+
+def test_later_snapshot_differs_only_in_ages_and_rate() -> None:
+    """Without new messages, only age, reboot age, rate and jitter change; each snapshot has its own dictionaries."""
+    stream = stream_at(10.0, 10.5, boot=90.0)
+    stream.add(
+        message(20_000, xy_reset_counter=3),
+        received=11 * SECOND,
+        latency=0.5,
+        lost=3,
+    )
+    first = stream.snapshot(12 * SECOND)
+    again = dataclasses.asdict(first)
+    assert first.flags is not None
+    assert first.flags_ever is not None
+    for values in first.flags, first.flags_ever, first.resets:
+        values.clear()
+    changes = {"age": 9.0, "reboot_age": 9.0, "rate": None, "jitter": None}
+    assert (first.age, first.reboot_age, first.reboots) == (1.0, 1.0, 1)
+    assert first.rate is not None
+    assert dataclasses.asdict(stream.snapshot(20 * SECOND)) == again | changes
+    assert dataclasses.asdict(stream.snapshot(12 * SECOND)) == again
 
 
 @pytest.mark.parametrize(
