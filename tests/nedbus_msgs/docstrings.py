@@ -19,4 +19,5 @@ def printed_line(documented: object) -> str:
 
 def printed_inline(documented: object) -> str:
     """Return the last text in backticks in a docstring."""
-    return re.findall(r"`([^`]+)`", inspect.getdoc(documented) or "")[-1]
+    inline: list[str] = re.findall(r"`([^`]+)`", inspect.getdoc(documented) or "")
+    return inline[-1]
