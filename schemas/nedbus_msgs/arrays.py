@@ -50,18 +50,19 @@ class Arrays(Generic[M]):
     """
 
     def __init__(self, definition: Definition[M]) -> None:
-        self.definition = definition
         types = definition.types
+        codec = codec_of(definition)
+        size = codec.size
+        self.definition = definition
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
-        self._codec = codec_of(definition)
-        size = self._codec.size
+        self._codec = codec
         self._size = size
         self._from_wire = self._wire_offsets()
         self._windows = _windows_of(self._from_wire)
         self._to_wire = np.zeros(size, np.intp)
         self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
-        self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
-        self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
+        self._tags = np.frombuffer(codec.tags.to_bytes(size, "big"), np.uint8)
+        self._tag_mask = np.frombuffer(codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
 
         # A struct that unpacks only the fields with rules from an element, and an expression for each unpacked field.
@@ -166,13 +167,13 @@ class Arrays(Generic[M]):
 
     def of(self, messages: Sequence[M]) -> MessageArray:
         """Convert messages to a structured array."""
-        rows = [tuple(message.__dict__.values()) for message in messages]
-        return np.array([self.to_element(row) for row in rows], self.dtype)
+        elements = [self.to_element(tuple(message.__dict__.values())) for message in messages]
+        return np.array(elements, self.dtype)
 
     def absent(self, count: int) -> MessageArray:
         """Return `count` messages with every field "not provided": NaN, false or 0."""
         values = tuple(kind.absent for kind in self.definition.types.values())
-        return np.repeat(np.array([values], self.dtype), count)
+        return np.full(count, np.array(values, self.dtype))
 
     def to_row(self, element: np.void) -> Values:
         """Return the values of one element in PX4's order, arrays as tuples."""

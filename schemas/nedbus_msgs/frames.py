@@ -141,30 +141,42 @@ class DerivedField(NamedTuple):
     compute: Callable[..., Any]
 
 
-def _angle(index: int, scale: float) -> Callable[..., Any]:
-    return lambda functions, q: scale * _euler(functions, q)[index]
+def _angle(meaning: str, index: int, scale: float = 1.0) -> DerivedField:
+    """Return one of roll, pitch and yaw [rad], times a scale."""
+    return DerivedField(
+        meaning, ("q",), "", lambda functions, q: scale * _euler(functions, q)[index]
+    )
 
 
 _DEGREES: Final = 180.0 / math.pi
-_ROLL: Final = (
-    "roll about the forward axis, the last of the rotations yaw, pitch, roll from NED to body FRD"
-)
-_PITCH: Final = "pitch, positive nose up, within a quarter turn; after yaw and before roll"
-_YAW: Final = "yaw, clockwise from north; the first of the rotations from NED to body FRD"
 
 DERIVED: Final[Mapping[str, DerivedField]] = {
-    "height": DerivedField("-z, height above the origin of the local frame [m]", ("z",), "z_valid", lambda _, z: -z),
+    "height": DerivedField(
+        "-z, height above the origin of the local frame [m]",
+        ("z",),
+        "z_valid",
+        lambda _, z: -z,
+    ),
     "speed": DerivedField(
-        "horizontal speed, the norm of vx and vy [m/s]", ("vx", "vy"), "v_xy_valid",
+        "horizontal speed, the norm of vx and vy [m/s]",
+        ("vx", "vy"),
+        "v_xy_valid",
         lambda functions, vx, vy: functions.sqrt(vx * vx + vy * vy),
     ),
-    "roll": DerivedField(f"{_ROLL} [rad]", ("q",), "", _angle(0, 1.0)),
-    "pitch": DerivedField(f"{_PITCH} [rad]", ("q",), "", _angle(1, 1.0)),
-    "yaw": DerivedField(f"{_YAW} [rad]", ("q",), "", _angle(2, 1.0)),
-    "roll_deg": DerivedField("roll [deg]", ("q",), "", _angle(0, _DEGREES)),
-    "pitch_deg": DerivedField("pitch [deg]", ("q",), "", _angle(1, _DEGREES)),
-    "yaw_deg": DerivedField("yaw [deg]", ("q",), "", _angle(2, _DEGREES)),
-}  # fmt: skip
+    "roll": _angle(
+        "roll about the forward axis, the last of the rotations yaw, pitch, roll from NED to body FRD [rad]",
+        0,
+    ),
+    "pitch": _angle(
+        "pitch, positive nose up, within a quarter turn; after yaw and before roll [rad]", 1
+    ),
+    "yaw": _angle(
+        "yaw, clockwise from north; the first of the rotations from NED to body FRD [rad]", 2
+    ),
+    "roll_deg": _angle("roll [deg]", 0, _DEGREES),
+    "pitch_deg": _angle("pitch [deg]", 1, _DEGREES),
+    "yaw_deg": _angle("yaw [deg]", 2, _DEGREES),
+}
 """Quantities that tables and commands offer by name for each message with their fields."""
 
 

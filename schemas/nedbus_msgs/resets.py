@@ -24,14 +24,23 @@ Quantity = Literal["xy", "z", "vxy", "vz", "heading", "dist_bottom"]
 Point = tuple[float, ...]
 
 _VALUES: Final[Mapping[Quantity, tuple[str, ...]]] = {
-    "xy": ("x", "y"), "z": ("z",), "vxy": ("vx", "vy"), "vz": ("vz",), "heading": ("heading",),
+    "xy": ("x", "y"),
+    "z": ("z",),
+    "vxy": ("vx", "vy"),
+    "vz": ("vz",),
+    "heading": ("heading",),
     "dist_bottom": ("dist_bottom",),
-}  # fmt: skip
+}
 # The rates of change of each value in order of preference; dist_bottom falls by vz, and the heading has no rate.
 _RATES: Final[Mapping[str, tuple[str, ...]]] = {
-    "x": ("vx",), "y": ("vy",), "z": ("z_deriv", "vz"), "vx": ("ax",), "vy": ("ay",), "vz": ("az",),
+    "x": ("vx",),
+    "y": ("vy",),
+    "z": ("z_deriv", "vz"),
+    "vx": ("ax",),
+    "vy": ("ay",),
+    "vz": ("az",),
     "dist_bottom": ("vz",),
-}  # fmt: skip
+}
 RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" for name in _VALUES}
 """The field that counts the resets of each quantity, modulo 256."""
 
@@ -103,30 +112,29 @@ class ResetTracker:
 
         All tracks restart when the timestamp goes back by over a second, which counts as a reboot of the vehicle.
         """
-        last = self._last
+        last = self._last or message
         self._last = message
-        rebooted = last is not None and message.timestamp < last.timestamp - _REBOOT
-        origin_changed = last is not None and str(_read_origin(last)) != str(_read_origin(message))
+        rebooted = message.timestamp < last.timestamp - _REBOOT
+        origin_changed = str(_read_origin(last)) != str(_read_origin(message))
         reset: set[Quantity] = set()
         discontinued: set[Quantity] = set()
-        values: dict[str, float] = {}
-        for name, fields in _VALUES.items():
+        for name, counter in RESET_COUNTERS.items():
+            count = (getattr(message, counter) - getattr(last, counter)) % 256
             jump: Point | None = _no_jump(name)
             if rebooted:
                 jump = None
-            elif last is not None:
-                counter = RESET_COUNTERS[name]
-                count = (getattr(message, counter) - getattr(last, counter)) % 256
-                if count:
-                    reset.add(name)
-                    self._resets[name] += count
-                if count or (origin_changed and name in _FROM_ORIGIN):
-                    jump = jump_of(name, _by_name(last), _by_name(message))
+            elif count or (origin_changed and name in _FROM_ORIGIN):
+                jump = jump_of(name, _by_name(last), _by_name(message))
+            if count and not rebooted:
+                reset.add(name)
+                self._resets[name] += count
             if jump is None:
                 discontinued.add(name)
                 self._jumps[name] = _no_jump(name)
             elif any(jump):
                 self._jumps[name] = tuple(map(add, self._jumps[name], jump))
+        values: dict[str, float] = {}
+        for name, fields in _VALUES.items():
             for field, jumped in zip(fields, self._jumps[name], strict=True):
                 values[field] = getattr(message, field) - jumped
         values["heading"] = wrap(values["heading"])
@@ -163,7 +171,7 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
         after[value] - before[value] - distance
         for value, distance in zip(_VALUES[name], motion.distances, strict=True)
     )
-    if not all(map(math.isfinite, step)) or seconds <= 0:
+    if seconds <= 0 or not all(map(math.isfinite, step)):
         return announced[0] if announced else None
     if name == "heading":
         step = (wrap(step[0]),)

@@ -161,35 +161,30 @@ class Selection:
 
     def key_exprs(self, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
         """Return the Zenoh key expressions that match the keys of these addresses: one per vehicle and topic."""
-        streams = self._streams
-        return [f"{prefix}/{vehicle}/{stream}" for vehicle in self.vehicles for stream in streams]
+        return self._key_exprs(prefix, "")
 
     def alive_key_exprs(self, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
         """Return the key expressions that match the liveliness tokens of these addresses."""
-        streams = self._streams
-        return [
-            f"{prefix}/{vehicle}/@alive/*/{stream}"
-            for vehicle in self.vehicles
-            for stream in streams
-        ]
+        return self._key_exprs(prefix, "@alive/*/")
 
     def rate_key_exprs(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> list[str]:
         """Return the key expressions of these streams downsampled to `rate` messages/s; "*" matches any rate."""
         return [f"{key}{RATE}{rate}" for key in self.key_exprs(prefix=prefix)]
 
-    @property
+    def _key_exprs(self, prefix: str, kind: str) -> list[str]:
+        streams = self._streams()
+        return [
+            f"{prefix}/{vehicle}/{kind}{stream}" for vehicle in self.vehicles for stream in streams
+        ]
+
     def _streams(self) -> list[str]:
-        """The part of a key expression after the vehicle, for each topic."""
+        """Return the part of a key expression after the vehicle, for each topic."""
         if self.topics == (ANY,):
             return ["**"]
         if self.instance is not None:
             return [f"{topic}/{self.instance}" for topic in self.topics]
         any_instance = {True: f"/{ANY}", False: "", None: "/**"}
-        streams: list[str] = []
-        for topic in self.topics:
-            has_instances = get_topic(topic).instances
-            streams.append(f"{topic}{any_instance[has_instances]}")
-        return streams
+        return [f"{topic}{any_instance[get_topic(topic).instances]}" for topic in self.topics]
 
     def __str__(self) -> str:
         parts = []
@@ -322,10 +317,9 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
         path = path[:-2]
     namespace = "/".join(path)
     digits = None
-    if name not in TOPICS:
-        parts = _ROS2_TOPIC.fullmatch(name)
-        if parts:
-            name, digits = parts.groups()
+    parts = _ROS2_TOPIC.fullmatch(name)
+    if parts and name not in TOPICS:
+        name, digits = parts.groups()
     if digits is not None:
         return namespace, name, int(digits)
     return namespace, name, 0 if get_topic(name).instances else None

@@ -27,7 +27,7 @@ NewerLayouts = Mapping[int, Sequence[str]]
 
 
 class FullWidth(NamedTuple):
-    """The msgpack encoding of one field, or of a whole payload, at full width.
+    """The msgpack encoding of one field at full width.
 
     `tags`: its bytes with zeros for the values. `code`: the struct format of the values, without byte order.
     `bits`: the bit mask of the values. `offsets`: the offset of each value.
@@ -111,17 +111,28 @@ class Codec(Generic[M]):
 
     def __init__(self, definition: Definition[M]) -> None:
         self.definition = definition
-        form, self.offsets = _payload_form(definition.types, cast("int", definition.current.wire))
-        self.size = len(form.tags)
-        self.tags = int.from_bytes(form.tags, "big")
+        tags = struct.pack(">BHB", 0xDC, 1 + len(definition.types), definition.current.wire)
+        code = f">{len(tags)}x"
+        bits = bytes(len(tags))
+        offsets: list[tuple[str, int, int]] = []
+        for name, kind in definition.types.items():
+            field = full_width(kind)
+            for index, offset in enumerate(field.offsets):
+                offsets.append((name, index, len(tags) + offset))
+            tags += field.tags
+            code += field.code
+            bits += field.bits
+        self.offsets = tuple(offsets)
+        self.size = len(tags)
+        self.tags = int.from_bytes(tags, "big")
         all_bits = (1 << 8 * self.size) - 1
-        self.tag_mask = all_bits ^ int.from_bytes(form.bits, "big")
+        self.tag_mask = all_bits ^ int.from_bytes(bits, "big")
         self._validation = definition.validation
         self._flatten = self._validation.flatten
         self._by_name = self._validation.by_name
         self._all_fields = definition.all_fields
         self._make_row = definition.row
-        packed = struct.Struct(">" + form.code)
+        packed = struct.Struct(code)
         self.encode_flat = self._encoder(packed)
         self._decode_full_width = self._decoder(packed)
 
@@ -245,26 +256,6 @@ class Codec(Generic[M]):
 def codec_of(definition: Definition[M]) -> Codec[M]:
     """Return the cached codec of a message."""
     return Codec(definition)
-
-
-def _payload_form(
-    types: Mapping[str, FieldType], layout: int
-) -> tuple[FullWidth, tuple[tuple[str, int, int], ...]]:
-    """Return the encoding of a payload, and field, array index and offset of every value."""
-    head = struct.pack(">BHB", 0xDC, 1 + len(types), layout)
-    tags = head
-    code = f"{len(head)}x"
-    bits = bytes(len(head))
-    offsets: list[tuple[str, int, int]] = []
-    for name, kind in types.items():
-        field = full_width(kind)
-        for index, offset in enumerate(field.offsets):
-            offsets.append((name, index, len(tags) + offset))
-        tags += field.tags
-        code += field.code
-        bits += field.bits
-    form = FullWidth(tags, code, bits, tuple(offset for _, _, offset in offsets))
-    return form, tuple(offsets)
 
 
 def describe(error: ValidationError, definition: Definition[Any]) -> str:

@@ -87,7 +87,8 @@ def _compile(
                 and (not (abs(squared_norm(values[2:6]) - 1.000001) <= 0.0019999999999998352))))
             and values
 
-    Where a field is converted, or a type differs, the second `values` is `flatten(validate(unflatten((...,))))`.
+    Where a type differs, or a field is converted, the types are not proved: the second `values` is then
+    `flatten(validate(unflatten(values)))`, with the tuple of a `_Conversion` in place of `values` if there is one.
     """
     plan = definition.plan(tuple(types))
     validation = definition.validation

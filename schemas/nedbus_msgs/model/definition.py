@@ -184,17 +184,16 @@ class Definition(Generic[M_co]):
         """The named tuple class of this message."""
         positions = {name: index for index, name in enumerate(self.names)}
         members: dict[str, Any] = {
-            name: property(itemgetter(index)) for name, index in positions.items()
+            "DEFINITION": self,
+            "_fields": self.names,
+            "_positions": positions,
+            "__slots__": (),
         }
-        members |= {
-            name: member
-            for name, member in vars(self.model).items()
-            if isinstance(member, property)
-        }
-        members["DEFINITION"] = self
-        members["_fields"] = self.names
-        members["_positions"] = positions
-        members["__slots__"] = ()
+        for name, index in positions.items():
+            members[name] = property(itemgetter(index))
+        for name, member in vars(self.model).items():
+            if isinstance(member, property):
+                members[name] = member
         return type(f"{self.name}Row", (Row,), members)
 
     @cached_property
@@ -205,7 +204,7 @@ class Definition(Generic[M_co]):
 
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout with this name or of this PX4 release; None if there is none."""
-        if release in self.layouts or release not in RELEASES:
+        if release not in RELEASES:
             return self.layouts.get(release)
         until = RELEASES[: RELEASES.index(release) + 1]
         for earlier in reversed(until):
@@ -259,22 +258,25 @@ class Definition(Generic[M_co]):
     ) -> None:
         """Add the model's fields that receive the value of a field of older layouts."""
         for name, index in older.targets:
-            if index is not None and name not in copied:
-                if name not in converted:
-                    sources: list[str | None] = [None] * self.types[name].values
-                    converted[name] = FieldConversion(sources, _as_array)
-                converted[name].sources[index] = older.name
-            elif older.up and name not in copied:
+            if name in copied:
+                continue
+            if index is not None:
+                sources: list[str | None] = [None] * self.types[name].values
+                conversion = converted.setdefault(name, FieldConversion(sources, _as_array))
+                conversion.sources[index] = older.name
+            elif older.up:
                 converted.setdefault(name, FieldConversion([older.name], older.up))
             elif name not in converted:
-                copied.setdefault(name, older.name)
+                copied[name] = older.name
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
         """Convert the model's values to a layout, in its order; fields without a fitting value are "not provided"."""
         fields: dict[str, object] = {}
         for name, kind in layout.types.items():
             older = self.older.get(name)
-            value = values.get(name, kind.absent) if older is None else _older_value(older, values)
+            value = values.get(name, kind.absent)
+            if older is not None:
+                value = _older_value(older, values)
             is_integer = not kind.length and not kind.is_float
             if is_integer and self.types.get(name) != kind:
                 least, greatest = kind.limits
@@ -313,10 +315,9 @@ class Definition(Generic[M_co]):
     def explain_unknown_field(self, name: str) -> str:
         """Return the error text for an unknown field, with suggestions."""
         base, bracket, _ = name.partition("[")
+        similar = difflib.get_close_matches(name.lower(), self.names, 3, _CLOSE_NAME)
         if bracket and base in self.types:
             similar = [base]
-        else:
-            similar = difflib.get_close_matches(name.lower(), self.names, 3, _CLOSE_NAME)
         hint = f"'nedbus schema {self.name}' lists the fields"
         if similar:
             hint = f"did you mean {' or '.join(similar)}?"
@@ -363,13 +364,12 @@ class Definition(Generic[M_co]):
 
 def _types_of_model(model: type[Message]) -> dict[str, FieldType]:
     """Return PX4's type of each field of a model, which its annotation has."""
-    types: dict[str, FieldType] = {}
-    for name, field in model.__pydantic_fields__.items():
-        for mark in field.metadata:
-            if isinstance(mark, FieldType):
-                types[name] = mark
-                break
-    return types
+    return {
+        name: mark
+        for name, field in model.__pydantic_fields__.items()
+        for mark in field.metadata
+        if isinstance(mark, FieldType)
+    }
 
 
 def _as_array(*elements: object) -> tuple[object, ...]:
@@ -405,7 +405,7 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
         try:
             upgraded[name] = conversion.convert(*values)
         except (TypeError, OverflowError):  # not a number: the model rejects it
-            (upgraded[name],) = values
+            upgraded[name] = values[0]
     return upgraded
 
 

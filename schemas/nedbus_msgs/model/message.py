@@ -85,7 +85,7 @@ class Message(BaseModel):
                 raise
             types = cls.DEFINITION.types
             converted = {name: _to_python(value, types.get(name)) for name, value in fields.items()}
-            if all(converted[name] is value for name, value in fields.items()):
+            if all(map(operator.is_, converted.values(), fields.values())):
                 raise
         return validate(converted)
 
@@ -109,7 +109,7 @@ class Message(BaseModel):
         """Compare all fields; NaN equals NaN."""
         if not isinstance(other, Message) or other.DEFINITION is not self.DEFINITION:
             return NotImplemented
-        return all(_is_same(value, other.__dict__[name]) for name, value in self.__dict__.items())
+        return all(map(_is_same, self.__dict__.values(), other.__dict__.values()))
 
     def __hash__(self) -> int:
         return hash((self.timestamp, self.__dict__.get("timestamp_sample")))

@@ -130,13 +130,13 @@ def _compile_rounded_by_name(
 ) -> ByName:
     """Compile a function that rounds the values of a row, and assigns them to the items of a copied dict.
 
-    `flat`: the expression of the flattened values. For a time, an array and a text, the source is:
+    `flat`: the expression of the flattened values. For a time, a float32[2] and a text, the source is:
 
         def by_name(row):
          values = copy()
-         values['timestamp'], part1_0, part1_1, values['text'], = unpack(pack(*row[0:1], *row[1], ...))
+         values['t'], part1_0, part1_1, values['s'], = unpack(pack(*row[0:1], *row[1], encode_text(row[2]), *row[3:]))
          values['q'] = (part1_0, part1_1,)
-         values['text'] = decode_text(values['text'])
+         values['s'] = decode_text(values['s'])
          return values
     """
     targets: list[str] = []
@@ -203,16 +203,18 @@ def accessors_of(types: Mapping[str, FieldType]) -> dict[str, str]:
 def _flat_values(kinds: Sequence[FieldType]) -> str:
     """Return the expression of the flattened values of `row`, which has fields of these types.
 
-    For two times, a quaternion and a text: `*row[0:2], *row[2], *row[3:3], encode_text(row[3]), *row[4:]`.
+    For two times, a quaternion and a text: `*row[0:2], *row[2], encode_text(row[3]), *row[4:]`.
     """
     parts: list[str] = []
     begin = 0  # of the single values after the last array or text
     for position, kind in enumerate(kinds):
-        if kind.length is not None:
+        if kind.length is None:
+            continue
+        if begin < position:
             parts.append(f"*row[{begin}:{position}]")
-            value = f"row[{position}]"
-            parts.append(f"encode_text({value})" if kind.is_text else f"*{value}")
-            begin = position + 1
+        value = f"row[{position}]"
+        parts.append(f"encode_text({value})" if kind.is_text else f"*{value}")
+        begin = position + 1
     parts.append(f"*row[{begin}:]")
     return ", ".join(parts)
 
@@ -220,7 +222,7 @@ def _flat_values(kinds: Sequence[FieldType]) -> str:
 def _restored_values(kinds: Sequence[FieldType]) -> str:
     """Return the expression of the values of fields of these types, of which `row` has the flattened ones.
 
-    For two times, a quaternion and a text: `*row[0:2], row[2:6], *row[6:6], decode_text(row[6]), *row[7:]`.
+    For two times, a quaternion and a text: `*row[0:2], row[2:6], decode_text(row[6]), *row[7:]`.
     """
     parts: list[str] = []
     begin = 0  # of the single values after the last array or text
@@ -228,10 +230,12 @@ def _restored_values(kinds: Sequence[FieldType]) -> str:
     for kind in kinds:
         end = position + kind.values
         if kind.length is not None:
-            parts.append(f"*row[{begin}:{position}]")
-            parts.append(
-                f"decode_text(row[{position}])" if kind.is_text else f"row[{position}:{end}]"
-            )
+            if begin < position:
+                parts.append(f"*row[{begin}:{position}]")
+            restored = f"row[{position}:{end}]"
+            if kind.is_text:
+                restored = f"decode_text(row[{position}])"
+            parts.append(restored)
             begin = end
         position = end
     parts.append(f"*row[{begin}:]")

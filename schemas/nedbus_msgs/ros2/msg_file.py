@@ -114,6 +114,14 @@ class _Line(NamedTuple):
     name: str
     comment: str
 
+    @property
+    def elements(self) -> int | None:
+        """Number of nested messages in an array, 0 if it is no array; None for a length that is no number."""
+        if not self.length:
+            return 0
+        length = _LENGTH.fullmatch(self.length)
+        return int(length[1]) if length else None
+
 
 _Parts = Mapping[str, Mapping[str, _Line]]
 
@@ -162,22 +170,19 @@ def _parts(text: str) -> _Parts:
 
 def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[MsgField]:
     for line in parts[message].values():
-        is_nested = bool(parts.get(line.base)) and level < limits.MSG_NESTING
-        length = _LENGTH.fullmatch(line.length)
         name = prefix + line.name
-        if is_nested and length:
-            for index in range(int(length[1])):
-                yield from _flatten(parts, line.base, f"{name}_{index}_", level + 1)
-        elif is_nested and not line.length:
-            yield from _flatten(parts, line.base, f"{name}_", level + 1)
-        else:
+        is_nested = bool(parts.get(line.base)) and level < limits.MSG_NESTING
+        if not is_nested or line.elements is None:
             yield MsgField(name, _type_of(line), line.comment, line.number, line.column)
+            continue
+        prefixes = [f"{name}_{index}_" for index in range(line.elements)] or [f"{name}_"]
+        for nested_prefix in prefixes:
+            yield from _flatten(parts, line.base, nested_prefix, level + 1)
 
 
 def _describe(line: _Line, parts: Mapping[str, object], literal_char: bool) -> Mapping[str, object]:
-    length = _LENGTH.fullmatch(line.length)
-    if line.base in parts and (length or not line.length):
-        elements = int(length[1]) if length else 0
+    elements = line.elements
+    if line.base in parts and elements is not None:
         return describe_field(line.name, NESTED, elements, f"{PACKAGE}/{line.base}")
     elements = _type_of(line).length or 0
     return describe_field(line.name, TYPE_IDS[literal_char][line.base], elements)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 import struct
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,6 +27,8 @@ from nedbus_msgs import (
     field_type,
     record_encoder,
 )
+from nedbus_msgs.codecs import records
+from tests.nedbus_msgs.docstrings import printed_line
 
 LAYOUTS = [
     (definition, layout.types)
@@ -213,3 +217,19 @@ def test_fields_of_another_type_name_the_broken_rule() -> None:
             encode_upgraded(DEFAULT, {"timestamp": 1, "x": value})
     with pytest.raises(InvalidMessageError, match="timestamp: Field required"):
         encode_upgraded(DEFAULT, {"x": 1.0})
+
+
+def test_printed_encoder_of_records_is_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The docstrings show the function for a VehicleAttitude, and the conversion of a position of PX4 1.15."""
+    sources: list[str] = []
+    monkeypatch.setattr(records, "compile_lambda", lambda text, **_: sources.append(text))
+    attitude = MESSAGES["VehicleAttitude"]
+    records._compile(attitude, attitude.types)
+    assert sources == [printed_line(records._compile)]
+    conversion = records._Conversion(DEFAULT, DEFAULT.layouts["1.15"].types)
+    assert conversion.text == printed_line(records._Conversion)
+    types = {**attitude.types, "timestamp": field_type("uint32")}
+    records._compile(attitude, types)
+    converted = re.search(r"`(flatten[^`]*)`", inspect.getdoc(records._compile) or "")
+    assert converted is not None
+    assert f"(values := {converted[1]})" in sources[1]

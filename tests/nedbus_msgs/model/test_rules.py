@@ -13,7 +13,9 @@ import nedbus
 from nedbus_msgs import MESSAGES
 from nedbus_msgs.arrays import arrays_of
 from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
+from nedbus_msgs.model import rules
 from tests.flights.ulogs import LOGS
+from tests.nedbus_msgs.docstrings import printed_line
 from tests.peers.command_line import run_command
 
 SHARED: Final = LOGS.parents[1]
@@ -159,3 +161,16 @@ def test_no_message_of_a_real_flight_is_rejected(tmp_path: Path, path: Path) -> 
     """All messages of a real flight are valid, on hardware and in simulation, from PX4 1.11 to main."""
     result = run_command("convert", str(path), str(tmp_path / "a.mcap"), "--topics", "*")
     assert (result.exit_code, "rejected" in result.out + result.err) == (0, False), result
+
+
+def test_printed_rules_are_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The docstrings show the expression of two rules, and the first check on columns."""
+    finite, not_negative = rules.FiniteWhile(z_valid="z"), rules.NotNegative("eph", "epv")
+    names = ["timestamp", "z_valid", "x", "z", "eph", "epv"]
+    accessors = {name: f"values[{index}]" for index, name in enumerate(names)}
+    expression = rules.expression_of([finite, not_negative], accessors)
+    assert expression == printed_line(rules.expression_of)
+    sources: list[str] = []
+    monkeypatch.setattr(rules, "compile_lambda", lambda text, **_: sources.append(text))
+    rules.column_checks([finite, not_negative])
+    assert sources[0] == printed_line(rules.column_checks)
