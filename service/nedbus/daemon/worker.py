@@ -367,7 +367,10 @@ class Worker:
         self._state = state
         self._error = reason
         text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
-        _log.info("%s: %s", self._name, text, extra=about(state, source=self._name, reason=reason))
+        event = "done"
+        if state == "failed":
+            event = "failed"
+        _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
     def _fail(self, error: BaseException) -> None:
         """Log and store the reason; release all addresses, because another source may use them during the backoff."""
