@@ -171,32 +171,19 @@ def _decode_table(
         if name in plan.names:
             decoded.absent[name] = converted.absent
     for name, old in plan.names.items():
-        messages[name] = columns[old]
+        messages[name] = columns[old]  # fits: readers convert or refuse types of no layout
     for name, (olds, convert) in plan.converted.items():
         unknown = np.full(len(table), np.nan)
         parts = [unknown if old is None else columns[old] for old in olds]
         rows = zip(*(part.tolist() for part in parts), strict=True)
         messages[name] = [convert(*values) for values in rows]
     decoded.valid[:] = arrays_of(definition).valid_mask(messages)
-    for name, old in plan.names.items():
-        decoded.valid[_is_out_of_range(messages[name], columns[old])] = False
     for name in stream.strict_bools & columns.keys():
         is_no_bool = columns[name].astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
-        decoded.valid[_any_in_message(is_no_bool)] = False
+        # of any element, if the field is an array
+        is_invalid = is_no_bool.reshape(len(table), -1).any(axis=1)
+        decoded.valid[is_invalid] = False
     return decoded
-
-
-def _is_out_of_range(values: npt.NDArray[Any], logged: npt.NDArray[Any]) -> _Mask:
-    """Return the messages in which an integer of another type in the file does not fit into that of the field."""
-    if values.dtype.kind not in "iu" or values.dtype == logged.dtype:
-        return np.zeros(len(values), bool)
-    return _any_in_message(values != logged)
-
-
-def _any_in_message(mask: npt.NDArray[Any]) -> _Mask:
-    """Return the messages that have any true element, whether or not the field is an array."""
-    by_message: _Mask = np.any(mask.reshape(len(mask), -1), axis=1)
-    return by_message
 
 
 class _Converted(NamedTuple):

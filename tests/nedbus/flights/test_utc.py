@@ -102,3 +102,32 @@ def test_most_timestamps_of_all_streams_decide_their_clock() -> None:
     estimate.add("first", {"timestamp": np.arange(3) + 1_000_000})
     estimate.add("second", {"timestamp": np.arange(1000) * 1_000_000 + 1_700_000_000_000_000})
     assert estimate.result() == nedbus.UtcOffset("timestamp", 0, 1000, 0)
+
+
+def gnss_sample(vehicle: str, offset: int, *, missing: frozenset[str] = frozenset()) -> Any:
+    """Return a message of a receiver; `offset`: its UTC minus its timestamp [us]."""
+    fields = {"timestamp": 1_000_000, "time_utc_usec": offset + 1_000_000}
+    sent = nedbus.SensorGps.model_validate(fields)
+    provenance = Provenance("mavlink", missing)
+    return nedbus.Sample(sent, Address(vehicle, "sensor_gps", 0), 0, provenance=provenance)
+
+
+def test_utc_of_samples_is_that_of_the_vehicle_and_of_provided_fields() -> None:
+    """Samples of other vehicles do not count, and a field that the source does not provide is no UTC."""
+    samples = [gnss_sample("1", BOOT_UTC), gnss_sample("2", BOOT_UTC + 5_000_000)]
+    found = nedbus.utc_of(samples, vehicle="2")
+    assert found is not None
+    assert found.offset_us == BOOT_UTC + 5_000_000
+    assert nedbus.utc_of([gnss_sample("1", BOOT_UTC, missing=frozenset({"time_utc_usec"}))]) is None
+
+
+def test_open_flight_has_the_utc_of_a_short_file(tmp_path: Path) -> None:
+    """The UTC of an open flight, which its first pass notes on the way, is that of `utc_of`."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for number in range(10):
+            sample = gnss_sample("1", BOOT_UTC)
+            writer.write_messages([(sample.message, sample.address, Provenance(), number)])
+    with nedbus.open(path) as flight:
+        assert flight.utc == nedbus.utc_of(path)
+        assert flight.utc is not None

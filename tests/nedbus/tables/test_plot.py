@@ -216,6 +216,17 @@ def test_events_are_marked_by_severity() -> None:
     assert not marks_of(others["track"], "x")
 
 
+def test_event_far_from_all_positions_is_not_on_the_track() -> None:
+    """An event in a pause of the positions has no place on the track, only on the time axes."""
+    address, array = flight_of()
+    array["timestamp"][50:] += 20_000_000
+    lost = event_of("gps_fix_lost", "once", "bad", 15.0)
+    parts = drawn([(address, array)], [lost, event_of("failsafe", "once", "bad", 6.5)])
+    assert [x for x, _ in marks_of(parts["altitude"], "x")] == [5.5, 14.0]
+    [(east, north)] = marks_of(parts["track"], "x")
+    assert (east, north) == pytest.approx((0.0, 4.9))
+
+
 @pytest.mark.parametrize(
     ("offsets", "ticks", "label"),
     [

@@ -20,8 +20,8 @@ from nedbus import tables
 from nedbus.errors import AddressError, ArgumentError, ConfigError, SourceError
 from nedbus.flights import RecordingWriter
 from nedbus.flights.readers.mcap import McapReader
-from nedbus_msgs import DEFAULT, Address, Provenance, VehicleLocalPosition
-from nedbus_msgs.arrays import DTYPE, to_array, to_message
+from nedbus_msgs import DEFAULT, MESSAGES, Address, Provenance, VehicleLocalPosition
+from nedbus_msgs.arrays import DTYPE, arrays_of, to_array, to_message
 from nedbus_msgs.frames import MapProjection
 from tests.flights.local_position import FIELD_TYPES, upgrade
 from tests.flights.messages import VLP, message
@@ -563,3 +563,40 @@ def test_plot_that_cannot_be_drawn_exits_with_an_error(
     assert plot.exit_code == exit_code
     assert reason in plot.err
     assert "Traceback" not in plot.err
+
+
+def test_integers_of_every_layout_fit_into_the_array() -> None:
+    """Columns are copied without a check of their range, because no layout has a wider integer than the newest one."""
+    for definition in MESSAGES.values():
+        array = arrays_of(definition).absent(0)
+        for layout in definition.layouts.values():
+            for name, old in definition.plan(tuple(layout.types)).names.items():
+                target = array.dtype[name].base
+                if target.kind in "iu":
+                    logged = np.dtype(layout.types[old].base)
+                    assert np.can_cast(logged, target), (definition.name, layout.name, name)
+
+
+def test_messages_of_two_subscriptions_are_in_the_order_of_the_file(tmp_path: Path) -> None:
+    """A log may subscribe to a topic again, and write the messages of both in turn."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    writer.add(VLP, message(1_000_000))
+    writer.put("A", struct.pack("<BH", 0, 1) + VLP.encode())
+    for stamp, number in ((2_000_000, 1), (3_000_000, 1), (4_000_000, 0), (5_000_000, 1)):
+        writer._ids[VLP, 0] = number
+        writer.add(VLP, message(stamp))
+    read = nedbus.read(writer.write(tmp_path / "a.ulg"))
+    assert (read["timestamp"] // 1_000_000).tolist() == [1, 2, 3, 4, 5]
+
+
+def test_topic_that_only_the_file_defines_means_its_first_instance(tmp_path: Path) -> None:
+    """Its first instance has no number, so the topic alone selects it; a number selects another one."""
+    writer = UlogWriter()
+    writer.put("F", b"own_topic:uint64_t timestamp;int32_t value;")
+    for instance in (0, 1):
+        writer.put("A", struct.pack("<BH", instance, instance) + b"own_topic")
+        writer.put("D", struct.pack("<HQi", instance, 1_000_000, 10 + instance))
+    path = writer.write(tmp_path / "a.ulg")
+    assert nedbus.read(path, "own_topic")["value"].tolist() == [10]
+    assert nedbus.read(path, "own_topic", instance=1)["value"].tolist() == [11]

@@ -131,6 +131,22 @@ def tracks_of(sim: SimulatedFleet) -> dict[Address, Track]:
     }
 
 
+def test_track_is_a_ring_with_a_line_per_state() -> None:
+    """Doubtful positions are on another line; a gap follows the newest point, and the first slot is repeated last."""
+    history = History(size=4, step=0.1)
+    for number in range(3):
+        point = dict.fromkeys(COLUMNS, 0.0)
+        point |= {"east": number, "north": 10 + number, "doubtful": float(number == 1)}
+        history.write([point[name] for name in COLUMNS])
+    tracks = Tracks()
+    tracks.update({Address("1", VLP): Track(history, 0)})
+    nan = math.nan
+    lines = {name: np.array(tracks.source.data[name]) for name in ("east", "valid0", "doubtful")}
+    assert lines["east"] == pytest.approx([0, 1, 2, nan, nan, nan, 0, nan], nan_ok=True)
+    assert lines["valid0"] == pytest.approx([10, nan, 12, nan, nan, nan, 10, nan], nan_ok=True)
+    assert lines["doubtful"][:3] == pytest.approx([nan, 11, nan], nan_ok=True)
+
+
 def test_tracks_send_only_new_points(sim: SimulatedFleet) -> None:
     """An update patches only the new points and the gap; without a new point it sends nothing."""
     tracks, document, plot = Tracks(), Document(), figure()

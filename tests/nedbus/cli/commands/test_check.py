@@ -71,8 +71,9 @@ def test_mistake_of_a_file_that_is_given_twice_is_reported_once(tmp_path: Path) 
     """The same file under two arguments has the same mistakes."""
     file = tmp_path / "nedbus.toml"
     file.write_text("conect = 1\n")
-    [line] = check("--offline", file, file)
-    assert line.startswith(f"{file}, line 1, column 1: unknown setting 'conect'")
+    lines = check("--offline", file, file)
+    assert lines[0].startswith(f"{file}, line 1, column 1: unknown setting 'conect'")
+    assert lines == check("--offline", file)
 
 
 def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
