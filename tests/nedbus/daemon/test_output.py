@@ -113,6 +113,7 @@ def test_stalest_address_is_replaced_at_the_limit() -> None:
     for number in range(1500):
         fake.receive(1, Address(f"v{number}", VLP))
     assert Address("v1499", VLP) in fake.output.addresses
+    assert Address("v1490", VLP) in fake.output.stale
     assert 990 <= len(fake.output.addresses + fake.output.stale) <= 1000
     assert not fake.output.rejected
 
