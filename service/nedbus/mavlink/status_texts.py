@@ -61,13 +61,13 @@ class StatusTexts:
             self._finish(_GAP)
         if message.chunk_seq > self._next:
             self._data += _GAP.encode()
-        chunk, end, _ = _raw_text(message).partition(b"\0")
+        chunk, _, _ = _raw_text(message).partition(b"\0")
         self._data += chunk  # of at most 256 chunks
         self._severity = severity
         self._id = message.id
         self._next = message.chunk_seq + 1
         self._time = now
-        has_more = message.id and len(chunk) == _CHUNK and not end
+        has_more = message.id and len(chunk) == _CHUNK
         if not has_more:
             self._finish()
 

@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 
 import nedbus
+from nedbus import limits
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
@@ -115,6 +116,19 @@ def test_stalest_address_is_replaced_at_the_limit() -> None:
     assert Address("v1499", VLP) in fake.output.addresses
     assert 990 <= len(fake.output.addresses + fake.output.stale) <= 1000
     assert not fake.output.rejected
+
+
+def test_oldest_stale_address_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of several stale addresses, the one that has been stale longest is replaced, and the others stay."""
+    monkeypatch.setattr(limits, "LIVE_ADDRESSES", 3)
+    fake = FakeOutput()
+    first, second, third, fourth = (Address(f"v{number}", VLP) for number in range(4))
+    fake.receive(1, first)
+    fake.receive(1, second)
+    fake.receive(10, third)
+    assert fake.output.stale == [first, second]
+    fake.receive(1, fourth)
+    assert fake.output.stale == [second]
 
 
 def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:

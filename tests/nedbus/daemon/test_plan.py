@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from nedbus.daemon import plan_sources
+from nedbus.daemon import Daemon, plan_sources
 from nedbus.settings import load_settings
+from nedbus_msgs import Address
 
 ENDLESS = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
 
@@ -40,3 +42,21 @@ def test_order_and_texts_of_sources_are_kept() -> None:
         (2, "sim:?vehicle=2", "7"),
     ]
     assert len(errors) == 1
+
+
+def test_vehicle_with_two_publishers_is_a_duplicate() -> None:
+    """A position that another service publishes, too, is a duplicate in the event log, whatever its state is."""
+    main, other = Address("1", "vehicle_local_position"), Address("2", "vehicle_local_position")
+    updates = list[dict[Address, str]]()
+    fake: Any = Daemon(load_settings(source=["sim:"]), version="1")
+    fake._registry = SimpleNamespace(publishers={main: None}, shared_vehicles=lambda: {"1"})
+    fake.event_log = SimpleNamespace(
+        vehicles={"1": SimpleNamespace(main=main), "2": SimpleNamespace(main=other)},
+        update=lambda _, states, **__: updates.append(states),
+    )
+    measures = SimpleNamespace(
+        states={str(main): "ok", str(other): "slow"},
+        status=SimpleNamespace(dropped=0, overload=""),
+    )
+    fake.update_events([measures])
+    assert updates == [{main: "duplicate", other: "slow"}]

@@ -717,6 +717,19 @@ def test_multicopter_is_no_vtol(kind: int, is_vtol: bool) -> None:
     assert ("is_vtol" in handle(vehicle, heartbeat, 101.0).fields) == is_vtol
 
 
+@pytest.mark.parametrize(("silence", "is_known"), [(2.9, True), (3.1, False)])
+def test_silence_discards_the_state(vehicle: Vehicle, silence: float, is_known: bool) -> None:
+    """After 3 s without a message all is requested again, and the origin of before is unknown."""
+    vehicle.count_lost(0, 100.0)
+    vehicle.handle(dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4), 100.0)
+    first = [vehicle.next_request(100.0) for _ in range(3 * len([*NEEDED, ORIGIN]))]
+    assert vehicle.next_request(100.0) is None
+    vehicle.count_lost(0, 100.0 + silence)
+    fields = estimate(vehicle, 1000, 100.0 + silence)
+    assert ("ref_lat" in fields) == is_known
+    assert vehicle.next_request(100.0 + silence) == (None if is_known else first[0])
+
+
 def test_origin_beyond_the_antimeridian_is_kept(vehicle: Vehicle) -> None:
     """PX4 up to 1.15 sends an origin east of 180 degrees."""
     vehicle.handle(dialect.MAVLink_gps_global_origin_message(-170_000_000, 1_800_000_100, 0), 100.0)

@@ -144,6 +144,16 @@ def test_contiguous_data_is_joined() -> None:
     assert join_data(lost_data) == lost_data
 
 
+def test_data_of_another_address_and_acknowledged_data_is_not_joined() -> None:
+    """Data from another address may be of another stream; acknowledged data may wait longer than other data."""
+    stranger = received(b"cd")._replace(peer="stranger")
+    for items in (
+        [received(b"ab"), stranger],
+        [received(b"ab", message=ACKED), received(b"cd", message=ACKED)],
+    ):
+        assert join_data(items) == items
+
+
 @pytest.mark.parametrize(
     ("offsets", "offset"), [((0, 1), 0), ((255, 1), 4), ((255, 255), 258), ((2, 255), 2)]
 )

@@ -162,6 +162,19 @@ def test_damaged_messages_of_ignored_senders_are_no_damage() -> None:
             assert len([*parse(new_parser(), bytes(frame), "link", None, 0)]) == is_damage
 
 
+@pytest.mark.parametrize(("component", "is_damage"), [(1, True), (100, False)])
+def test_damaged_signed_messages_of_ignored_senders_are_no_damage(
+    component: int, is_damage: bool
+) -> None:
+    """The sender of a damaged message with a signature is known, too."""
+    encoder = dialect.MAVLink(None, 9, component)
+    encoder.signing.secret_key = bytes(32)
+    encoder.signing.sign_outgoing = True
+    frame = bytearray(position(1).pack(encoder))
+    frame[12] ^= 1  # of the payload
+    assert len([*parse(new_parser(), bytes(frame), "link", None, 0)]) == is_damage
+
+
 @pytest.mark.parametrize(
     ("autopilot", "author"),
     [(PX4, "PX4"), (ARDUPILOT, "ArduPilot"), (dialect.MAV_AUTOPILOT_PPZ, "autopilot"), (0, "PX4")],

@@ -163,6 +163,18 @@ def test_packet_that_came_twice_is_marked() -> None:
         assert counter.link == 0
 
 
+@pytest.mark.parametrize("behind", range(1, 9))
+def test_late_copy_is_marked(behind: int) -> None:
+    """A copy of a packet that up to eight others of its link overtook is neither a restart nor another link."""
+    counter = SequenceCounter()
+    for number in range(100):
+        assert counter.add(number, 100 + number / 100) == 0
+    assert counter.add(99 - behind, 101.0) == 0
+    assert counter.link == REPEATED
+    assert counter.add(100, 101.0) == 0
+    assert counter.link == 0
+
+
 ORDERS = {
     "one packet overtakes two": [*range(200), 202, 200, 201, *range(203, 600)],
     "two swap": [*range(200), 201, 200, *range(202, 600)],
