@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# node-mavlink 2.3.0, 2026-11-29: a .tlog that is read as a stream loses frames, here those whose record is split between two of
-# the stream's blocks of 64 KiB. Given the same file as one block, the splitter delivers all of them.
+# node-mavlink 2.3.0, 2026-11-29: a .tlog that is read as a stream loses some of the frames that lie across two of the stream's
+# blocks of 64 KiB. Given the same file as one block, the splitter delivers all of them.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
