@@ -25,7 +25,8 @@ class Decision:
 
     def __str__(self) -> str:
         if not self.is_default:
-            return f"rule {self.rules[0]} {'allows' if self.is_allowed else 'denies'} it"
+            verb = "allows" if self.is_allowed else "denies"
+            return f"rule {self.rules[0]} {verb} it"
         if self.is_allowed:
             return "no rule denies it"
         if not self.rules:
@@ -65,32 +66,33 @@ class AccessControl:
         """Parse `access_control` and `low_pass_filter` of a configuration that Zenoh has accepted."""
         self.is_enabled: bool = section["enabled"]
         self._is_allowed_by_default = section["default_permission"] == "allow"
+        # A limit of sizes has messages, flows and key expressions like a rule.
+        self._size_limits = [_parse_rule(limit) for limit in filters]
         rules = {rule["id"]: _parse_rule(rule) for rule in section["rules"] or ()}
         self._rules = defaultdict[str, list[AccessRule]](list)  # by subject
         for policy in section["policies"] or ():
             for subject in policy["subjects"]:
                 self._rules[subject] += [rules[name] for name in policy["rules"] if name in rules]
-        # by common name; None: those of every certificate
-        self._subjects = defaultdict[str | None, list[str]](list)
+        self._common: list[str] = []  # subjects of every certificate
+        self._subjects = defaultdict[str, list[str]](list)  # of one, by its common name
         for subject in section["subjects"] or ():
-            for certificate in subject["cert_common_names"] or (None,):
+            if not subject["cert_common_names"]:
+                self._common.append(subject["id"])
+                continue
+            for certificate in subject["cert_common_names"]:
                 self._subjects[certificate].append(subject["id"])
-        self._limited = [
-            zenoh.KeyExpr(key)
-            for rule in filters
-            if "put" in rule["messages"] and "ingress" in (rule["flows"] or _BOTH_FLOWS)
-            for key in rule["key_exprs"]
-        ]
 
     @property
     def certificates(self) -> list[str]:
         """The common names in the configuration, in its order."""
-        return [name for name in self._subjects if name is not None]
+        return list(self._subjects)
 
     def rules_of(self, certificate: str) -> list[AccessRule]:
         """Return the rules that apply to the certificate with this common name."""
-        subjects = [*self._subjects.get(None, ()), *self._subjects.get(certificate, ())]
-        return [rule for subject in subjects for rule in self._rules.get(subject, ())]
+        rules: list[AccessRule] = []
+        for subject in (*self._common, *self._subjects.get(certificate, ())):
+            rules += self._rules.get(subject, ())
+        return rules
 
     def decide(self, certificate: str, message: str, flow: Flow, key: str) -> Decision:
         """Return what the router does with a message of a certificate: `message` and `flow` as in its rules.
@@ -102,22 +104,25 @@ class AccessControl:
         wanted = zenoh.KeyExpr(key)
         rules = [rule for rule in self.rules_of(certificate) if rule.is_for(message, flow)]
         including = [rule for rule in rules if rule.includes(wanted)]
-        for rule in including:
-            if not rule.is_allowed:
-                return Decision(is_allowed=False, rules=(rule.name,))
-        if including:
-            return Decision(is_allowed=True, rules=(including[0].name,))
-        names = tuple(rule.name for rule in rules)
-        return Decision(self._is_allowed_by_default, names, is_default=True)
+        if not including:
+            names = tuple(rule.name for rule in rules)
+            return Decision(self._is_allowed_by_default, names, is_default=True)
+        deciding = min(including, key=lambda rule: rule.is_allowed)
+        return Decision(deciding.is_allowed, (deciding.name,))
 
     def limits_size(self, key: str) -> bool:
         """Return whether the router limits the size of messages that clients put on this key."""
         wanted = zenoh.KeyExpr(key)
-        return any(own.includes(wanted) for own in self._limited)
+        return any(
+            limit.is_for("put", "ingress") and limit.includes(wanted) for limit in self._size_limits
+        )
 
 
 def _parse_rule(rule: Mapping[str, Any]) -> AccessRule:
-    is_allowed = rule["permission"] == "allow"
-    flows = tuple(rule["flows"] or _BOTH_FLOWS)
-    key_exprs = tuple(zenoh.KeyExpr(key) for key in rule["key_exprs"])
-    return AccessRule(rule["id"], is_allowed, flows, tuple(rule["messages"]), key_exprs)
+    return AccessRule(
+        name=rule["id"],
+        is_allowed=rule.get("permission") == "allow",
+        flows=tuple(rule["flows"] or _BOTH_FLOWS),
+        messages=tuple(rule["messages"]),
+        key_exprs=tuple(map(zenoh.KeyExpr, rule["key_exprs"])),
+    )

@@ -56,16 +56,16 @@ class FleetTokens:
     @property
     def complete(self) -> bool:
         """True if all tokens are known."""
-        return (
-            not self._excluded
-            and not self.is_listing
-            and (self._tokens.is_listing or self._tokens.complete)
-        )
+        if self._excluded or self.is_listing:
+            return False
+        return self._tokens.is_listing or self._tokens.complete
 
     @property
     def is_listing(self) -> bool:
         """True until the router has listed all tokens, except those of excluded vehicles."""
-        return bool(self._survey) or (self._tokens.is_listing and not self._is_surveyed)
+        if self._survey:
+            return True
+        return self._tokens.is_listing and not self._is_surveyed
 
     def undeclare(self) -> None:
         """End the subscription, and close its session."""
@@ -73,44 +73,58 @@ class FleetTokens:
 
     def poll(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, like LivelinessTokens."""
-        tokens = [reply.ok for query in self._survey for reply in query.poll()]
-        listed = [(str(token.key_expr), True) for token in tokens if token is not None]
-        changes = [
-            change
-            for change in (listed if self._survey else self._tokens.poll())
-            if self._apply(*change)
-        ]
+        changes = [change for change in self._receive() if self._apply(*change)]
+        if changes:
+            crowded = self._crowded()
+            if crowded:
+                return changes + self._exclude(crowded)
         now = time.monotonic()
-        crowded = (
-            {name for name, number in self._numbers.items() if number > limits.TOKENS_OF_VEHICLE}
-            if changes
-            else set()
-        )
-        if crowded and len(self._key_exprs(self._excluded | crowded)) <= limits.EXCLUDING_KEY_EXPRS:
-            text = "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
-            _log.warning(
-                text,
-                ", ".join(map(repr, sorted(crowded))),
-                limits.TOKENS_OF_VEHICLE,
-                extra=about("incomplete"),
-            )
-            self._excluded |= crowded
-            self._retry = now + TIMINGS.excluded
-            gone = [(key, False) for key in self._keys if self._vehicle_of(key) in crowded]
-            changes += [change for change in gone if self._apply(*change)]
-            self._restart(self._subscribe)
-        elif self._survey and all(query.ended for query in self._survey):
-            is_complete = len(self._keys) < limits.REPLIES and not any(
-                query.failed for query in self._survey
-            )
-            self._restart(partial(self._subscribe, is_surveyed=is_complete))
-            self._slow = math.inf  # no vehicle has too many
+        if self._survey and all(query.ended for query in self._survey):
+            self._end_survey()
         elif self._tokens.is_listing and now > self._slow:
             self._restart(self._query)
         elif now > self._retry:
-            self._excluded, self._retry = set(), math.inf
+            self._excluded = set()
+            self._retry = math.inf
             self._restart(self._subscribe)
         return changes
+
+    def _receive(self) -> list[tuple[str, bool]]:
+        """Return the changes of the subscription, or the tokens that the survey lists."""
+        if not self._survey:
+            return self._tokens.poll()
+        replies = [reply for query in self._survey for reply in query.poll()]
+        return [(str(reply.ok.key_expr), True) for reply in replies if reply.ok is not None]
+
+    def _crowded(self) -> set[str]:
+        """Return the vehicles to exclude now: those above the limit, if few key expressions exclude them."""
+        limit = limits.TOKENS_OF_VEHICLE
+        crowded = {vehicle for vehicle, number in self._numbers.items() if number > limit}
+        if crowded and len(self._key_exprs(self._excluded | crowded)) > limits.EXCLUDING_KEY_EXPRS:
+            return set()
+        return crowded
+
+    def _exclude(self, crowded: set[str]) -> list[tuple[str, bool]]:
+        """Exclude vehicles; return the ends of their tokens."""
+        text = (
+            "the streams of %s are not listed: over %d liveliness tokens, the limit for a vehicle"
+        )
+        names = ", ".join(map(repr, sorted(crowded)))
+        _log.warning(text, names, limits.TOKENS_OF_VEHICLE, extra=about("incomplete"))
+        self._excluded |= crowded
+        self._retry = time.monotonic() + TIMINGS.excluded
+        gone = [(key, False) for key in self._keys if self._vehicle_of(key) in crowded]
+        for change in gone:
+            self._apply(*change)
+        self._restart(self._subscribe)
+        return gone
+
+    def _end_survey(self) -> None:
+        is_complete = len(self._keys) < limits.REPLIES
+        if any(query.failed for query in self._survey):
+            is_complete = False
+        self._restart(partial(self._subscribe, is_surveyed=is_complete))
+        self._slow = math.inf  # no vehicle has too many
 
     def _restart(self, start: Callable[[], None]) -> None:
         """List the tokens on a new session, because the old one processes all tokens that the router has sent."""
@@ -140,12 +154,19 @@ class FleetTokens:
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
-        if (key in self._keys) == alive or (alive and len(self._keys) >= limits.REPLIES):
+        if (key in self._keys) == alive:
             return False
-        (self._keys.add if alive else self._keys.remove)(key)
-        self._numbers[vehicle := self._vehicle_of(key)] += 1 if alive else -1
-        if not self._numbers[vehicle]:
-            del self._numbers[vehicle]
+        vehicle = self._vehicle_of(key)
+        if not alive:
+            self._keys.remove(key)
+            self._numbers[vehicle] -= 1
+            if not self._numbers[vehicle]:
+                del self._numbers[vehicle]
+            return True
+        if len(self._keys) >= limits.REPLIES:
+            return False
+        self._keys.add(key)
+        self._numbers[vehicle] += 1
         return True
 
     def _vehicle_of(self, key: str) -> str:
@@ -160,11 +181,17 @@ def key_exprs_without(excluded: Set[str], selection: Selection, *, prefix: str) 
             return [f"{prefix}/{selection.vehicles[0]}/@alive/-"]  # no token
         return Selection(selection.topics, kept, selection.instance).alive_key_exprs(prefix=prefix)
     starts = {name[:length] for name in excluded for length in range(len(name) + 1)}
-    short = [start for start in starts if len(start) <= _LONGEST_NAME]
-    names = {f"{start}{c}$*" for start in short for c in _CHARACTERS if start + c not in starts}
-    names |= starts - excluded - {""}
+    # All names that begin like an excluded one, and then differ.
+    patterns = {
+        f"{start}{character}$*"
+        for start in starts
+        for character in _CHARACTERS
+        if len(start) <= _LONGEST_NAME and start + character not in starts
+    }
+    # The excluded names shortened, which are names of their own.
+    patterns |= starts - excluded - {""}
     return [
-        tokens.replace(f"/{ANY}/", f"/{name}/", 1)
+        tokens.replace(f"/{ANY}/", f"/{pattern}/", 1)
         for tokens in selection.alive_key_exprs(prefix=prefix)
-        for name in sorted(names) or [ANY]
+        for pattern in sorted(patterns) or [ANY]
     ]

@@ -21,15 +21,15 @@ from .session import Session, translate_zenoh_errors
 _log = logging.getLogger(__name__)
 
 _LONGEST_KEY: Final = limits.QUERY_BYTES // limits.REPLIES
+_LEAST_CHANGES: Final = 256  # that each of many subscribers queues
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
 
 
 def token_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
     replies = wait_for_replies([query_tokens(session, key_expr, timeout=timeout)])
-    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[
-        : limits.REPLIES
-    ]
+    keys = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+    return sorted(keys)[: limits.REPLIES]
 
 
 class LivelinessTokens:
@@ -44,7 +44,8 @@ class LivelinessTokens:
     """
 
     def __init__(self, session: Session, *key_exprs: str, known: Iterable[str] = ()) -> None:
-        self._session, self._key_exprs = session, key_exprs
+        self._session = session
+        self._key_exprs = key_exprs
         # Access rules that allow the key expression allow this key.
         self._probe_key = re.sub(r"\*\*|\$?\*", "-", key_exprs[-1])
         self._keys = set(known)
@@ -75,24 +76,10 @@ class LivelinessTokens:
 
     def poll(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, in order: the key of a token, and True if it was declared."""
-        is_listed = False
-        if self._probe is not None:  # read before the changes, because its reply follows all tokens
-            self._probe.poll()
-            is_listed = self._probe.ended and not self._probe.failed
-            if self._probe.ended:
-                self._probe = self._send_probe() if self._probe.failed else None
-        changes: list[tuple[str, bool]] = []
-        is_overflow = False
-        with suppress(zenoh.ZError):  # the session is closed
-            for subscriber in self._subscribers:
-                received = list(islice(iter(subscriber.handler.try_recv, None), self._capacity))
-                is_overflow |= len(received) == self._capacity
-                changes += [
-                    (str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-                    for sample in received
-                ]
+        is_listed = self._poll_probe()  # before the changes, because its reply follows all tokens
+        changes = self._receive()
         is_retry_due = len(self._keys) < limits.REPLIES and time.monotonic() >= self._retry
-        if is_overflow or is_retry_due:  # changes were dropped, or there is room again
+        if changes is None or is_retry_due:
             self.undeclare()
             self._subscribe()
             return []
@@ -101,17 +88,44 @@ class LivelinessTokens:
             changes += [(key, False) for key in self._unseen]
         return [change for change in changes if self._apply(*change)]
 
+    def _poll_probe(self) -> bool:
+        """Return whether the probe has just ended, and so all tokens are listed; repeat it if it failed."""
+        if self._probe is None:
+            return False
+        self._probe.poll()
+        if not self._probe.ended:
+            return False
+        if self._probe.failed:
+            self._probe = self._send_probe()
+            return False
+        self._probe = None
+        return True
+
+    def _receive(self) -> list[tuple[str, bool]] | None:
+        """Return the queued changes; None if a queue is full, which may have dropped some."""
+        changes: list[tuple[str, bool]] = []
+        with suppress(zenoh.ZError):  # the session is closed
+            for subscriber in self._subscribers:
+                samples = list(islice(iter(subscriber.handler.try_recv, None), self._capacity))
+                if len(samples) == self._capacity:
+                    return None
+                for sample in samples:
+                    is_declared = sample.kind == zenoh.SampleKind.PUT
+                    changes.append((str(sample.key_expr), is_declared))
+        return changes
+
     def _subscribe(self) -> None:
-        self._capacity = max(
-            limits.TOKEN_CHANGES // len(self._key_exprs), min(limits.TOKEN_CHANGES, 256)
-        )
+        share = limits.TOKEN_CHANGES // len(self._key_exprs)
+        self._capacity = max(share, min(limits.TOKEN_CHANGES, _LEAST_CHANGES))
         with translate_zenoh_errors():
             declare = self._session.liveliness().declare_subscriber
             self._subscribers = [
                 declare(key_expr, zenoh.handlers.RingChannel(self._capacity), history=True)
                 for key_expr in self._key_exprs
             ]
-        self._probe, self._unseen, self._retry = self._send_probe(), self._keys.copy(), math.inf
+        self._probe = self._send_probe()
+        self._unseen = self._keys.copy()
+        self._retry = math.inf
 
     def _send_probe(self) -> Replies:
         return query_tokens(self._session, self._probe_key, timeout=_PROBE_TIMEOUT)
@@ -120,14 +134,17 @@ class LivelinessTokens:
         """Apply a change; return False if it has no effect."""
         if (key in self._keys) == alive or len(key) > _LONGEST_KEY:
             return False
-        if alive and len(self._keys) >= limits.REPLIES:
-            if self._retry == math.inf:
-                text = "%s: more than %d liveliness tokens, so some streams are missing"
-                _log.warning(text, self._key_exprs[0], limits.REPLIES, extra=about("incomplete"))
-            self._retry = time.monotonic() + TIMINGS.tokens_retry
-            return False
-        (self._keys.add if alive else self._keys.remove)(key)
-        return True
+        if not alive:
+            self._keys.remove(key)
+            return True
+        if len(self._keys) < limits.REPLIES:
+            self._keys.add(key)
+            return True
+        if self._retry == math.inf:
+            text = "%s: more than %d liveliness tokens, so some streams are missing"
+            _log.warning(text, self._key_exprs[0], limits.REPLIES, extra=about("incomplete"))
+        self._retry = time.monotonic() + TIMINGS.tokens_retry
+        return False
 
 
 def query_tokens(session: Session, key_expr: str, *, timeout: float) -> Replies:

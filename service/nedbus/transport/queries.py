@@ -9,6 +9,7 @@ import logging
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import zenoh
@@ -21,7 +22,9 @@ from .session import RawSample, Session, translate_zenoh_errors
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
-_PAUSES: Final = (0.0005, 0.01)  # s between polls for replies: first and longest pause
+# s between polls for replies
+_FIRST_PAUSE: Final = 0.0005
+_LONGEST_PAUSE: Final = 0.01
 
 
 class Replies:
@@ -38,15 +41,16 @@ class Replies:
         """Return the replies received since the last call."""
         received: list[zenoh.Reply] = []
         try:
-            while (
-                len(received) < limits.REPLIES and (reply := self._handler.try_recv()) is not None
-            ):
+            for reply in islice(iter(self._handler.try_recv, None), limits.REPLIES):
                 received.append(reply)
-                self.failed |= reply.ok is None
-            if time.monotonic() > self._end:
-                self.ended = self.failed = True
+                if reply.ok is None:
+                    self.failed = True
         except zenoh.ZError:  # empty and closed
             self.ended = True
+            return received
+        if time.monotonic() > self._end:
+            self.ended = True
+            self.failed = True
         return received
 
 
@@ -58,10 +62,14 @@ def send_query(
     `options`: other arguments of `zenoh.Session.get`, such as `priority`.
     """
     timeout = zenoh_timeout(timeout)
-    options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
     with translate_zenoh_errors():
         replies = session.get(
-            selector, zenoh.handlers.FifoChannel(capacity), timeout=timeout, **options
+            selector,
+            zenoh.handlers.FifoChannel(capacity),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+            **options,
         )
     return Replies(replies, timeout=timeout)
 
@@ -76,22 +84,17 @@ def query(
     replies of the groups that use least come first, so the same holds for a limit of the caller.
     """
     accepted = _Accepted()
-    replies = wait_for_replies(
-        [send_query(session, selector, timeout=timeout) for selector in selectors]
-    )
-    for sample in filter(None, (reply.ok for reply in replies)):
-        accepted.add(group_of(str(sample.key_expr)), sample)
+    queries = [send_query(session, selector, timeout=timeout) for selector in selectors]
+    for reply in wait_for_replies(queries):
+        if reply.ok is not None:
+            accepted.add(group_of(str(reply.ok.key_expr)), reply.ok)
     if accepted.dropped:
         text = (
             "%s: dropped %d of %d replies beyond the limits of a query, so the result is incomplete"
         )
-        _log.warning(
-            text,
-            ", ".join(selectors),
-            accepted.dropped,
-            accepted.count + accepted.dropped,
-            extra=about("incomplete"),
-        )
+        names = ", ".join(selectors)
+        total = accepted.count + accepted.dropped
+        _log.warning(text, names, accepted.dropped, total, extra=about("incomplete"))
     return accepted.samples()
 
 
@@ -100,8 +103,10 @@ class _Accepted:
 
     def __init__(self) -> None:
         self.groups: defaultdict[str, list[RawSample]] = defaultdict(list)
-        self.count = self.dropped = 0
-        self._size, self._used = 0, Counter[str]()  # bytes; and by group, with the share of a reply
+        self.count = 0
+        self.dropped = 0
+        self._size = 0  # bytes
+        self._used = Counter[str]()  # bytes by group, with the share of each reply
         self._largest = ""
 
     def add(self, group: str, sample: RawSample) -> None:
@@ -125,18 +130,19 @@ class _Accepted:
         size = len(sample.payload) + len(str(sample.key_expr))
         self.count += sign
         self._size += sign * size
-        self._used[group] += sign * (size + limits.QUERY_BYTES // limits.REPLIES)
+        share = limits.QUERY_BYTES // limits.REPLIES
+        self._used[group] += sign * (size + share)
 
 
 def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:
     """Yield replies as they arrive, until all queries have ended."""
-    pause, longest = _PAUSES
+    pause = _FIRST_PAUSE
     while pending := [replies for replies in queries if not replies.ended]:
         received = [reply for replies in pending for reply in replies.poll()]
         yield from received
         if not received:
             time.sleep(pause)
-            pause = min(1.25 * pause, longest)
+            pause = min(1.25 * pause, _LONGEST_PAUSE)
 
 
 def zenoh_timeout(timeout: float) -> float:

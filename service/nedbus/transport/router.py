@@ -84,33 +84,41 @@ def open_router(
         }
     else:
         config = _read_config(config_file)
-        if plugins := _get(config, "plugins"):
-            text = "%s: %s not loaded, because this router, unlike zenohd, loads no plugins"
-            _log.warning(text, config_file, _plugin_names(plugins), extra=about("router"))
-        # because Zenoh's error does not name the file
-        for name, file in _tls_files(config).items():
-            if not os.access(file, os.R_OK):
-                reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
-                raise ConfigError.in_file(config_file, reason)
-        given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
-        settings = {name: endpoints for name, endpoints in given.items() if endpoints}
+        _check_config(config, config_file)
+        settings = {}
+        if listen:
+            settings["listen/endpoints"] = list(listen)
+        if connect:
+            settings["connect/endpoints"] = list(connect)
     insert_settings(config, settings, where="listen")
     if tls is not None and not _get(config, "transport/link/tls").get("root_ca_certificate"):
-        files = {
-            f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()
-        }
-        insert_settings(config, files, where="tls")
+        files = tls.zenoh_settings().items()
+        by_key = {f"transport/link/tls/{name}": value for name, value in files}
+        insert_settings(config, by_key, where="tls")
     sessions = _get(config, "transport/unicast/max_sessions")
     metadata = _get(config, "metadata")
-    if metadata is None or isinstance(metadata, dict):  # any JSON value is allowed
-        insert_settings(
-            config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata"
-        )
+    if metadata is None:
+        metadata = {}
+    if isinstance(metadata, dict):  # any JSON value is allowed
+        metadata["max_sessions"] = sessions
+        insert_settings(config, {"metadata": metadata}, where="metadata")
     raise_file_limit(sessions)
     try:
         return open_session(config)
     except zenoh.ZError as exc:
         raise ListenError(router_endpoints(listen, config_file), error_reason(exc)) from exc
+
+
+def _check_config(config: zenoh.Config, path: Path) -> None:
+    """Log the plugins of a configuration; raise ConfigError for an unreadable TLS file, which Zenoh does not name."""
+    plugins = _get(config, "plugins")
+    if plugins:
+        text = "%s: %s not loaded, because this router, unlike zenohd, loads no plugins"
+        _log.warning(text, path, _plugin_names(plugins), extra=about("router"))
+    for name, file in _tls_files(config).items():
+        if not os.access(file, os.R_OK):
+            reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
+            raise ConfigError.in_file(path, reason)
 
 
 def raise_file_limit(sessions: int) -> None:
@@ -137,9 +145,10 @@ def router_endpoints(
 
     Raises ConfigError for a malformed file.
     """
-    if listen or config_file is None:
-        return tuple(listen) or (DEFAULT_ENDPOINT,)
-    return _endpoints(_read_config(config_file), "listen") or (DEFAULT_ENDPOINT,)
+    endpoints = tuple(listen)
+    if not endpoints and config_file is not None:
+        endpoints = _endpoints(_read_config(config_file), "listen")
+    return endpoints or (DEFAULT_ENDPOINT,)
 
 
 class RouterConfig(NamedTuple):
@@ -177,25 +186,27 @@ def _get(config: zenoh.Config, key: str) -> Any:
 
 def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
     endpoints = _get(config, f"{name}/endpoints")
-    return tuple(endpoints.get("router", ()) if isinstance(endpoints, dict) else endpoints or ())
+    if isinstance(endpoints, dict):  # by mode
+        endpoints = endpoints.get("router")
+    return tuple(endpoints or ())
 
 
 def _tls_files(config: zenoh.Config) -> dict[str, Path]:
-    section = _get(config, "transport/link/tls").items()
-    return {
-        name: Path(file)
-        for name, file in section
-        if file and name.endswith(("_certificate", "_private_key"))
-    }
+    files: dict[str, Path] = {}
+    for name, file in _get(config, "transport/link/tls").items():
+        if file and name.endswith(("_certificate", "_private_key")):
+            files[name] = Path(file)
+    return files
 
 
 def _read_config(path: Path) -> zenoh.Config:
     """Read the file for an embedded router; raise ConfigError if it is malformed or requires a plugin."""
     config = _parse_config(path)
-    plugins = _get(config, "plugins").items()
-    if required := [
-        name for name, settings in plugins if settings and settings.get("__required__")
-    ]:
+    required: list[str] = []
+    for name, settings in _get(config, "plugins").items():
+        if settings and settings.get("__required__"):
+            required.append(name)
+    if required:
         reason = f"it requires {_plugin_names(required)}, but this router loads no plugins: run it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
@@ -219,7 +230,10 @@ def _parse_config(path: Path) -> zenoh.Config:
     except zenoh.ZError as exc:
         text = str(exc)
         position = re.search(r"(?:line: |--> )(\d+)(?:, column: |:)(\d+)", text)
-        line, column = map(int, position.groups()) if position else (None, None)
+        line: int | None = None
+        column: int | None = None
+        if position:
+            line, column = map(int, position.groups())
         # Strip the source excerpt and source paths that Zenoh's parser adds.
         message = re.search(r'(?:msg: "|= )(.*?)(?: at /|", location)', text, re.DOTALL)
         reason = message[1].replace("`", "'") if message else "not a Zenoh configuration"
@@ -247,11 +261,13 @@ def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     2**18 bytes for a client, about 1,400 sessions.
     """
     replies = query(session, "@/*/router", timeout=timeout)
-    small = (reply for reply in replies if len(reply.payload) <= limits.ROUTER_STATE_BYTES)
-    states = filter(
-        None, (parse_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small)
-    )
-    by_zid = {state.zid: state for state in states}
+    by_zid: dict[str, RouterState] = {}
+    for reply in replies:
+        if len(reply.payload) > limits.ROUTER_STATE_BYTES:
+            continue
+        state = parse_state(str(reply.key_expr), reply.payload.to_bytes())
+        if state is not None:
+            by_zid[state.zid] = state
     return [by_zid[zid] for zid in sorted(islice(by_zid, limits.ROUTERS))]
 
 
@@ -262,10 +278,15 @@ def parse_state(key: str, payload: bytes) -> RouterState | None:
         state = json.loads(payload)
     except (ValueError, RecursionError):
         return None
-    sessions = state.get("sessions") if isinstance(state, dict) else None
-    if match is None or not isinstance(sessions, list):
+    if match is None or not isinstance(state, dict):
         return None
+    sessions = state.get("sessions")
+    if not isinstance(sessions, list):
+        return None
+    limit = None
     metadata = state.get("metadata")
-    limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
-    is_limit = type(limit) is int and 0 < limit <= _LARGEST_LIMIT  # not a bool
-    return RouterState(match[1], len(sessions), limit if is_limit else None)
+    if isinstance(metadata, dict):
+        limit = metadata.get("max_sessions")
+    if type(limit) is not int or not 0 < limit <= _LARGEST_LIMIT:  # nor a bool
+        limit = None
+    return RouterState(match[1], len(sessions), limit)

@@ -22,7 +22,14 @@ from nedbus.daemon.write_permission import WritePermission
 from nedbus.errors import RefusedError
 from nedbus.pki import write_access_rules
 from nedbus.timings import Timings
-from nedbus.transport import Session, WriteVerdict, open_client, open_router, query
+from nedbus.transport import (
+    Session,
+    WriteVerdict,
+    open_client,
+    open_router,
+    query,
+    read_router_config,
+)
 from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
 from tests.flights.local_position import encode
@@ -751,3 +758,60 @@ def test_tokens_of_a_vehicle_do_not_hide_others(
         assert all(str(each) in listed.out for each in addresses)
         assert "the streams of '2' are not listed" in listed.err
         assert len(tokens) == 2000
+
+
+RULES: Final = """{
+  access_control: {
+    enabled: true, default_permission: "deny",
+    rules: [
+      { id: "all", permission: "allow", messages: ["put"], key_exprs: ["nedbus/**"] },
+      { id: "not-8", permission: "deny", flows: ["ingress"], messages: ["put"], key_exprs: ["nedbus/8/**"] },
+    ],
+    subjects: [{ id: "any" }, { id: "seven", cert_common_names: ["seven"] }],
+    policies: [{ rules: ["all"], subjects: ["any"] }, { rules: ["not-8"], subjects: ["seven"] }],
+  },
+  low_pass_filter: [
+    { messages: ["reply"], key_exprs: ["replies/**"], size_limit: 10 },
+    { flows: ["egress"], messages: ["put"], key_exprs: ["sent/**"], size_limit: 10 },
+    { messages: ["put"], key_exprs: ["received/**"], size_limit: 10 },
+  ],
+}"""
+
+
+@pytest.mark.parametrize(
+    ("certificate", "message", "flow", "key", "decision"),
+    [
+        ("seven", "put", "ingress", "nedbus/7/a", "rule all allows it"),
+        ("seven", "put", "ingress", "nedbus/8/a", "rule not-8 denies it"),
+        ("seven", "put", "egress", "nedbus/8/a", "rule all allows it"),
+        ("eight", "put", "ingress", "nedbus/8/a", "rule all allows it"),
+        ("seven", "put", "ingress", "other/8/a", "none of its rules includes this key: all, not-8"),
+        (
+            "seven",
+            "query",
+            "ingress",
+            "nedbus/7/a",
+            "no rule is for such messages of this certificate",
+        ),
+    ],
+)
+def test_decision_names_its_rule(  # noqa: PLR0917 - one row of the table
+    tmp_path: Path, certificate: str, message: str, flow: Any, key: str, decision: str
+) -> None:
+    """A denial takes precedence over a permission, rules of every certificate apply, and the default is the last."""
+    file = tmp_path / "router.json5"
+    file.write_text(RULES)
+    access = read_router_config(file).access
+    decided = access.decide(certificate, message, flow, key)
+    assert str(decided) == decision
+    assert decided.is_allowed == decision.endswith("allows it")
+    assert access.certificates == ["seven"]
+
+
+def test_limit_of_size_holds_for_messages_that_clients_put(tmp_path: Path) -> None:
+    """A filter limits what clients put if it is for put messages, and for ingress or both directions."""
+    file = tmp_path / "router.json5"
+    file.write_text(RULES)
+    access = read_router_config(file).access
+    limited = [key for key in ("replies/a", "sent/a", "received/a") if access.limits_size(key)]
+    assert limited == ["received/a"]

@@ -1,5 +1,8 @@
 """A vehicle with too many liveliness tokens does not hide the streams of the other vehicles."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import zenoh
 from hypothesis import example, given, strategies as st
@@ -167,6 +170,37 @@ def test_slow_list_is_complete(endpoint: str, zenoh_session: Session, timings: T
             lambda: list(bus.vehicles()) == sorted(OTHERS[1:]), what="the departure of a vehicle"
         )
         assert bus.vehicles().complete
+
+
+class Listing:
+    """A subscription to tokens whose list does not end."""
+
+    is_listing = True
+    complete = False
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def poll(self) -> list[tuple[str, bool]]:
+        return []
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_failed_survey_leaves_the_list_incomplete(
+    monkeypatch: pytest.MonkeyPatch, timings: Timings, *, failed: bool
+) -> None:
+    """If the query of a slow list fails, the subscription must list the tokens before the list counts as complete."""
+    timings.slow_list = -1.0
+    survey = SimpleNamespace(ended=True, failed=failed, poll=list)
+    session: Any = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr(fleet_tokens, "LivelinessTokens", Listing)
+    monkeypatch.setattr(fleet_tokens, "query_tokens", lambda *_, **__: survey)
+    tokens = fleet_tokens.FleetTokens(lambda: session, Selection(), prefix="nedbus")
+    tokens.poll()
+    assert tokens.is_listing, "the query"
+    tokens.poll()
+    assert tokens.is_listing is failed
+    assert tokens.complete is not failed
 
 
 SELECTIONS = [

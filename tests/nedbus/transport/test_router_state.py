@@ -22,6 +22,7 @@ from nedbus.doctor import Finding
 from nedbus.doctor.examination import check_network
 from nedbus.doctor.observation import Observation
 from nedbus.doctor.prober import check_endpoint
+from nedbus.endpoints import DEFAULT_ENDPOINT
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, service_pages
 from nedbus.settings import load_settings
@@ -34,6 +35,7 @@ from nedbus.transport import (
     query_routers,
     read_router_config,
     router,
+    router_endpoints,
 )
 from nedbus.transport.router import parse_state, raise_file_limit
 from tests.peers.certificates import CONFIG, write_config as write_shipped
@@ -154,6 +156,19 @@ def test_malformed_router_file_raises(tmp_path: Path) -> None:
     file.write_text("{ mode: ")
     with pytest.raises(ConfigError):
         read_router_config(file)
+
+
+def test_endpoints_of_a_router_file(tmp_path: Path) -> None:
+    """Given endpoints override those of the file, which may depend on the mode; without any, the default holds."""
+    file = tmp_path / "router.json5"
+    file.write_text(
+        '{ listen: { endpoints: { router: ["tcp/[::1]:9"], client: ["tcp/[::1]:8"] } } }'
+    )
+    assert read_router_config(file).listen == ("tcp/[::1]:9",)
+    assert router_endpoints(config_file=file) == ("tcp/[::1]:9",)
+    assert router_endpoints(["tcp/[::1]:7"], file) == ("tcp/[::1]:7",)
+    file.write_text("{ listen: { endpoints: { router: [] } } }")
+    assert router_endpoints(config_file=file) == router_endpoints() == (DEFAULT_ENDPOINT,)
 
 
 @pytest.mark.parametrize(
