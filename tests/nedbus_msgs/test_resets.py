@@ -182,6 +182,18 @@ def test_backward_timestamp_restarts_the_track() -> None:
     assert second.x == 5.0
     assert third.discontinued == {"xy", "z", "vxy", "vz", "heading", "dist_bottom"}
     assert third.x == 0.5
+    assert not third.reset
+    assert third.resets["xy"] == 1  # the counter begins again, which is no reset
+
+
+def test_heading_without_a_jump_stays_within_half_a_turn() -> None:
+    """A heading whose reset was removed is wrapped again when the vehicle turns through south."""
+    *_, third = track(
+        at(1, heading=0.0),
+        at(2, heading=-1.0, heading_reset_counter=1, delta_heading=-1.0),
+        at(3, heading=2.5, heading_reset_counter=1, delta_heading=-1.0),
+    )
+    assert third.heading == pytest.approx(3.5 - 2 * math.pi)
 
 
 def test_delta_without_a_jump_at_a_new_origin_is_ignored() -> None:
