@@ -191,7 +191,7 @@ def parse_mavlink(data: bytes) -> int:
 
     The input has the format of `frames`; a `LogReceiver` reads it in its thread.
     """
-    options = MavlinkOptions(log=frozenset({"1", "take"}), topics=("*",))
+    options = MavlinkOptions(log="1", topics=("*",))
     link: Any = _Link(frames(data))
     reader = LinkReader(link, name="fuzz")
     receiver = LogReceiver(reader, options, link.answer)
