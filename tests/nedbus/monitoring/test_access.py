@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import socket
 import threading
@@ -82,6 +83,9 @@ def servers() -> Iterator[list[Server]]:
         return run
 
     with ExitStack() as running:
+        # Bokeh collects garbage for each session that ends: with the objects of all tests, that takes seconds.
+        gc.freeze()
+        running.callback(gc.unfreeze)
         found = []
         for host in ("127.0.0.1", "0.0.0.0"):  # noqa: S104 - as in the image
             service = running.enter_context(closing(HttpServer(f"{host}:0", TEXTS)))
