@@ -198,9 +198,7 @@ def save_stream(folder: Path) -> tuple[Path, Values]:
     client = cast(
         "LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=1.0)
     )
-    stream = LogStream(
-        "1", MavlinkOptions(log="1", save=str(folder / "saved")), client
-    )
+    stream = LogStream("1", MavlinkOptions(log="1", save=str(folder / "saved")), client)
     for start in range(0, len(writer.data), 249):
         list(
             stream.add(
