@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from nedbus.client.rate_gate import RateGate, rate_step
@@ -26,7 +26,7 @@ class Throttled:
 
     gate: RateGate
     has_arrived: bool = False  # a downsampled message
-    last_sent: float = field(default=-math.inf)  # time of sending of the last message [ns]
+    last_sent: float = -math.inf  # time of sending of the last message [ns]
 
 
 class Throttle:
