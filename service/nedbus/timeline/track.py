@@ -105,6 +105,7 @@ class Track(Generic[M]):
         self.lag: int | None = None
         self.is_unix = False
         self.last: dict[Any, int] = {}
+        self._batched: dict[Any, int] = {}  # the last timestamp of streams that were written later
         self.doubtful: list[Item[M]] = []
         self._previous: _Part | None = None
 
@@ -164,6 +165,7 @@ class Track(Generic[M]):
             return self.base + item.stamp
         if self._is_batched(item, before):
             self.last[item.stream] = item.stamp
+            self._batched[item.stream] = item.stamp
             return self.base + item.stamp
         return self._place_before_change(item)
 
@@ -173,6 +175,8 @@ class Track(Generic[M]):
             return False
         if item.log is None and self.doubtful:
             return False
+        if item.stamp == self._batched.get(item.stream):
+            return True  # sent twice with one timestamp
         return before < item.stamp <= min(before + LATENESS, self.newest)
 
     def _continues_doubtful(self, item: Item[M]) -> bool:

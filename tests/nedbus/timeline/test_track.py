@@ -54,3 +54,16 @@ def test_late_message_of_a_log_is_counted_and_keeps_the_order_of_its_stream() ->
     assert found == messages
     assert found[50].at == found[49].at
     assert order.unordered.total() == 1
+
+
+def test_message_that_was_sent_twice_keeps_its_place_in_a_later_batch() -> None:
+    """PX4 may publish two messages of a topic with one timestamp; here their topic arrives after the others."""
+    others = [Message(n * STEP, UNIX + n * STEP, logged="a") for n in range(1, 200)]
+    arrived = others[-1].time
+    stamps = [STEP, 100 * STEP, 100 * STEP, 101 * STEP]
+    late = [Message(stamp, arrived, logged="b") for stamp in stamps]
+    found = [*Order[Message]().arrange([*others[:20], late[0], *others[20:], *late[1:]])]
+    assert [message.timestamp for message in found if message in late] == stamps
+    assert [message.timestamp for message in found] == sorted(
+        message.timestamp for message in found
+    )
