@@ -13,7 +13,7 @@ IMAGE_EXTRAS = mavlink mcap metrics pki web
 # The lock files are valid on x86-64 and ARM64 and for every supported Python; they omit the package index's address.
 LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 
-.PHONY: run check api api-baseline generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
+.PHONY: run check api api-baseline generated docs quick test behaviour slow long test-all measured fuzz compose-test wheel lock bench clean
 
 # The shell waits for a service in the background: only then does a trap run at once, when make is killed and kills it.
 run: $(READY)  ## run the service with a simulated flight, or with ARGS; it prints a command for a second terminal
@@ -47,20 +47,23 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
 quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
-	$(BIN)/pytest -q -n 2 -m "quick or not (slow or router or process or compose)" --junitxml=build/tests.xml
+	$(BIN)/pytest -q -n 2 -m "quick or not (slow or long or router or process or compose)" --junitxml=build/tests.xml
 
 test: check behaviour  ## run `make check` and all tests of behaviour: twelve minutes on two idle cores
 
 behaviour: $(DEV)
-	$(BIN)/pytest -q -n 6 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
+	$(BIN)/pytest -q -n 6 --dist worksteal -m "not (slow or long or compose)" --junitxml=build/tests.xml
 
 slow: $(DEV)  ## run the slow tests, and the property tests with three times as many examples
-	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not compose" --hypothesis-profile=all --junitxml=build/slow-tests.xml
+	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not (long or compose)" --hypothesis-profile=all --junitxml=build/slow-tests.xml
+
+long: $(DEV)  ## run the tests of complete flights, of much damage, and of programs that other compilers build
+	$(BIN)/pytest -q -n 4 --dist worksteal -m "long and not compose" --junitxml=build/long-tests.xml
 
 test-all: SECONDS = 60
 test-all: check measured fuzz compose-test  ## run everything: with branch coverage, slow tests, a minute of fuzzing, and containers
 
-measured: $(DEV)  ## run the tests of `make test` and `make slow` with branch coverage
+measured: $(DEV)  ## run the tests of `make test`, `make slow` and `make long` with branch coverage
 	$(BIN)/coverage erase
 	$(BIN)/coverage run -m pytest -q -n 4 --dist worksteal -m "not compose" --hypothesis-profile=all
 	$(BIN)/coverage combine -q

@@ -47,7 +47,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for fixture, mark in (("start", "process"), ("endpoint", "router")):
             if fixture in getattr(item, "fixturenames", ()):
                 item.add_marker(mark)
-        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+        is_slow = item.get_closest_marker("slow") or item.get_closest_marker("long")
+        if is_slow and not item.get_closest_marker("timeout"):
             # three times their duration on four busy cores, with coverage
             item.add_marker(pytest.mark.timeout(600))
         # most tests of a module that imports it call it

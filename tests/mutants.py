@@ -27,7 +27,10 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
 TABLE: Final = Path(__file__).with_suffix(".toml")
-TIERS: Final = {"test": "not slow and not compose", "test-all": "slow and not compose"}
+TIERS: Final = {
+    "test": "not (slow or long or compose)",
+    "test-all": "(slow or long) and not compose",
+}
 _FAILED: Final = re.compile(r"^(?:FAILED|ERROR) (tests/.+?)(?: - .*)?$", re.MULTILINE)
 _USAGE, _NO_TESTS = 4, 5  # exit codes of pytest: usage error; no tests collected
 _BASELINE: Final = 7200.0  # s; timeout of all named tests without a mutation
@@ -157,9 +160,11 @@ def copy_tree(checkout: Path, folder: Path) -> Path:
             shutil.copy2(checkout / name, tree / name)
     if (checkout.parent / "shared").is_dir():
         (folder / "shared").symlink_to((checkout.parent / "shared").resolve())
-    # Pytest rejects unknown markers, and an older checkout does not declare "slow".
+    # Pytest rejects unknown markers, and an older checkout may not declare these.
     settings = tree / "pyproject.toml"
-    settings.write_text(settings.read_text().replace("markers = [", 'markers = [\n  "slow",', 1))
+    settings.write_text(
+        settings.read_text().replace("markers = [", 'markers = [\n  "slow",\n  "long",', 1)
+    )
     return tree
 
 

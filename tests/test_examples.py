@@ -180,7 +180,7 @@ def test_alarm_example_names_the_flags(
     assert alarm.out.count("xy_valid is false") == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_resets_example_plots_both_tracks(start: Start, tmp_path: Path) -> None:
     """examples/resets.py prints the reset after the simulated outage, and plots both tracks and one marker."""
     flight, picture = tmp_path / "flight.mcap", tmp_path / "resets.png"

@@ -105,7 +105,7 @@ def test_why_is_what_the_command_prints(log: Path) -> None:
 
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
-@pytest.mark.slow
+@pytest.mark.long
 def test_why_of_a_real_flight() -> None:
     """A log of PX4 1.17, its open flight and its samples have one verdict; times are the vehicle's UTC."""
     verdict = nedbus.why(REAL)["1"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.flights.ulogs import write_log
 from tests.peers.processes import Start
 
@@ -83,6 +85,7 @@ assert not set(unused.split()) & set(sys.modules), set(unused.split()) & set(sys
     assert process.wait() == 0, process.err
 
 
+@pytest.mark.slow
 def test_files_are_read_without_zenoh(start: Start, tmp_path: Path) -> None:
     """Reading files, in a script or with a command, loads neither Zenoh nor the client."""
     log = write_log(tmp_path / "flight.ulg", [1_000_000 * second for second in range(1, 20)])

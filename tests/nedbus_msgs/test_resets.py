@@ -265,7 +265,7 @@ def test_track_follows_simulated_ground_truth() -> None:
 
 
 @pytest.mark.logs
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("thinned", [False, True])
 def test_track_is_closer_than_with_deltas_or_steps_alone(thinned: bool) -> None:
     """At the resets of all logs, at full rate and at 10 Hz, the track is off by less than with either rule alone."""

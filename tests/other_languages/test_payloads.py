@@ -32,7 +32,7 @@ def parse(text: str, kind: FieldType) -> Any:
     return FieldType.fit(field_type(kind.base), float(text)) if kind.is_float else int(text)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.process
 @pytest.mark.timeout(420)  # packages may be downloaded and compiled
 @pytest.mark.parametrize("language", PROGRAMS)

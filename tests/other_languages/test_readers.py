@@ -61,7 +61,7 @@ Texts = Mapping[tuple[str, str], list[str]]
 Values = Mapping[tuple[str, str], list[Any]]
 
 # packages may be downloaded, compiled
-pytestmark = [pytest.mark.slow, pytest.mark.process, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.long, pytest.mark.process, pytest.mark.timeout(900)]
 
 
 def parse(output: str) -> Texts:

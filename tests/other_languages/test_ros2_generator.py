@@ -107,7 +107,7 @@ def definitions() -> Iterator[dict[str, str]]:
         }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.process
 @pytest.mark.timeout(900)
 def test_hash_equals_that_of_ros_2(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_hash_equals_that_of_ros_2(tmp_path: Path) -> None:
             assert hash_of_msg(name, text + nested) == expected, (number, name)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.process
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("package", LITERAL)

@@ -84,7 +84,7 @@ def test_golden_payloads_remain_among_the_vectors() -> None:
         } <= payloads
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.process
 @pytest.mark.timeout(420)  # packages may be downloaded and compiled
 @pytest.mark.parametrize("tool", PROGRAMS)

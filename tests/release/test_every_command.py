@@ -13,6 +13,7 @@ from tests.release.every_command import ROOT, Case, problem_of
 MAKE_RUN = re.findall(r'--editable "\.\[(\w+)\]"', (ROOT / "Makefile").read_text())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("extras", [[], MAKE_RUN], ids=["wheel", "make run"])
 def test_commands_run_without_optional_packages(start: Start, extras: list[str]) -> None:
     """Help needs no extra; a command whose extra is missing ends with one line that names it, and exit code 2."""

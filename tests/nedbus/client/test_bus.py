@@ -269,6 +269,7 @@ def test_list_of_vehicles_is_incomplete_without_a_router() -> None:
         assert not bus.vehicles().complete
 
 
+@pytest.mark.slow
 def test_replies_beyond_channel_capacity_do_not_block(endpoint: str) -> None:
     """More replies than a Zenoh channel holds (256) block neither the bus that sends them nor another one."""
     with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:

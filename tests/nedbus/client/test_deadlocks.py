@@ -10,7 +10,7 @@ from tests.peers.ports import free_port
 from tests.peers.processes import Start
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_opening_and_closing_publishers_does_not_deadlock(start: Start) -> None:
     """Python code neither runs on Zenoh's threads nor holds the GIL while it waits for Zenoh.
 

@@ -209,7 +209,7 @@ def test_ten_subscriptions_need_at_most_twelve_threads(endpoint: str) -> None:
         assert len(set(threading.enumerate()) - before) <= 12
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_publisher_exits_during_a_flood_of_queries(start: Start, endpoint: str) -> None:
     """A reply in progress at process exit does not abort a publisher that is flooded with schema queries."""
     code = """

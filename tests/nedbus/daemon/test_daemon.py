@@ -129,6 +129,7 @@ def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
     assert (output.published, output.rejected) == (0, 1)
 
 
+@pytest.mark.slow
 def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serve: Serve) -> None:
     """A replay at speed=max waits for readers; the service exits only once a slow reader has received everything."""
     total = 12_000
@@ -332,6 +333,7 @@ def test_signal_stops_a_replay_blocked_by_a_stuck_reader(tmp_path: Path, serve: 
         service.wait()
 
 
+@pytest.mark.slow
 def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -> None:
     """With --connect a service waits for its router, reconnects after a router crash, and stops on a signal."""
     endpoint = free_endpoint()
@@ -614,6 +616,7 @@ def test_plain_zenoh_can_query_status_and_messages(
     assert str(reply.ok.key_expr) == "nedbus/1/estimator_local_position/1"
 
 
+@pytest.mark.slow
 def test_duplicate_vehicle_is_logged_and_reported(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:

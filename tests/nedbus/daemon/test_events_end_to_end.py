@@ -23,7 +23,7 @@ from tests.waits import wait_for
 
 __all__ = ["browser"]  # a fixture
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 
 GPS: Final = "vehicle_gps_position"
 VEHICLES: Final = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot")

@@ -108,6 +108,7 @@ def test_home_position_is_not_republished_after_a_reboot() -> None:
     assert [address for address, _ in fake.published].count(HOME) == 1
 
 
+@pytest.mark.slow
 def test_stalest_address_is_replaced_at_the_limit() -> None:
     """At the limit of addresses, a new address replaces the one that has been stale longest."""
     fake = FakeOutput()

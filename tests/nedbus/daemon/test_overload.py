@@ -21,6 +21,7 @@ from tests.peers.processes import Start
 from tests.waits import wait_for
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_overload_is_reported(run_nedbus: Start, bus: nedbus.Bus, endpoint: str) -> None:
     """After 0.8 s in which the process did not run, each command and page reports an overload."""

@@ -43,6 +43,7 @@ def test_changes_between_streamed_and_converted_messages_are_no_resets(
     assert {sum(health.resets.values()) for health in service.healths.values()} == {0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.name.removesuffix(".bin.gz"))
 def test_no_message_is_rejected_and_no_estimate_contradicted(
     monkeypatch: pytest.MonkeyPatch, path: Path

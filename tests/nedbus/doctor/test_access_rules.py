@@ -144,6 +144,7 @@ def secure(pki: Path, tmp_path: Path, start: Start) -> tuple[str, Path]:
     return endpoint, file
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_doctor_names_key_certificate_and_rule_of_a_denial(
     pki: Path, secure: tuple[str, Path]

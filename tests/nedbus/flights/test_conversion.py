@@ -13,6 +13,7 @@ from tests.flights.ulogs import write_log
 TIMES = [20_000 * number for number in range(1, 3001)]  # us
 
 
+@pytest.mark.slow
 def test_conversion_reports_what_it_did(tmp_path: Path) -> None:
     """It writes all messages under the given vehicle, reports progress up to the total, and names absent topics."""
     log, output = write_log(tmp_path / "flight.ulg", TIMES), tmp_path / "flight.mcap"

@@ -207,6 +207,7 @@ def test_payload_of_another_release_names_it() -> None:
         decode_with(DEFAULT, payload[:-1], DEFAULT.current)
 
 
+@pytest.mark.long
 def test_growing_file_is_read_as_far_as_it_is(tmp_path: Path) -> None:
     """Messages that are appended while a log is read are no error; the reader has not reached its end."""
     writer = UlogWriter()

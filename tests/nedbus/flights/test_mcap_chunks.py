@@ -131,6 +131,7 @@ def test_file_at_a_limit_is_read_in_bounded_memory(start: Start, tmp_path: Path,
     assert int(process.out.splitlines()[-1]) < SHARE * LIMIT, process.out
 
 
+@pytest.mark.long
 def test_index_with_many_schemas_is_read_in_linear_time(tmp_path: Path) -> None:
     """An index with 40,000 schemas and channels is read in seconds of CPU time, on any machine."""
     path = tmp_path / "a.mcap"

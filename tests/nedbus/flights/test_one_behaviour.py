@@ -215,6 +215,7 @@ def test_truncated_file_is_read_to_its_end(tmp_path: Path, suffix: str) -> None:
         assert flight.warnings
 
 
+@pytest.mark.long
 @each_format
 def test_file_that_shrinks_while_it_is_read_is_reported(tmp_path: Path, suffix: str) -> None:
     """Messages before the new end are kept, and the loss is reported; no exception of the platform escapes."""

@@ -61,6 +61,7 @@ def test_fusion_of_a_vehicle(endpoint: str) -> None:
     assert asyncio.run(read()).vehicle == "2"
 
 
+@pytest.mark.long
 def test_command_follows_a_vehicle(endpoint: str) -> None:
     """`nedbus fusion` prints each change, as text or JSON; a vehicle without messages is an error."""
     with nedbus.connect(endpoint, timeout=20) as bus:

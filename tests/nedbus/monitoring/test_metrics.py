@@ -546,6 +546,7 @@ def test_ended_stream_has_no_age(
         )
 
 
+@pytest.mark.long
 def test_report_of_950_vehicles_is_complete(endpoint: str) -> None:
     """A report of many megabytes arrives with every vehicle, its faults and their events.
 

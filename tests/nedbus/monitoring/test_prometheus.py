@@ -103,7 +103,7 @@ def shorten(rules: str) -> str:
     return re.sub(r"\[\dm\]", "[10s]", re.sub(r"for: \d+[sm]", "for: 1s", rules))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_every_alert_fires_and_clears(
     start: Start, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path

@@ -147,7 +147,7 @@ def test_bundle_publishes_only_its_vehicle(
     assert list(reader.vehicles()) == ["wing"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_documented_commands_enroll_a_vehicle(run_nedbus: Start, tmp_path: Path) -> None:
     """The commands of docs/security.md work in order in an empty folder, here on loopback and without /etc."""
     page = (ROOT / "docs" / "security.md").read_text()

@@ -57,7 +57,7 @@ _log = logging.getLogger(__name__)
 
 TRIES = int(os.environ.get("DAMAGE_TRIES", "200"))
 FEW = 60  # number of tries in the quick tier, which uses generated files only
-each_tier = pytest.mark.parametrize("tries", [FEW, pytest.param(TRIES, marks=pytest.mark.slow)])
+each_tier = pytest.mark.parametrize("tries", [FEW, pytest.param(TRIES, marks=pytest.mark.long)])
 MAX_LOG = 150_000  # bytes of a real log per try
 
 Rows = Counter[tuple[str, bytes]]  # topic and values of messages

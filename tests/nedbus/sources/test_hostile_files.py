@@ -109,7 +109,7 @@ def test_recording_beyond_a_limit_has_reason(
     assert reason in reasons
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", log_limits.LIMITS)
 def test_log_beyond_a_limit_is_read_within_limits(start: Start, tmp_path: Path, kind: str) -> None:
     """All code that reads logs stays within limits of time and memory, whatever the formats describe."""
@@ -117,7 +117,7 @@ def test_log_beyond_a_limit_is_read_within_limits(start: Start, tmp_path: Path, 
     _check(start, tmp_path / "limits.ulg")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", LIMITS)
 def test_recording_beyond_a_limit_is_read_within_limits(
     start: Start, tmp_path: Path, kind: str

@@ -149,13 +149,13 @@ def test_duckdb_selects_the_rows_of_numpy(special: Path, tmp_path: Path) -> None
     assert np.isinf(array["vxy_max"]).any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_duckdb_selects_the_rows_of_numpy_for_all_limits(special: Path, tmp_path: Path) -> None:
     """The same holds for every limit of float32 and of float64."""
     assert different_filters(special, tmp_path, {"vxy_max": LIMITS, "ref_lat": LIMITS}) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.logs
 def test_duckdb_selects_the_rows_of_numpy_in_a_real_log(tmp_path: Path) -> None:
     """The same holds for a log of PX4 1.16, in which vxy_max is infinite; ref_lat is a float64."""

@@ -171,6 +171,7 @@ def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
     assert [x for x, _ in marks_of(parts["flags"], "|")] == [1.0, 2.0, 3.0, 4.0, 5.0]
 
 
+@pytest.mark.long
 def test_events_are_marked_by_severity() -> None:
     """A condition is drawn as a bar from start to end; the shape of a marker shows its severity."""
     lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix lost: 3D to none")
@@ -307,6 +308,7 @@ def test_fields_are_drawn_by_name() -> None:
         plot.draw_field_figure([(address, array)], ["delta_xy"], title="a")
 
 
+@pytest.mark.long
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL, reason="no real logs")
 def test_plot_command_draws_angles(tmp_path: Path) -> None:
@@ -321,7 +323,7 @@ def test_plot_command_draws_angles(tmp_path: Path) -> None:
     assert "unknown field 'rol_deg'" in run_command(*command, "--field", "rol_deg").err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plot_command_marks_events(tmp_path: Path) -> None:
     """`nedbus plot` marks the events of a simulated loss of GPS."""
     flight = tmp_path / "flight.mcap"
@@ -343,6 +345,7 @@ def test_plot_command_marks_events(tmp_path: Path) -> None:
     } <= texts
 
 
+@pytest.mark.long
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL, reason="no real logs")
 @pytest.mark.parametrize("path", [*SMALL, *LARGE], ids=lambda path: path.stem)

@@ -195,6 +195,7 @@ def test_other_certificates_cannot_publish_a_vehicle(join: Join, intruder: str) 
         assert list(reader.vehicles()) == ["1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("certificate", ["reader", "vehicle-2"])
 def test_script_learns_that_it_may_not_publish(join: Join, certificate: str) -> None:
     """A script whose certificate may not publish a vehicle gets a typed error, at the publisher and at `flush`.
@@ -234,6 +235,7 @@ def test_allowed_publisher_is_probed_once(join: Join, monkeypatch: pytest.Monkey
     assert asked == ["1"]
 
 
+@pytest.mark.slow
 def test_refused_service_fails_at_the_end_of_its_sources(
     configured: tuple[Path, str], pki: Path, start: Start, *, tmp_path: Path
 ) -> None:
@@ -330,6 +332,7 @@ def test_incomplete_tls_settings_raise(
         nedbus.connect("tls/127.0.0.1:1", timeout=0.1)
 
 
+@pytest.mark.slow
 def test_commands_accept_certificates_as_flags_or_variables(
     secure: str, pki: Path, run_nedbus: Start
 ) -> None:
@@ -416,6 +419,7 @@ def test_px4_without_tls_is_bridged_to_the_secure_router(
     assert "no.crt cannot be read" in invalid.err
 
 
+@pytest.mark.slow
 def test_list_suggests_info_if_a_service_replies(secure: str, pki: Path, run_nedbus: Start) -> None:
     """If a service replies but no vehicle is visible, `list` suggests `nedbus info` instead of `nedbus serve`."""
 

@@ -105,6 +105,7 @@ def test_number_of_excluded_vehicles_is_bounded(
     assert len(tokens) == 2 * LIMIT + 3
 
 
+@pytest.mark.slow
 def test_names_that_are_too_long_count_as_one_vehicle(
     endpoint: str, zenoh_session: Session, limits: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:

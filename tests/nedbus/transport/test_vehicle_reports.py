@@ -222,6 +222,7 @@ def test_vehicle_without_a_service_has_no_forged_verdict(fleet: Fleet) -> None:
     assert "no faults" not in result.out
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_refusal_cannot_be_hidden_by_another_vehicle(fleet: Fleet, run_nedbus: Start) -> None:
     """A service that is refused for vehicle 3 stays so in `info`, whatever vehicle 1 reports under its id."""
@@ -421,7 +422,7 @@ def peak_memory(process: Process) -> int:
     return int(status.partition("VmHWM:")[2].split()[0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_flood_of_reports_and_heartbeats_takes_little_memory(
     fleet: Fleet, pki: Path, start: Start, run_nedbus: Start
 ) -> None:

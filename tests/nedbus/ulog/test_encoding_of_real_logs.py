@@ -60,7 +60,7 @@ def test_first_messages_are_encoded_as_their_fields(path: Path) -> None:
         assert compare(file.read(SIZE))["valid"] > 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
 def test_all_messages_are_encoded_as_their_fields(path: Path) -> None:
     """As above, for the whole log."""

@@ -159,6 +159,7 @@ def test_service_and_reader_detect_the_expected_events() -> None:
         assert {each["kind"] for each in invalid["evidence"]} >= {"gps_fix_lost"}
 
 
+@pytest.mark.long
 # at the end of a silence, between the arrival of a sample and its reading
 @example(step=10.0, at=20.0)
 @given(step=st.sampled_from([-3600.0, -1.0, 10.0, 3600.0]), at=st.floats(0.0, LENGTH))

@@ -848,6 +848,7 @@ def test_gone_vehicle_is_forgotten_after_an_hour() -> None:
     assert set(event_log.vehicles) == {"here"}
 
 
+@pytest.mark.long
 def test_last_fifty_gone_vehicles_are_remembered() -> None:
     """The last fifty gone vehicles, and all that left within the last minute, are remembered."""
     flight = Flight()

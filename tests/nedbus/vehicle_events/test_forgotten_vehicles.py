@@ -86,6 +86,7 @@ class World:
         }
 
 
+@pytest.mark.long
 def test_state_of_vehicles_that_come_and_go_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """After hundreds of vehicles, eight at a time, only those of the last minute and fifty more are kept."""
     world = World(monkeypatch)

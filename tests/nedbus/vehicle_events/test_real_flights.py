@@ -656,7 +656,7 @@ def convert_whole(path: Path, folder: Path) -> Path:
     return converted
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_conversion_has_the_same_events_and_verdict(path: Path, tmp_path: Path) -> None:
     """A log and its conversion, which hold the messages in different orders, have the same events and verdict."""
@@ -667,7 +667,7 @@ def test_conversion_has_the_same_events_and_verdict(path: Path, tmp_path: Path) 
     assert verdict(converted).text == verdict(path).text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_samples_of_a_replay_and_its_recording_have_the_same_events_and_verdict(
     path: Path, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
@@ -719,7 +719,7 @@ def texts_of(verdicts: Mapping[str, Verdict]) -> list[str]:
     return [story.what for verdict in verdicts.values() for story in verdict.stories]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["foreign_stop_in_flight", "gps_off_in_flight"])
 def test_replay_and_its_recording_have_the_same_events(
     name: str, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path

@@ -86,6 +86,7 @@ def shown(player: Player) -> object:
     return found
 
 
+@pytest.mark.long
 def test_recording_plays_at_the_selected_speed(
     recording: Recording, clock: SimpleNamespace
 ) -> None:
@@ -252,7 +253,7 @@ def test_url_of_a_recording_restores_the_moment(recording: Recording) -> None:
         assert other.panel(part) == page.panel(part)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("clock")
 def test_invalid_time_in_the_url_is_ignored(recording: Recording) -> None:
     """If the time in the URL is invalid or outside the recording, the page opens at a time within it."""
@@ -260,7 +261,7 @@ def test_invalid_time_in_the_url_is_ignored(recording: Recording) -> None:
         assert 0 <= open_page(recording, query=query).player.time <= recording.length
 
 
-@pytest.mark.slow  # test_viewer.py tests the same on a live page
+@pytest.mark.long  # test_viewer.py tests the same on a live page
 @pytest.mark.usefixtures("clock")
 def test_malformed_actions_leave_the_recording_playable(recording: Recording) -> None:
     """No action, index or time from a browser breaks the page or moves the position outside the recording."""

@@ -147,6 +147,7 @@ def test_page_above_the_viewer_limit_shows_a_notice(
         assert [root.text for root in session.document.roots if isinstance(root, Div)] == [text]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
 def test_requests_without_websocket_do_not_count_as_viewers(
     monkeypatch: pytest.MonkeyPatch, url: str

@@ -375,6 +375,7 @@ def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
         )
 
 
+@pytest.mark.long
 def test_attitude_is_shown_as_angles_in_degrees(sim: SimulatedFleet) -> None:
     """Below the tiles are roll, pitch and yaw of the attitude, "-" if it is unknown, with an age if it is silent."""
     attitude = Address("wing", "vehicle_attitude")
@@ -857,6 +858,7 @@ MALFORMED = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_malformed_input_from_the_browser_is_ignored(faulty_fleet: SimulatedFleet) -> None:
     """No action, index, size, update number, selection or range from a browser stops the updates of its page."""
     page = Page(faulty_fleet)

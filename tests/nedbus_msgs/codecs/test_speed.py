@@ -81,7 +81,7 @@ MAX_SPREAD = 1.5
 """Maximum ratio of the time for any flight to the time for the fastest flight, for the same operation."""
 
 
-@pytest.mark.slow  # concurrent tests would distort the measurement
+@pytest.mark.long  # concurrent tests would distort the measurement
 @pytest.mark.timeout(600)
 def test_hot_path_is_within_its_bounds(start: Start) -> None:
     """For each flight, each operation stays below its limits relative to the baseline and to the fastest flight."""

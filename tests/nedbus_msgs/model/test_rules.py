@@ -154,7 +154,7 @@ def test_no_message_of_a_short_flight_is_rejected(tmp_path: Path, name: str) -> 
     ] == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.logs
 @pytest.mark.parametrize("path", FLIGHTS, ids=lambda path: path.stem)
 def test_no_message_of_a_real_flight_is_rejected(tmp_path: Path, path: Path) -> None:

@@ -147,6 +147,7 @@ class WriterProxy:
             if self.expected <= number < request.stop and number not in self.held:
                 self._hold(number, arrival)
         if answers:
+            self.unresponsive = False
             lowest = request.first_available
             request.first_available = min(answers) if lowest is None else min(lowest, *answers)
             request.last_answered |= (
@@ -166,7 +167,6 @@ class WriterProxy:
         request.requested = None
         expired = request.deadline is not None and now >= request.deadline
         if request.last_answered:
-            self.unresponsive = False
             released = self._confirm_lowest(request, expired=expired)
         elif request.probe is not None:
             request.probe = request.stop - 1  # the probe may have left the cache

@@ -251,6 +251,7 @@ def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Tim
     assert "nothing arrived" in hz.err
 
 
+@pytest.mark.long
 def test_blocked_echo_does_not_delay_a_replay(
     run_nedbus: Start, endpoint: str, pause_echo: Callable[..., AbstractContextManager[Paused]]
 ) -> None:

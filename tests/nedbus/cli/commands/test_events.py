@@ -150,7 +150,7 @@ def test_converted_log_has_the_same_events(log: Path, tmp_path: Path) -> None:
 
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("read_once")
 def test_real_flight_has_expected_events() -> None:
     """A log of PX4 1.17 and its MCAP conversion yield the same events, with causes."""
@@ -227,6 +227,7 @@ def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
     )
 
 
+@pytest.mark.long
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.usefixtures("read_once")
@@ -267,6 +268,7 @@ def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
     assert run_command("why", log).out.startswith(begin)
 
 
+@pytest.mark.long
 def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Above the limit only the most recent events are shown, and stderr states the total."""
     monkeypatch.setattr(limits, "FILE_EVENTS", 2000)
@@ -441,6 +443,7 @@ def test_history_contains_px4_texts(
         assert 'PX4: "reset", PX4: "Failsafe activated"' in result
 
 
+@pytest.mark.long
 def test_events_live_are_printed_as_they_happen(
     run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
 ) -> None:
@@ -548,6 +551,7 @@ def test_every_event_kind_is_documented() -> None:
     assert sorted(kinds) == sorted(KINDS)
 
 
+@pytest.mark.slow
 def test_file_suffix_is_case_insensitive(log: Path, tmp_path: Path) -> None:
     """Every command accepts uppercase suffixes: FLIGHT.ULG, as on a FAT-formatted SD card, and FLIGHT.MCAP."""
     flight, converted = tmp_path / "FLIGHT.ULG", tmp_path / "FLIGHT.MCAP"

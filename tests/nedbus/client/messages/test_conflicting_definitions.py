@@ -174,7 +174,7 @@ def test_restart_with_other_firmware_changes_fields(router: str) -> None:
 
 
 @pytest.mark.router
-@pytest.mark.slow
+@pytest.mark.long
 @hypothesis.given(steps=STEPS)
 def test_restarts_in_any_order_do_not_mix_up_fields(router: str, steps: Steps) -> None:
     """While vehicles and readers restart in any order, each message is read once, with the fields of its sender."""

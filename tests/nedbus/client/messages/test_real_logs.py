@@ -122,7 +122,7 @@ def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
     assert compared > 100_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @each_flight
 def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
     """A replay delivers all messages in the arrays."""
@@ -143,7 +143,7 @@ def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @each_flight
 def test_replayed_log_reaches_another_process(
     flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
@@ -167,7 +167,7 @@ def test_replayed_log_reaches_another_process(
     assert "0 rejected" in service.err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @each_flight
 def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None:
     """A converted recording has every message of every topic in the log, and lists the same fields as missing."""
@@ -230,7 +230,7 @@ def test_plot_of_topic_without_track_fails(tmp_path: Path) -> None:
     assert "vehicle_attitude has no track" in plot.err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plot_of_all_topics_draws_positions(tmp_path: Path) -> None:
     """With `-t "*"`, `nedbus plot` draws the topics that have a track."""
     drawn = run_command(

@@ -213,6 +213,28 @@ def test_unresponsive_publisher_gets_more_than_one_request_after_a_link_change(
     assert attempt() == 3
 
 
+def test_answer_shows_that_a_publisher_responds_even_if_its_end_comes_later(
+    timings: Timings,
+) -> None:
+    """A publisher that did not answer, and then does, gets more than one request for its next gap."""
+    inbox, now = make_queue("every"), 100.0
+    inbox.put([raw(0), raw(2)])
+    [writer] = inbox.gaps.requesting
+    for _ in range(2):
+        assert inbox.next_request(writer, now) == range(1, 2)
+        inbox.on_retransmission(writer, {}, ended=True, now=now)
+        now += timings.retransmit_timeout
+    assert inbox.counts.lost == 1
+    inbox.put([raw(4)])
+    assert inbox.next_request(writer, now) == range(3, 4)
+    inbox.on_retransmission(writer, {3: raw(3)}, ended=False, now=now)
+    inbox.on_retransmission(writer, {}, ended=True, now=now)
+    inbox.put([raw(6)])
+    assert inbox.next_request(writer, now) == range(5, 6)
+    inbox.on_retransmission(writer, {}, ended=True, now=now)
+    assert inbox.counts.lost == 1
+
+
 @pytest.mark.parametrize(
     ("mode", "arriving", "losses", "counts"),
     [

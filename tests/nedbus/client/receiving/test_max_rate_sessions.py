@@ -345,6 +345,7 @@ def test_stream_that_is_not_downsampled_is_logged_once(
         assert subscription.counts == nedbus.Counts(received=2)
 
 
+@pytest.mark.long
 def test_vehicle_with_too_many_tokens_hides_no_stream_without_downsampling(
     endpoint: str,
     bus: nedbus.Bus,

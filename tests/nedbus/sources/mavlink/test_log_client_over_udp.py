@@ -154,7 +154,7 @@ def test_recorded_stream_arrives_completely() -> None:
     assert link.reassembly.bytes + link.reassembly.skipped == recorded_bytes("default_topics")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "impairment",
     [

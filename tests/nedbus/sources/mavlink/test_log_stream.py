@@ -278,6 +278,7 @@ def test_stream_replaces_converted_topics(timings: Timings) -> None:
     }
 
 
+@pytest.mark.long
 @recorded_flight
 @pytest.mark.parametrize(("name", "messages", "lost", "gaps", "impairment"), [
     # lost by PX4 after the header, and in the gap of its own log

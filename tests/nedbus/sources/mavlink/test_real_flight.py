@@ -72,7 +72,7 @@ def is_same(name: str, converted: Any, logged: Any) -> bool:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_converted_messages_equal_log() -> None:
     """Each converted message is valid, in order, and equals the logged one within MAVLink's resolution."""
     rows: dict[tuple[str, int | None], list[Any]] = defaultdict(list)

