@@ -67,3 +67,22 @@ def test_message_that_was_sent_twice_keeps_its_place_in_a_later_batch() -> None:
     assert [message.timestamp for message in found] == sorted(
         message.timestamp for message in found
     )
+
+
+@pytest.mark.parametrize("streams", ["ab", "abc"])
+def test_three_streams_that_go_on_together_show_a_pause(streams: str) -> None:
+    """The timestamps of two streams may be damaged together; three streams with the same step show a pause."""
+    pause = 30_000_000
+    messages = [
+        Message(n * STEP, UNIX + n * STEP, logged=name) for n in range(1, 40) for name in "abcd"
+    ]
+    last = messages[-1]
+    for name in streams:
+        messages.append(Message(last.timestamp + pause, last.time + STEP, logged=name))
+    for n in range(1, 10):
+        stamp = last.timestamp + n * STEP
+        messages.append(Message(stamp, last.time + n * STEP, logged="d"))
+    order = Order[Message]()
+    [*order.arrange(messages)]
+    is_pause = order.duration > pause / 1e6
+    assert is_pause == (streams == "abc")
