@@ -179,7 +179,7 @@ def _decode_table(
         messages[name] = [convert(*values) for values in rows]
     decoded.valid[:] = arrays_of(definition).valid_mask(messages)
     for name in stream.strict_bools & columns.keys():
-        is_no_bool = columns[name].astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
+        is_no_bool = columns[name].astype(np.int64) > 1  # a byte that is neither 0 nor 1
         # of any element, if the field is an array
         is_invalid = is_no_bool.reshape(len(table), -1).any(axis=1)
         decoded.valid[is_invalid] = False

@@ -93,6 +93,33 @@ def test_fields_unknown_to_px4_are_skipped_and_listed(tmp_path: Path, where: str
     assert_complete(path, warnings=(left_out,))
 
 
+@pytest.mark.parametrize("value", [2, 3, 128, 255])
+@pytest.mark.parametrize("name", ["xy_valid", "gust"])
+@pytest.mark.parametrize("count", [10, 1000])
+def test_message_with_a_bool_of_another_value_is_invalid(
+    tmp_path: Path, value: int, name: str, count: int
+) -> None:
+    """A byte of a bool is 0 or 1, also in a field that is left out; samples and arrays leave out the same message."""
+    xy_valid = 20  # its place in the payload
+
+    def change(payload: bytes) -> bytes:
+        """Add the field `gust` to a payload, and change one of its bools."""
+        is_changed = payload == changed
+        if is_changed and name == "gust":
+            return payload + bytes([value])
+        if is_changed:
+            payload = payload[:xy_valid] + bytes([value]) + payload[xy_valid + 1 :]
+        return payload + bytes([1])
+
+    changed = encode_cdr(downgrade(message(5, x=4.0), "1.16"), layout="1.16")
+    definition = message_definition("1.16") + "bool gust\n"
+    path = write_bag(tmp_path / "a.mcap", range(count), definition=definition, change=change)
+    valid = [number for number in range(count) if number != 4]
+    assert nedbus.read(path)["x"].tolist() == valid
+    messages = open_replay(f"mcap:{path}").messages
+    assert [each.fields["x"] for each in messages if not each.error] == valid
+
+
 def test_definition_that_matches_no_release_raises(tmp_path: Path) -> None:
     """A definition that lacks required fields, or has them with other types, raises; the error names the fields."""
     text = (
