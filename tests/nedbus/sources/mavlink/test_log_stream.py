@@ -22,6 +22,7 @@ from nedbus import limits
 from nedbus.client import LogStreamStatus
 from nedbus.mavlink.log_reassembly import Chunk, Reassembly
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
+from nedbus.sources.mavlink import log_stream
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
@@ -276,6 +277,18 @@ def test_stream_replaces_converted_topics(timings: Timings) -> None:
         "vehicle_attitude",
         "vehicle_local_position",
     }
+
+
+@pytest.mark.parametrize(
+    ("spread", "count", "is_known"),
+    [(19, 100, True), (21, 100, False), (19, 98, False), (30, 220, False), (30, 230, True)],
+)
+def test_mean_size_is_known_within_two_percent(*, spread: int, count: int, is_known: bool) -> None:
+    """The mean size of messages is known from 100 messages on, once its standard error is at most 2 %."""
+    sizes = log_stream._MeanSize()
+    sizes.add([100 - spread, 100 + spread] * (count // 2))
+    assert sizes.is_known == is_known
+    assert sizes.mean == 100
 
 
 @pytest.mark.long
