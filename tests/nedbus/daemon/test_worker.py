@@ -238,6 +238,30 @@ def test_replay_waits_only_for_its_first_subscriber() -> None:
     assert harness.times[:3] == [1.0, 1.5, 1.5]
 
 
+@dataclass
+class LateReplay(FakeReplay):
+    """A replay whose second stream is found half a second after the first one."""
+
+    def open(self) -> ReplayRun:
+        addresses: dict[Address, Definition[Any]] = {ONE: DEFAULT}
+
+        def read() -> Iterator[SourceMessage]:
+            yield at(0.0)
+            addresses[TWO] = DEFAULT
+            yield at(0.5, TWO)
+
+        return ReplayRun(read(), addresses, 2, "a flight")
+
+
+def test_loop_keeps_the_publishers_of_streams_that_start_later() -> None:
+    """A stream that is found during the first run is open from the begin of the next ones, and is not closed between."""
+    harness = run(LateReplay([], loop=True), FakeClock(stop_at=2.2))
+    assert [time for time, _ in harness.registry.published[TWO]] == [0.5, 1.0, 1.5, 2.0]
+    opened = harness.registry.log[:2]
+    assert opened == ["0 +1 ulog", "0.5 +2 ulog"]
+    assert [line for line in harness.registry.log if float(line.split()[0]) < 2.0] == opened
+
+
 def test_looped_replay_has_a_minimum_duration() -> None:
     """Each run of a loop takes at least 0.1 s, however short the log is."""
     harness = run(FakeReplay([at(0.0)], loop=True), FakeClock(stop_at=1.0))
