@@ -254,7 +254,7 @@ class LateReplay(FakeReplay):
 
 
 def test_loop_keeps_the_publishers_of_streams_that_start_later() -> None:
-    """A stream that is found during the first run is open from the begin of the next ones, and is not closed between."""
+    """A stream that is found during the first run stays open between runs."""
     harness = run(LateReplay([], loop=True), FakeClock(stop_at=2.2))
     assert [time for time, _ in harness.registry.published[TWO]] == [0.5, 1.0, 1.5, 2.0]
     opened = harness.registry.log[:2]
