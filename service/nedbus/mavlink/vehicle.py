@@ -211,9 +211,10 @@ class Vehicle:
         is_redundant = name == "ATTITUDE" and self._has_quaternion(now)
         if topic not in self._topics or timestamp is None or is_redundant:
             return None
-        return self._publish(
-            self._address_of(topic, message), convert(message), timestamp, now, log
-        )
+        address = self._address_of(topic, message)
+        if _is_streamed(address, log):  # usual with `log=`, so it is not converted first
+            return None
+        return self._publish(address, convert(message), timestamp, now, log)
 
     def _add_origin(self, message: Any, now: float) -> None:
         if has_origin(message):
@@ -223,7 +224,7 @@ class Vehicle:
     def _add_text(self, message: Any, now: float, log: StreamedTopics | None) -> Rejection | None:
         """Add a STATUSTEXT, unless it is not needed; return a Rejection if there are too many."""
         address = self._text_address
-        if address.topic not in self._topics or (log is not None and log.delivers(address)):
+        if address.topic not in self._topics or _is_streamed(address, log):
             return None
         if not self._text_limit.admits(round(now * 1e6)):
             reason = f"more than {limits.LOG_MESSAGES} log messages per second"
@@ -287,7 +288,7 @@ class Vehicle:
     ) -> Item | None:
         """Return the message of an address, from which unknown fields are left out; see `handle`."""
         known = {name: value for name, value in fields.items() if value is not None}
-        if not known or (log is not None and log.delivers(address)):
+        if not known or _is_streamed(address, log):
             return None
         if address.topic in _SENT_ONCE:
             placed = self._place_sample(address, timestamp)
@@ -363,3 +364,8 @@ class Vehicle:
         self.lost = 0
         self._certain = 0
         self._reset(now)
+
+
+def _is_streamed(address: Address, log: StreamedTopics | None) -> bool:
+    """Return whether the vehicle's ULog stream delivers the messages of an address."""
+    return log is not None and log.delivers(address)
