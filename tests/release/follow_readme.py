@@ -212,6 +212,8 @@ def _other_hosts(clone: Clone, blocks: list[Block], _: ExitStack) -> None:
 
 def main() -> None:
     """Follow the page; print each command, and raise AssertionError at the first fault."""
+    # Ctrl-C ends its commands also in a background job of a script, which ignores it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     handlers = dict(
         zip(SECTIONS, (_start, _your_vehicle, _everyday_commands, _other_hosts), strict=True)
     )
