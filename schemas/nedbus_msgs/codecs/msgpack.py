@@ -171,7 +171,9 @@ class Codec(Generic[M]):
                 row = unflatten(packed.unpack(values))
             else:
                 row = unpack(payload, use_list=False)[1:]
-            return row if passes_rules(row) else None
+            if passes_rules(row):
+                return row
+            return None
 
         return decode_full_width
 

@@ -382,7 +382,9 @@ def _older_value(older: RenamedField, values: Mapping[str, Any]) -> Any:
     value = values[name]
     if index is not None:
         value = value[index]
-    return value if older.down is None else older.down(value)
+    if older.down is None:
+        return value
+    return older.down(value)
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:

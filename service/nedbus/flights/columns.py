@@ -129,7 +129,10 @@ class _Part:
             return ""
         first_reason = ""
         for payload in payloads:
-            reason = None if self._are_usual([payload]) else self._stream.check(payload)
+            if self._are_usual([payload]):
+                reason = None
+            else:
+                reason = self._stream.check(payload)
             if reason:
                 first_reason = first_reason or reason
                 self._unusable.append(len(self))

@@ -39,7 +39,9 @@ def absent_topics(names: Collection[str], topics: Collection[str], where: str) -
 
 
 def _topics_of(name: str) -> Set[str]:
-    return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
+    if name in MESSAGES:
+        return MESSAGES[name].topics.keys()
+    return {name}
 
 
 def matching(
@@ -102,4 +104,6 @@ def require_one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle
 def _list(addresses: Sequence[Address]) -> str:
     text = ", ".join(map(str, addresses[: limits.SHOWN_NAMES]))
     more = len(addresses) - limits.SHOWN_NAMES
-    return f"{text} and {more} more" if more > 0 else text
+    if more > 0:
+        return f"{text} and {more} more"
+    return text

@@ -226,8 +226,9 @@ def _choose_streams(
         if topic != ANY and topic not in arrays:
             known = f"one of {', '.join(arrays)}"
             raise AddressError("topic", topic, known, problem="is not among these arrays")
-    is_all = not topics or ANY in topics
-    chosen = arrays if is_all else [name for name in arrays if name in names]
+    chosen = list(arrays)
+    if topics and ANY not in topics:
+        chosen = [name for name in arrays if name in names]
     return {name: StreamArray(arrays[name], {}) for name in chosen}
 
 
@@ -305,7 +306,10 @@ def _pick(messages: MessageArray, rows: _Ints) -> MessageArray:
     if is_absent.any():
         for field in values.dtype.names or ():
             base = values.dtype[field].base
-            values[field][is_absent] = np.nan if base.kind == "f" else base.type()
+            absent = base.type()
+            if base.kind == "f":
+                absent = np.nan
+            values[field][is_absent] = absent
     return values
 
 
@@ -332,7 +336,9 @@ def _interpolate(
             is_same = is_same.all(axis=1, keepdims=True)  # an equal element changes on the arc
             middle = _slerp(first, second, parts)
         else:
-            unit = definition.meaning(name) if definition else ""
+            unit = ""
+            if definition:
+                unit = definition.meaning(name)
             middle = _linear(first, second, parts, _period(unit))
         values[name][between] = np.where(is_same, first, middle)
 

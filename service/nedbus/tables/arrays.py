@@ -153,7 +153,10 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
     if library not in ("pandas", "polars"):
         raise ArgumentError("dataframe", library, "pandas or polars")
     package = import_optional(library, library)
-    convert = _pandas_column if library == "pandas" else _polars_column
+    if library == "pandas":
+        convert = _pandas_column
+    else:
+        convert = _polars_column
     columns: dict[str, Any] = {}
     for name in messages.dtype.names or ():
         values = messages[name]

@@ -75,7 +75,9 @@ class _Stream(NamedTuple):
         """Return the message nearest in time; None if it is far from that."""
         distances = np.abs(self.seconds - seconds)
         nearest = distances.argmin()
-        return self.messages[nearest] if distances[nearest] <= _NEAR else None
+        if distances[nearest] <= _NEAR:
+            return self.messages[nearest]
+        return None
 
 
 class _Row(NamedTuple):
@@ -245,7 +247,10 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
             known.update(_plottable(stream.messages))
         names = ", ".join(sorted(known))
         raise ConfigError("--field", f"no selected stream has a number {name!r}; they have {names}")
-    meaning = DERIVED[name].meaning if name in DERIVED else name
+    if name in DERIVED:
+        meaning = DERIVED[name].meaning
+    else:
+        meaning = name
     axes.set_title(meaning, fontsize="medium", loc="right", parse_math=False)
     axes.grid(alpha=0.3)
 
@@ -298,7 +303,10 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
         if begin is not None:
             utc.append(begin)
     has_utc = len(utc) == len(streams) and max(utc) - min(utc) < 1.0
-    shift = utc[0] if has_utc else start
+    if has_utc:
+        shift = utc[0]
+    else:
+        shift = start
     low, high = axes.get_xlim()
     low += shift
     high += shift
@@ -352,7 +360,8 @@ def _mark_ends(axes: Any, stream: _Stream) -> None:
     is_valid = stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])
     track = stream.messages[is_valid]
     if len(track):
-        first, last = track[0], track[-1]
+        first = track[0]
+        last = track[-1]
         color = stream.color
         axes.plot(first["y"], first["x"], "o", color=color, markersize=7, fillstyle="none")
         axes.plot(last["y"], last["x"], "s", color=color, markersize=4)
@@ -395,7 +404,9 @@ def _rows(streams: Sequence[_Stream]) -> list[_Row]:
     """Return the rows of all flags, of heading resets, and of other reset counters that change."""
     rows = []
     for stream in streams:
-        suffix = f" {stream.address}" if len(streams) > 1 else ""
+        suffix = ""
+        if len(streams) > 1:
+            suffix = f" {stream.address}"
         missing = missing_of(stream.messages)
         for flag in _FLAGS:
             if flag not in missing:
@@ -416,11 +427,16 @@ def _draw_flags(axes: Any, rows: Sequence[_Row]) -> None:
             axes.plot(times, heights, "|", color=stream.color, markersize=7)
             continue
         flag = stream.messages[field]
-        color = _WARNING_COLOR if field == "dead_reckoning" else stream.color
+        if field == "dead_reckoning":
+            color = _WARNING_COLOR
+        else:
+            color = stream.color
         before = np.append(False, flag[:-1])
         is_shown = flag | before  # fill to the first message without the flag
         axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
-    size = "x-small" if len(rows) > _MANY_ROWS else "small"
+    size = "small"
+    if len(rows) > _MANY_ROWS:
+        size = "x-small"
     axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=size)
     axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
@@ -439,7 +455,9 @@ def _marks(
         by_vehicle[stream.address.vehicle].append(stream)
     rows: dict[str, list[_Mark]] = {}
     for vehicle in sorted(by_vehicle):
-        suffix = f" {vehicle}" if len(by_vehicle) > 1 else ""
+        suffix = ""
+        if len(by_vehicle) > 1:
+            suffix = f" {vehicle}"
         seconds = np.concatenate([stream.seconds for stream in by_vehicle[vehicle]])
         period = float(seconds.min()), float(seconds.max())
         spans = spans_of([event for event in timed if event.vehicle == vehicle])
@@ -472,7 +490,10 @@ def _marks_of(
         begin = span.since + offset
         if not first - margin <= begin <= last + margin:
             continue
-        end = last if span.until is None else min(span.until + offset, last)
+        if span.until is None:
+            end = last
+        else:
+            end = min(span.until + offset, last)
         end = max(begin, end)
         row = KINDS[event.kind].row or event.kind.replace("_", " ")
         # Conditions that begin with the same event share a mark, which ends when the last condition ends.
@@ -487,7 +508,9 @@ def _text_of(event: Event, row: str) -> str:
     """Return the label of an event; none if it would repeat the name of its row."""
     if event.kind == "mode":
         return event.names[-1]
-    return "" if event.text == row else event.text
+    if event.text == row:
+        return ""
+    return event.text
 
 
 def _mark_events(

@@ -39,7 +39,9 @@ class _Stream(Generic[M]):
         """Return the part from a timestamp on, None if it does not advance."""
         items = [item for item in self.items if item.stamp >= start]
         part = _Stream(items)
-        return part if items and part.is_advancing else None
+        if items and part.is_advancing:
+            return part
+        return None
 
     def drop_old(self) -> None:
         """Leave out a first message that was sent long before the recording of its stream began."""

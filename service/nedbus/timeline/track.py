@@ -311,7 +311,9 @@ class Track(Generic[M]):
         gap = self._elapsed(change.first)
         if gap is None:
             is_reboot = not (change.is_ahead or change.is_unix or self.is_unix)
-            gap = change.first.stamp if is_reboot else 0
+            gap = 0
+            if is_reboot:
+                gap = change.first.stamp
         if change.is_unix and self.is_unix:
             self.changes += 1
         self._previous = _Part(self.base, self.lag)

@@ -25,7 +25,9 @@ class Decision:
 
     def __str__(self) -> str:
         if not self.is_default:
-            verb = "allows" if self.is_allowed else "denies"
+            verb = "denies"
+            if self.is_allowed:
+                verb = "allows"
             return f"rule {self.rules[0]} {verb} it"
         if self.is_allowed:
             return "no rule denies it"

@@ -101,7 +101,9 @@ class PositionDetector(ChangeDetector):
             return findings
         has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
         is_valid = self._state[0]
-        step = self._unexplained_step() if has_moved and is_valid else None
+        step = None
+        if has_moved and is_valid:
+            step = self._unexplained_step()
         if step is None and self._jump is None:
             return None
         return self._track_jump(step)
@@ -130,7 +132,9 @@ class PositionDetector(ChangeDetector):
         # as text, because NaN equals NaN
         is_same_origin = str(_origin_of(before)) == str(_origin_of(after))
         is_comparable = after["xy_valid"] and "xy" not in quantities and is_same_origin
-        step = self._unexplained_step() if is_comparable else None
+        step = None
+        if is_comparable:
+            step = self._unexplained_step()
         yield from self._track_jump(step)
 
     def _detect_origin(self, before: Fields, after: Fields) -> Iterator[Finding]:
@@ -219,7 +223,9 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         known.append(_describe(name, numbers))
     sizes = [abs(size) for name, size in numbers.items() if name != "heading"]
     is_small = not unknown and all(size < SMALL_RESET for size in sizes)
-    severity: Severity | None = "info" if is_small else None
+    severity: Severity | None = None
+    if is_small:
+        severity = "info"
     return Finding(
         "reset",
         "once",
@@ -306,7 +312,9 @@ def _move_of_origin(before: Fields, after: Fields) -> Finding | None:
     largest = max(distance, abs(up))
     if largest < _SMALLEST_MOVE:
         return None
-    severity: Severity | None = "info" if largest < SMALL_RESET else None
+    severity: Severity | None = None
+    if largest < SMALL_RESET:
+        severity = "info"
     text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
     numbers = {"distance": distance, "up": up}
     return Finding("origin_moved", "once", text, numbers=numbers, severity=severity)

@@ -137,10 +137,13 @@ def _report_of_vehicle(
     unreported = [condition for condition in faults if condition.begin.identity not in reported]
     kinds = [condition.kind for condition in state.conditions]
     topics = sorted(vehicle.topics, key=lambda topic: (topic not in TOPICS, topic))
+    since = None
+    if state.since is not None:
+        since = max(0.0, state.since + to_utc)
     return VehicleReport(
         severity=state.severity,
         text=state.text,
-        since=None if state.since is None else max(0.0, state.since + to_utc),
+        since=since,
         kinds=tuple(dict.fromkeys(kinds)),
         flags=flags,
         topics=tuple(topics[: limits.REPORTED_TOPICS]),

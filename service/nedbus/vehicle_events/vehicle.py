@@ -192,7 +192,10 @@ class Vehicle(Conditions):
         if (kind, "") in self.conditions or ("gone", "") in self.conditions:
             return
         silent = self.conditions.pop(("silent", ""), None)
-        since = self._main_time if silent is None else silent.since
+        if silent is None:
+            since = self._main_time
+        else:
+            since = silent.since
         age = max(0.0, time - since)
         text = f"gone: no publisher of {stream}"
         if kind == "silent":
@@ -266,7 +269,9 @@ class Vehicle(Conditions):
     @property
     def unknown(self) -> tuple[str, ...]:
         """Flags that the position estimate in use does not provide."""
-        return () if self._position is None else self._position.unknown
+        if self._position is None:
+            return ()
+        return self._position.unknown
 
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream; None if it has no events, or a preferred stream is in use."""
@@ -333,7 +338,9 @@ class Vehicle(Conditions):
 
     def _detector_of(self, topic: str, instance: int) -> ChangeDetector | None:
         """Return a detector for a topic other than the positions, None if it has no events."""
-        own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        own = None
+        if topic in BY_TOPIC:
+            own = detectors.detection_of(BY_TOPIC[topic].name)
         if topic in rules.AID_SOURCES:
             return AidDetector(
                 topic, lambda primary: primary == self._ekf, partial(self._explain, topic)
@@ -348,7 +355,8 @@ class Vehicle(Conditions):
             return None
         if topic == _EKF:
             own = own._replace(detect=partial(self._detect_flags, instance, own.detect))
-        return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
+        detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
+        return detector(*own)
 
     def _detect_flags(
         self,
@@ -360,7 +368,9 @@ class Vehicle(Conditions):
         if instance != self._ekf:
             return detectors.detect_unused(instance, before, after)
         flags = [after[name] for name in _VISION_FLAGS if after[name] is not None]
-        is_fused = any(flags) if flags else None
+        is_fused = None
+        if flags:
+            is_fused = any(flags)
         if is_fused != self._vision[0]:
             self._vision = is_fused, after["timestamp"]
         return detect(before, after)
@@ -419,7 +429,10 @@ class Vehicle(Conditions):
 
     def _set_boot(self, boot: float, time: float, *, is_queued: bool) -> None:
         """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
-        expected = boot if self.boot is None else self.boot + time - self.time
+        if self.boot is None:
+            expected = boot
+        else:
+            expected = self.boot + time - self.time
         was_off = self._is_off
         self._is_off = is_queued or abs(boot - expected) > 1e-6 * REORDER_WINDOW
         is_single = self._is_off and not was_off and not is_queued

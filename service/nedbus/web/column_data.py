@@ -108,8 +108,14 @@ class Tracks:
             east = point[_EAST]
             is_new_slot = position % self._step == 0
             is_broken = math.isnan(east) or (is_broken and not is_new_slot)
-            north = math.nan if is_broken else round(point[_NORTH], 2)
-            line = ring.lines.doubtful if point[_DOUBTFUL] > 0 else ring.lines.valid
+            if is_broken:
+                north = math.nan
+            else:
+                north = round(point[_NORTH], 2)
+            if point[_DOUBTFUL] > 0:
+                line = ring.lines.doubtful
+            else:
+                line = ring.lines.valid
             ring.put(position // self._step, round(east, 2), line, north)
         ring.put((end - 1) // self._step + 1, math.nan, ring.lines.valid, math.nan)
 

@@ -66,7 +66,9 @@ class Recording:
     @property
     def length(self) -> float:
         """Duration read so far [s]."""
-        return self.entries[-1].time if self.entries else 0.0
+        if self.entries:
+            return self.entries[-1].time
+        return 0.0
 
     def _read(self) -> None:
         replay = self._replay
@@ -133,7 +135,9 @@ class Player:
         elapsed = now - self._ticked
         self._ticked = now
         if self._play.active:
-            speed = float(self._speed.value) if self._speed.value in _SPEEDS else 1.0
+            speed = 1.0
+            if self._speed.value in _SPEEDS:
+                speed = float(self._speed.value)
             self.time = min(self.time + elapsed * speed, self.recording.length)
         if self._slider.value == self._shown:
             self._shown = round(self.time, 1)

@@ -83,7 +83,9 @@ def to_table(
         folded.add(first)
     table = Table(box=None, pad_edge=False, padding=(0, len(COLUMN_GAP), 0, 0), header_style="")
     for name in kept:
-        justify: Literal["left", "right"] = "left" if name in (first, last) else "right"
+        justify: Literal["left", "right"] = "right"
+        if name in (first, last):
+            justify = "left"
         table.add_column(name, justify=justify, no_wrap=name not in folded, overflow="fold")
     for row in shown:
         by_name = dict(zip(head, row, strict=True))
