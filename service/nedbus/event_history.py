@@ -57,13 +57,9 @@ class EventHistory:
         for name in selected:
             self._require(name)
         events = [event for event in self.events if event.vehicle in (ALL, *selected)]
+        reports = {name: self.reports[name] for name in selected}
         from_start = {name: text for name, text in self.from_start.items() if name in selected}
-        return replace(
-            self,
-            events=tuple(events),
-            reports={name: self.reports[name] for name in selected},
-            from_start=from_start,
-        )
+        return replace(self, events=tuple(events), reports=reports, from_start=from_start)
 
     def why(self, vehicle: str | int, *, at: str | None = None) -> Verdict:
         """Return the verdict on a vehicle: usable or not, since when, for how long, and why.
@@ -79,6 +75,7 @@ class EventHistory:
         report = self.reports[name]
         events = [event for event in self.events if event.vehicle in (name, ALL)]
         state = report.vehicles[name]
+        at_time = self._moment(at, events)
         verdict = verdict_of(
             name,
             events,
@@ -87,11 +84,11 @@ class EventHistory:
             unknown=state.unknown,
             times=self.times,
             end=report.now,
-            at=self._moment(at, events),
+            at=at_time,
             since=state.first,
         )
-        others = events_outside(verdict.stories, events)
-        return replace(verdict, others=tuple(others))
+        others = tuple(events_outside(verdict.stories, events))
+        return replace(verdict, others=others)
 
     def verdicts(self, vehicle: VehicleNames = ANY, *, at: str | None = None) -> dict[str, Verdict]:
         """Return the verdict on each vehicle, worst first, or on the named ones in this order; errors as of `why`."""

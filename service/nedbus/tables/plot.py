@@ -174,7 +174,8 @@ def draw_figure(
     label = _label_times(axes["altitude"], drawn, start, times)
     for name in {"speed", lowest}:
         axes[name].set_xlabel(label)
-    figure.supxlabel("\n".join(_missing_notes(drawn)), fontsize="small")
+    notes = "\n".join(_missing_notes(drawn))
+    figure.supxlabel(notes, fontsize="small")
     if marks:
         _draw_events(figure, axes["events"], marks)
     return figure
@@ -208,7 +209,8 @@ def draw_field_figure(
         _draw_field(axes[name], drawn, name)
     if len(drawn) > 1:
         first.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
-    axes[lowest].set_xlabel(_label_times(first, drawn, start, times))
+    label = _label_times(first, drawn, start, times)
+    axes[lowest].set_xlabel(label)
     if marks:
         _draw_events(figure, axes["events"], marks)
     return figure
@@ -303,21 +305,20 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
         if begin is not None:
             utc.append(begin)
     has_utc = len(utc) == len(streams) and max(utc) - min(utc) < 1.0
+    shift = start
+    unit = Times.unit("boot")
     if has_utc:
         shift = utc[0]
-    else:
-        shift = start
+        unit = Times.unit("vehicle")
     low, high = axes.get_xlim()
     low += shift
     high += shift
     step = _step_of(high - low)
-    ticks = np.arange(np.ceil(low / step), high / step) * step
+    first = np.ceil(low / step)
+    ticks = np.arange(first, high / step) * step
+    labels = [f"{tick:.7g}" for tick in ticks]
     if has_utc:
         labels = [format_utc(tick).removesuffix(".0") for tick in ticks]
-        unit = Times.unit("vehicle")
-    else:
-        labels = [f"{tick:.7g}" for tick in ticks]
-        unit = Times.unit("boot")
     axes.set_xticks(ticks - shift, labels)
     return f"time [{unit}]"
 
@@ -339,7 +340,8 @@ def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None
         messages = stream.messages
         tracks.append((messages["y"], messages["x"]))
         altitudes.append((stream.seconds, -messages["z"]))
-        speeds.append((stream.seconds, np.hypot(messages["vx"], messages["vy"])))
+        speed = np.hypot(messages["vx"], messages["vy"])
+        speeds.append((stream.seconds, speed))
     _draw_lines(axes["track"], streams, "xy_valid", tracks, width=1.2)
     _draw_lines(axes["altitude"], streams, "z_valid", altitudes, width=1.0)
     _draw_lines(axes["speed"], streams, "v_xy_valid", speeds, width=0.9)
@@ -368,8 +370,9 @@ def _mark_ends(axes: Any, stream: _Stream) -> None:
 
 
 def _mark_resets(axes: Any, stream: _Stream) -> None:
-    resets = np.union1d(stream.resets("z_reset_counter"), stream.resets("vz_reset_counter"))
-    for time in resets:
+    of_height = stream.resets("z_reset_counter")
+    of_speed = stream.resets("vz_reset_counter")
+    for time in np.union1d(of_height, of_speed):
         axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
 
 
@@ -384,7 +387,8 @@ def _draw_lines(
     """Plot a line per stream, thin where its flag is false; thin parts affect the limits only if nothing is valid."""
     has_valid = False
     for stream, (_, y) in zip(streams, lines, strict=True):
-        if np.any(stream.messages[flag] & np.isfinite(y)):
+        is_valid = stream.messages[flag] & np.isfinite(y)
+        if is_valid.any():
             has_valid = True
     for stream, (x, y) in zip(streams, lines, strict=True):
         # below all other lines
@@ -437,8 +441,10 @@ def _draw_flags(axes: Any, rows: Sequence[_Row]) -> None:
     size = "small"
     if len(rows) > _MANY_ROWS:
         size = "x-small"
-    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=size)
-    axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
+    labels = [row.label for row in rows]
+    axes.set_yticks(range(len(rows)), labels, fontsize=size)
+    limits = (len(rows) - 0.4, -0.6)
+    axes.set(title="flags and resets", ylim=limits)
     axes.grid(axis="x", alpha=0.3)
 
 
@@ -460,7 +466,8 @@ def _marks(
             suffix = f" {vehicle}"
         seconds = np.concatenate([stream.seconds for stream in by_vehicle[vehicle]])
         period = float(seconds.min()), float(seconds.max())
-        spans = spans_of([event for event in timed if event.vehicle == vehicle])
+        own = [event for event in timed if event.vehicle == vehicle]
+        spans = spans_of(own)
         for name, marks in _marks_of(spans, start, period).items():
             rows[name + suffix] = sorted(marks, key=lambda mark: mark.begin)
     return dict(sorted(rows.items(), key=lambda row: _rank(row[1])))
@@ -561,7 +568,8 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
             axes.broken_barh([bar], (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0)
             axes.plot(mark.begin, number, marker, color=color, markersize=size)
     axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
-    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
+    limits = (len(rows) - 0.4, -0.6)
+    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=limits)
     axes.grid(axis="x", alpha=0.3)
     figure.draw_without_rendering()  # computes the layout, on which the space for labels depends
     gap = _GAP * _DPI / 72  # pixels
@@ -569,7 +577,8 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
         limit = float(axes.get_window_extent().x1)
         for mark in reversed(marks):
             _draw_label(axes, mark, number, limit)
-            limit = float(axes.transData.transform((mark.begin, number))[0]) - gap
+            x, _ = axes.transData.transform((mark.begin, number))
+            limit = float(x) - gap
 
 
 def _draw_label(axes: Any, mark: _Mark, row: int, limit: float) -> None:

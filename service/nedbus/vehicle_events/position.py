@@ -99,7 +99,8 @@ class PositionDetector(ChangeDetector):
         findings = super().add(message, missing)
         if findings is not None:
             return findings
-        has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
+        has_moved = abs(motion[0] - before[0]) > _MIN_STEP
+        has_moved = has_moved or abs(motion[1] - before[1]) > _MIN_STEP
         is_valid = self._state[0]
         step = None
         if has_moved and is_valid:
@@ -145,7 +146,8 @@ class PositionDetector(ChangeDetector):
         is_back = self._left == returned_to and self.stamp - self.earlier <= 1e6 * WILD
         self._left = _Left(self.stamp, _origin_of(before))
         if is_back:
-            finding = replace(finding, numbers={**finding.numbers, ALONE: 1})
+            numbers = {**finding.numbers, ALONE: 1}
+            finding = replace(finding, numbers=numbers)
         yield finding
 
     def _unexplained_step(self) -> _Step | None:
@@ -155,8 +157,10 @@ class PositionDetector(ChangeDetector):
             return None
         before = _Motion._make(self._motion_before)
         motion = _Motion._make(self._motion)
-        north = motion.x - before.x - (motion.vx + before.vx) / 2 * seconds
-        east = motion.y - before.y - (motion.vy + before.vy) / 2 * seconds
+        mean_vx = (motion.vx + before.vx) / 2
+        mean_vy = (motion.vy + before.vy) / 2
+        north = motion.x - before.x - mean_vx * seconds
+        east = motion.y - before.y - mean_vy * seconds
         speed = math.hypot(motion.vx, motion.vy)
         limit = JUMP_DISTANCE + JUMP_SHARE * speed * seconds
         if north * north + east * east > limit * limit:
@@ -223,6 +227,7 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         known.append(_describe(name, numbers))
     sizes = [abs(size) for name, size in numbers.items() if name != "heading"]
     is_small = not unknown and all(size < SMALL_RESET for size in sizes)
+    is_large = any(size >= LARGE_CORRECTION for size in sizes)
     severity: Severity | None = None
     if is_small:
         severity = "info"
@@ -233,7 +238,7 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         tuple(quantities),
         numbers,
         severity=severity,
-        is_large=any(size >= LARGE_CORRECTION for size in sizes),
+        is_large=is_large,
     )
 
 
@@ -241,8 +246,9 @@ def _describe(name: Quantity, numbers: Mapping[str, float]) -> str:
     """Return the text for a quantity of a reset, whose `numbers` have its sizes."""
     reset = _RESETS[name]
     sizes = {key: numbers[key] for key in reset.names}
-    degrees = math.degrees(sizes[reset.names[0]])
-    return reset.text.format(**sizes, size=math.hypot(*sizes.values()), degrees=degrees)
+    first, *_ = sizes.values()
+    size = math.hypot(*sizes.values())
+    return reset.text.format(**sizes, size=size, degrees=math.degrees(first))
 
 
 def _sizes_of(reset: Event) -> dict[Quantity, float]:
@@ -252,7 +258,8 @@ def _sizes_of(reset: Event) -> dict[Quantity, float]:
         keys = _RESETS[name].names
         is_known = reset.numbers.keys() >= set(keys)
         if is_known and name in reset.names:
-            sizes[name] = math.hypot(*(reset.numbers[key] for key in keys))
+            values = [reset.numbers[key] for key in keys]
+            sizes[name] = math.hypot(*values)
     return sizes
 
 
@@ -305,7 +312,8 @@ def _has_origin(fields: Fields) -> bool:
 
 def _move_of_origin(before: Fields, after: Fields) -> Finding | None:
     projection = MapProjection(before["ref_lat"], before["ref_lon"])
-    distance = math.hypot(*projection.project(after["ref_lat"], after["ref_lon"]))
+    north, east = projection.project(after["ref_lat"], after["ref_lon"])
+    distance = math.hypot(north, east)
     up = after["ref_alt"] - before["ref_alt"]
     if not math.isfinite(up):
         up = 0.0

@@ -113,7 +113,8 @@ class Vehicle(Conditions):
             detector.resumes_at = time + detector.pause
         if address.topic in _FUSION_TOPICS:
             self._fusion.add(address.topic, message, address.instance)
-        self._before, detector.time = detector.time, time
+        self._before = detector.time
+        detector.time = time
         before = detector.stamp
         earlier = detector.earlier
         findings: Iterable[Finding] = detector.add(message, missing) or ()
@@ -159,7 +160,8 @@ class Vehicle(Conditions):
         self.last_seen = time
         if "rejected" not in self._bursts:
             text = f"{topic} rejected: {reason}"
-            self.emit(Finding("rejected", "begin", text, (topic, reason)), topic, time)
+            finding = Finding("rejected", "begin", text, (topic, reason))
+            self.emit(finding, topic, time)
         self._count("rejected", time, 1, topic)
 
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
@@ -173,9 +175,11 @@ class Vehicle(Conditions):
             self._update_duplicate(self.main.stream, time, is_duplicate=state == "duplicate")
         if state == "gone":
             self._fall_silent("gone", self.main.stream, time)
-        elif state == "stale" or (
-            state is None and is_connected and time - self._main_time > rules.SILENCE
-        ):
+            return
+        is_silent = state == "stale"
+        if state is None and is_connected:
+            is_silent = time - self._main_time > rules.SILENCE
+        if is_silent:
             self._fall_silent("silent", self.main.stream, time)
 
     def _update_duplicate(self, stream: str, time: float, *, is_duplicate: bool) -> None:
@@ -235,7 +239,8 @@ class Vehicle(Conditions):
             self.emit(finding, "", self._main_time - age_of_first)
         if resumed:
             text = kind.end.format(", ".join(resumed))
-            self.emit(Finding(kind.name, "end", text, tuple(resumed)), "", self._main_time)
+            finding = Finding(kind.name, "end", text, tuple(resumed))
+            self.emit(finding, "", self._main_time)
 
     def _reopen_unused(self) -> None:
         """Decide anew on the streams that had no detector, because another one was preferred."""
@@ -328,7 +333,8 @@ class Vehicle(Conditions):
             return None
         if address.topic != rules.POSITIONS[-1] or current.topic == rules.POSITIONS[-1]:
             return None
-        return ChangeDetector(_SAMPLE, (), partial(self._detect_equal, address.instance or 0))
+        detect = partial(self._detect_equal, address.instance or 0)
+        return ChangeDetector(_SAMPLE, (), detect)
 
     def _close_candidates(self) -> None:
         """Stop comparing the estimates of the EKFs with the vehicle's."""
@@ -341,12 +347,11 @@ class Vehicle(Conditions):
         own = None
         if topic in BY_TOPIC:
             own = detectors.detection_of(BY_TOPIC[topic].name)
+        explain = partial(self._explain, topic)
         if topic in rules.AID_SOURCES:
-            return AidDetector(
-                topic, lambda primary: primary == self._ekf, partial(self._explain, topic)
-            )
+            return AidDetector(topic, lambda primary: primary == self._ekf, explain)
         if topic in rules.VISION:
-            return VisionDetector(self._is_vision_fused, partial(self._explain, topic))
+            return VisionDetector(self._is_vision_fused, explain)
         if topic in REFERENCES:
             return ReferenceDetector(topic, self._comparison, own)
         if topic == MAGNETOMETER:
@@ -354,7 +359,8 @@ class Vehicle(Conditions):
         if own is None:
             return None
         if topic == _EKF:
-            own = own._replace(detect=partial(self._detect_flags, instance, own.detect))
+            detect = partial(self._detect_flags, instance, own.detect)
+            own = own._replace(detect=detect)
         detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
         return detector(*own)
 
@@ -381,7 +387,8 @@ class Vehicle(Conditions):
         if before and before["timestamp_sample"] == vehicle[0]:
             own = tuple(before[name] for name in _SAMPLE)
             self._equal[instance] = vehicle == own
-        if self._equal.get(instance) and not self._equal.get(self._ekf, True):
+        primary_is_equal = self._equal.get(self._ekf, True)
+        if self._equal.get(instance) and not primary_is_equal:
             yield detectors.selected(instance, None)
 
     def _sample_of_vehicle(self) -> tuple[object, ...]:
@@ -408,7 +415,8 @@ class Vehicle(Conditions):
 
         self._supersede(Address(self.name, _EKF, instance), is_over)
         for ekf in (old, instance):
-            detector = self._detectors.get(Address(self.name, _EKF, ekf))
+            address = Address(self.name, _EKF, ekf)
+            detector = self._detectors.get(address)
             if detector is not None:
                 for finding in detector.again(detectors.HEALTHY):
                     self.emit(finding, _EKF, self.time)

@@ -104,7 +104,8 @@ class EventTimeline:
         if cached is not None and end - cached.end < _VERDICT_AGE:
             return cached.verdict
         begin = end - PAST
-        events = self._by_vehicle.get(vehicle, [])[-limits.PAGE_STORY_EVENTS :]
+        events = self._by_vehicle.get(vehicle, [])
+        events = events[-limits.PAGE_STORY_EVENTS :]
         if self.times.is_live:
             events = [event for event in events if event.time > begin]
         known = self.event_log.vehicles.get(vehicle)

@@ -143,7 +143,8 @@ class Viewer:
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[: limits.PEER_TEXT]
-        if drawn.isdecimal() and self._sent - int(drawn) >= _WINDOW:
+        is_behind = drawn.isdecimal() and self._sent - int(drawn) >= _WINDOW
+        if is_behind:
             return
         self._sent += 1
         if self._drawn.value:
@@ -223,7 +224,8 @@ class Viewer:
         clock = ""
         if snapshot.time or player:
             clock = self._timeline.format_clock(snapshot.time)
-        wanted = str(self._search.value_input or "").strip().lower()
+        wanted = str(self._search.value_input or "")
+        wanted = wanted.strip().lower()
         rows = []
         for view in snapshot.vehicles:
             if wanted in f"{view.vehicle}\n{view.state.text}".lower():
@@ -306,9 +308,11 @@ class Viewer:
             set_time_range(self._plots.range, begin, end)
         else:
             first = max(begin, now - _MINUTE)
-            set_time_range(self._plots.range, first, min(first + _MINUTE, max(end, 1.0)))
+            last = min(first + _MINUTE, max(end, 1.0))
+            set_time_range(self._plots.range, first, last)
         events = self._events_of_chosen()
-        self._plots.mark_events(events, self._timeline.spans.get(vehicle, ()), end)
+        spans = self._timeline.spans.get(vehicle, ())
+        self._plots.mark_events(events, spans, end)
         self._update_timeline(snapshot, begin, end, now)
         if self._map.is_long:
             since = 0.0

@@ -52,7 +52,9 @@ def fit_columns(widths: Mapping[str, int], optional: Sequence[str], width: int) 
 
 
 def _width_of(columns: Sequence[str], widths: Mapping[str, int]) -> int:
-    return sum(widths[name] for name in columns) + len(COLUMN_GAP) * (len(columns) - 1)
+    text = sum(widths[name] for name in columns)
+    gaps = len(COLUMN_GAP) * (len(columns) - 1)
+    return text + gaps
 
 
 def to_table(
