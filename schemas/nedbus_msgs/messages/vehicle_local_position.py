@@ -219,10 +219,9 @@ def describe_flags(shares: Mapping[str, float]) -> str:
     bad |= {name: shares[name] for name in _WARNINGS if name in shares}
     invalid = [label for name, label in _VALID.items() if bad.get(name, 0.0) >= 1.0]
     unknown = [label for name, label in _VALID.items() if name not in shares]
+    texts = []
     if invalid:
-        texts = [f"{' '.join(invalid)} invalid"]
-    else:
-        texts = []
+        texts.append(f"{' '.join(invalid)} invalid")
     if len(unknown) == len(_VALID):
         texts.append("validity unknown")
     elif unknown:

@@ -97,8 +97,7 @@ class Columns:
         if len(parts) == 1:
             return parts[0]
         # The parts follow one another; sorted by part, the messages in file order have these places.
-        part_numbers = np.repeat(self._parts_of_runs, self._lengths)
-        by_part = np.argsort(part_numbers, kind="stable")
+        by_part = np.argsort(np.repeat(self._parts_of_runs, self._lengths), kind="stable")
         in_file_order = np.argsort(by_part)
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return Decoded(*(column[in_file_order] for column in columns))
@@ -227,7 +226,7 @@ def _decode_rows(definition: Definition[Any], rows: Collection[Mapping[str, Any]
     for index, fields in enumerate(rows):
         with suppress(ValidationError):
             message = upgrade_with(definition, fields)
-            (decoded.messages[index],) = arrays.of([message])
+            decoded.messages[index] = arrays.of([message])[0]
             decoded.valid[index] = True
             for name in definition.all_fields - message.model_fields_set:
                 decoded.absent[name][index] = True

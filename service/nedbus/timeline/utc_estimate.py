@@ -81,8 +81,7 @@ class UtcEstimate:
         unix = int(np.sum(is_unix))
         if unix > len(stamps) / 2:
             return UtcOffset("timestamp", 0, unix, 0)
-        other_stamps = _joined(others.values())
-        period = _period(other_stamps)
+        period = _period(_joined(others.values()))
         first_reason = ""
         for key, parts in sorted(self._sources.items()):
             times, offsets = np.concatenate(parts, axis=1)

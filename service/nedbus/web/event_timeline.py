@@ -169,10 +169,9 @@ class EventTimeline:
             self._by_vehicle.setdefault(event.vehicle, []).append(event)
         self._spans = {}
         for name, events in self._by_vehicle.items():
+            initial: list[Condition] = []
             if name in vehicles:
                 initial = list(vehicles[name].initial)
-            else:
-                initial = []
             self._spans[name] = spans_of(events, initial)
 
 

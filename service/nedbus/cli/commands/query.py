@@ -52,10 +52,9 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
     selection = Selection(ANY, vehicle or ANY)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=selection.vehicles)}
+    measured: dict[str, Health] = {}
     if newest:
         measured = _measured_by_services(bus)
-    else:
-        measured = {}
     selected = {address for address in everything if selection.matches(address)}
     streams = []
     for address in sorted(selected | newest.keys()):

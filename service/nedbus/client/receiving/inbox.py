@@ -330,10 +330,7 @@ class Inbox:
                 counted = 0 if arrival.codec is None else 1  # by `_start_reading`
             else:
                 with self._lock:
-                    if self._unread:
-                        taken = self._unread.pop_batch(max_messages)
-                    else:
-                        taken = []
+                    taken = self._unread.pop_batch(max_messages) if self._unread else []
                     losses = _take_losses(taken)
                 if self._ack_requests:
                     self.acknowledge(drained=False)
