@@ -66,12 +66,13 @@ def find_utc(
     if not isinstance(flight, str | Path):
         return _utc_of_samples(flight, vehicle)
     path = Path(flight).expanduser()
+    selection = Selection(vehicle=vehicle)
     with open_reader(path) as reader:
         offsets = read_utc(reader)
-        selection = Selection(vehicle=vehicle)
-        addresses = matching(path, sorted(reader.definitions), selection)
-        require_one_vehicle(path, addresses, vehicle)
-        return offsets[addresses[0].vehicle]
+        addresses = sorted(reader.definitions)
+    selected = matching(path, addresses, selection)
+    require_one_vehicle(path, selected, vehicle)
+    return offsets[selected[0].vehicle]
 
 
 def _utc_of_arrays(flight: Mapping[str, MessageArray]) -> UtcOffset | str:
@@ -126,7 +127,10 @@ def utc_of_columns(
         decoded = columns[address].decode(definition)
         estimate = estimates[address.vehicle]
         estimate.add(address.stream, decoded.utc_columns())
-    return {vehicle: estimate.result(reader.boot_utc) for vehicle, estimate in estimates.items()}
+    results = {}
+    for vehicle, estimate in estimates.items():
+        results[vehicle] = estimate.result(reader.boot_utc)
+    return results
 
 
 class FileUtc:

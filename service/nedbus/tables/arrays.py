@@ -151,7 +151,8 @@ def _start_of_vehicle(flight: Flight, addresses: Sequence[Address]) -> int:
             offsets.append(times - stamps)
     if not offsets:
         return 0
-    offset = round(np.median(np.concatenate(offsets)))
+    joined = np.concatenate(offsets)
+    offset = round(np.median(joined))
     return max(0, min(firsts) - offset)
 
 

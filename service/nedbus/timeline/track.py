@@ -225,7 +225,8 @@ class Track(Generic[M]):
                 stamp = item.stamp
             else:
                 stamp = self._stamp_of_outlier(item, newest)
-            placed.append(Placed(self.base + stamp, item))
+            place = self.base + stamp
+            placed.append(Placed(place, item))
         return placed
 
     def _stamp_of_outlier(self, item: Item[M], newest: int) -> int:

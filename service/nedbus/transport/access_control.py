@@ -33,7 +33,8 @@ class Decision:
             return "no rule denies it"
         if not self.rules:
             return "no rule is for such messages of this certificate"
-        return f"none of its rules includes this key: {', '.join(self.rules)}"
+        names = ", ".join(self.rules)
+        return f"none of its rules includes this key: {names}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,8 @@ class AccessControl:
         self._is_allowed_by_default = section["default_permission"] == "allow"
         # A limit of sizes has messages, flows and key expressions like a rule.
         self._size_limits = [_parse_rule(limit) for limit in filters]
-        rules = {rule["id"]: _parse_rule(rule) for rule in section["rules"] or ()}
+        parsed = [_parse_rule(rule) for rule in section["rules"] or ()]
+        rules = {rule.name: rule for rule in parsed}
         self._rules = defaultdict[str, list[AccessRule]](list)  # by subject
         for policy in section["policies"] or ():
             own = [rules[name] for name in policy["rules"] if name in rules]
@@ -79,11 +81,13 @@ class AccessControl:
         self._common: list[str] = []  # subjects of every certificate
         self._subjects = defaultdict[str, list[str]](list)  # of one, by its common name
         for subject in section["subjects"] or ():
-            if not subject["cert_common_names"]:
-                self._common.append(subject["id"])
+            name = subject["id"]
+            certificates = subject["cert_common_names"]
+            if not certificates:
+                self._common.append(name)
                 continue
-            for certificate in subject["cert_common_names"]:
-                self._subjects[certificate].append(subject["id"])
+            for certificate in certificates:
+                self._subjects[certificate].append(name)
 
     @property
     def certificates(self) -> list[str]:

@@ -99,8 +99,9 @@ class PositionDetector(ChangeDetector):
         findings = super().add(message, missing)
         if findings is not None:
             return findings
-        has_moved = abs(motion[0] - before[0]) > _MIN_STEP
-        has_moved = has_moved or abs(motion[1] - before[1]) > _MIN_STEP
+        north = abs(motion[0] - before[0])
+        east = abs(motion[1] - before[1])
+        has_moved = north > _MIN_STEP or east > _MIN_STEP
         is_valid = self._state[0]
         step = None
         if has_moved and is_valid:

@@ -71,8 +71,9 @@ class AccountReport:
     def about(self, vehicle: str) -> AccountReport:
         """Return what this report says about one vehicle; events of the link and the reader become its events."""
         vehicles = {}
-        if vehicle in self.vehicles:
-            vehicles[vehicle] = self.vehicles[vehicle]
+        known = self.vehicles.get(vehicle)
+        if known is not None:
+            vehicles[vehicle] = known
         events = []
         for event in self.events:
             if event.vehicle == vehicle:
@@ -90,11 +91,10 @@ class AccountReport:
         events_each = math.ceil(len(self.events) / number)
         parts = []
         for part in range(number):
-            first_name = part * vehicles_each
-            first_event = part * events_each
-            own = names[first_name : first_name + vehicles_each]
-            events = self.events[first_event : first_event + events_each]
-            vehicles = {name: self.vehicles[name] for name in own}
+            of_names = slice(part * vehicles_each, (part + 1) * vehicles_each)
+            of_events = slice(part * events_each, (part + 1) * events_each)
+            vehicles = {name: self.vehicles[name] for name in names[of_names]}
+            events = self.events[of_events]
             parts.append(replace(self, vehicles=vehicles, events=events))
         return parts
 

@@ -109,9 +109,8 @@ class EventTimeline:
         if self.times.is_live:
             events = [event for event in events if event.time > begin]
         known = self.event_log.vehicles.get(vehicle)
-        if known is None:
-            since = None
-        else:
+        since = None
+        if known is not None:
             since = max(known.first, begin)
         topics, held = self._evidence(vehicle)
         verdict = verdict_of(
@@ -131,7 +130,8 @@ class EventTimeline:
         for name in self._by_vehicle:
             for story in self._find_stories_cached(name, None):
                 faults.append((name, story))
-        return sorted(faults, key=lambda fault: fault[1].since)
+        faults.sort(key=lambda fault: fault[1].since)
+        return faults
 
     def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:
         events = self._by_vehicle.get(vehicle, [])
