@@ -231,7 +231,10 @@ def dtype_of(message: type[Message] | str) -> np.dtype[Any]:
 
 def to_array(messages: Sequence[M]) -> MessageArray:
     """Return messages of one class as a structured array."""
-    definition = messages[0].DEFINITION if messages else DEFAULT
+    if messages:
+        definition = messages[0].DEFINITION
+    else:
+        definition = DEFAULT
     return arrays_of(definition).of(messages)
 
 
@@ -257,7 +260,10 @@ def derive_column(messages: MessageArray, name: str) -> npt.NDArray[np.float64]:
     """Return a quantity of `frames.DERIVED` of each message, shape (n,); NaN where it is invalid."""
     derived = DERIVED[name]
     values = [messages[field].astype(np.float64).T for field in derived.fields]
-    is_valid = messages[derived.flag] if derived.flag else is_rotation(values[0])
+    if derived.flag:
+        is_valid = messages[derived.flag]
+    else:
+        is_valid = is_rotation(values[0])
     functions = Functions(np.sqrt, np.arctan2)
     with np.errstate(invalid="ignore", over="ignore"):  # of invalid values, which are replaced
         computed = derived.compute(functions, *values)

@@ -25,7 +25,9 @@ M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 def definition_of(message: type[M] | str) -> Definition[M]:
     """Return the definition of a message by class, name or topic; raise KeyError if it is unknown."""
     if isinstance(message, str):
-        return MESSAGES[message] if message in MESSAGES else BY_TOPIC[message]
+        if message in MESSAGES:
+            return MESSAGES[message]
+        return BY_TOPIC[message]
     return message.DEFINITION
 
 
@@ -66,7 +68,10 @@ def define(
     annotated: dict[str, Any] = {}
     for field, kind in types.items():
         is_required = field == "timestamp"
-        annotation = Timestamp if is_required else kind.annotation
+        if is_required:
+            annotation = Timestamp
+        else:
+            annotation = kind.annotation
         annotated[field] = annotation, Field(description=meanings.get(field))
     doc = "A message defined at run time."
     model = create_model(name, __base__=Message, __doc__=doc, **annotated)

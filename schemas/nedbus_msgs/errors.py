@@ -77,7 +77,10 @@ class InvalidMessageError(NedbusError, ValueError):
         message: str,
         index: int | None = None,
     ) -> None:
-        where = "" if index is None else f" at index {index}"
+        if index is None:
+            where = ""
+        else:
+            where = f" at index {index}"
         super().__init__(f"not a valid {message}{where}: {reason}")
         self.reason = reason
         self.violations = tuple(violations)

@@ -110,9 +110,13 @@ def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
     for part in encoding.split(";")[2:]:
         name, _, value = part.partition("=")
         parts[name] = value
-    source = parts.get("source", "")
+    source = parts.get("source")
+    if source is not None and not _SOURCE.fullmatch(source):
+        source = None
     digits = math.ceil(len(definition.names) / 4)
     missing = re.fullmatch(f"[0-9a-f]{{1,{digits}}}", parts.get("missing", ""))
-    mask = int(missing[0], 16) if missing else 0
+    mask = 0
+    if missing:
+        mask = int(missing[0], 16)
     fields = frozenset(name for index, name in enumerate(definition.names) if mask >> index & 1)
-    return Provenance(source if _SOURCE.fullmatch(source) else None, fields)
+    return Provenance(source, fields)

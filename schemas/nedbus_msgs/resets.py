@@ -172,10 +172,15 @@ def jump_of(name: Quantity, before: Mapping[str, Any], after: Mapping[str, Any])
         for value, distance in zip(_VALUES[name], motion.distances, strict=True)
     )
     if seconds <= 0 or not all(map(math.isfinite, step)):
-        return announced[0] if announced else None
+        if announced:
+            return announced[0]
+        return None
     if name == "heading":
         step = (wrap(step[0]),)
-    measured_interval = _MEASURED_INTERVAL if motion.is_known else _MEASURED_WITHOUT_RATES
+    if motion.is_known:
+        measured_interval = _MEASURED_INTERVAL
+    else:
+        measured_interval = _MEASURED_WITHOUT_RATES
     is_measured = seconds <= measured_interval
     if announced:
         best = min(announced, key=lambda jump: math.dist(jump, step))
@@ -192,7 +197,9 @@ def _announced_jumps(
     counter = RESET_COUNTERS[name]
     if (after[counter] - before[counter]) % 256 == 1:
         delta = after[f"delta_{name}"]
-        jumps.append(delta if isinstance(delta, tuple) else (delta,))
+        if not isinstance(delta, tuple):
+            delta = (delta,)
+        jumps.append(delta)
     origin_before = [before[field] for field in _ORIGIN]
     origin_after = [after[field] for field in _ORIGIN]
     if name in _FROM_ORIGIN and str(origin_before) != str(origin_after):

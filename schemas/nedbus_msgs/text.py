@@ -8,4 +8,6 @@ def counted(number: int, noun: str) -> str:
 
 def plural(number: int) -> str:
     """Return the ending of a regular noun after this number."""
-    return "" if number == 1 else "s"
+    if number == 1:
+        return ""
+    return "s"

@@ -78,7 +78,9 @@ class Address(_Hashed):
         if parts is None:
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
         vehicle, topic, instance = parts.groups()
-        return cls(vehicle, topic, None if instance is None else int(instance))
+        if instance is None:
+            return cls(vehicle, topic)
+        return cls(vehicle, topic, int(instance))
 
     def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression of this address."""
@@ -99,14 +101,18 @@ class Address(_Hashed):
     @property
     def stream(self) -> str:
         """The topic, with its instance where it has one: the part of the key after the vehicle."""
-        return self.topic if self.instance is None else f"{self.topic}/{self.instance}"
+        if self.instance is None:
+            return self.topic
+        return f"{self.topic}/{self.instance}"
 
     def __lt__(self, other: Address) -> bool:
         return self._order < other._order
 
     @property
     def _order(self) -> tuple[str, str, int]:
-        return self.vehicle, self.topic, -1 if self.instance is None else self.instance
+        if self.instance is None:
+            return self.vehicle, self.topic, -1
+        return self.vehicle, self.topic, self.instance
 
     def __str__(self) -> str:
         return f"{self.vehicle}/{self.stream}"
@@ -209,7 +215,9 @@ def _distinct(what: str, given: object) -> tuple[str, ...]:
             names.append(name)
     if not names:
         raise AddressError(what, given, f'at least one {what}, or "*" for all')
-    return (ANY,) if ANY in names else tuple(names)
+    if ANY in names:
+        return (ANY,)
+    return tuple(names)
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -264,7 +272,9 @@ def prefix_of(key: str) -> str:
     prefix = chunks[:-1]  # without the vehicle
     # `<domain>/fmu/out/vehicle_local_position`
     is_ros2_domain = bool(prefix) and prefix[0].isdecimal()
-    return "" if is_ros2_domain else "/".join(prefix)
+    if is_ros2_domain:
+        return ""
+    return "/".join(prefix)
 
 
 def ack_key(key_expr: str) -> str:
@@ -322,7 +332,9 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
         name, digits = parts.groups()
     if digits is not None:
         return namespace, name, int(digits)
-    return namespace, name, 0 if get_topic(name).instances else None
+    if get_topic(name).instances:
+        return namespace, name, 0
+    return namespace, name, None
 
 
 def is_vehicle_input(topic: str) -> bool:

@@ -39,7 +39,9 @@ def format_duration(seconds: float) -> str:
         return f"{max(0.0, seconds) * 1e3:.0f} ms"
     if seconds < 120:
         return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+    if seconds < 7200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.0f} h"
 
 
 def format_utc(utc: float) -> str:
@@ -50,6 +52,6 @@ def format_utc(utc: float) -> str:
 
 def format_since(since: float | None, now: float) -> str:
     """Format the start of a condition as a suffix for its text; "" if unknown."""
-    return (
-        "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"
-    )
+    if since is None:
+        return ""
+    return f", since {format_utc(since)} UTC ({format_duration(now - since)})"

@@ -57,7 +57,10 @@ def dial_endpoint(endpoint: str) -> str:
 def split_http(where: str) -> tuple[str, int]:
     """Parse HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
     host, _, port = where.rpartition(":")
-    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if host.startswith("[") and host.endswith("]"):
+        bare = host[1:-1]
+    else:
+        bare = host
     if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
         raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
     return bare, int(port)

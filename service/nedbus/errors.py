@@ -184,7 +184,8 @@ class RefusedError(NedbusError, PermissionError):
             f"the router refuses messages of vehicle {vehicle}, so they reach no reader: its access rules must allow"
             f" them for the certificate {certificate} ('nedbus pki rules', docs/security.md)"
         )
-        self.vehicle, self.certificate = vehicle, certificate
+        self.vehicle = vehicle
+        self.certificate = certificate
 
 
 class ReceiveError(NedbusError, RuntimeError):

@@ -35,12 +35,16 @@ class EventHistory:
     @property
     def vehicles(self) -> dict[str, VehicleReport]:
         """The state of each vehicle at the end, worst first."""
-        return {name: report.vehicles[name] for name, report in self.reports.items()}
+        states = {}
+        for name, report in self.reports.items():
+            states[name] = report.vehicles[name]
+        return states
 
     @property
     def end(self) -> float:
         """The time of the last message, or in live data now, on the clock of `event.time` [s]."""
-        return max((report.now for report in self.reports.values()), default=0.0)
+        ends = [report.now for report in self.reports.values()]
+        return max(ends, default=0.0)
 
     def utc(self, event: Event) -> float | None:
         """Return the Unix time of an event [s], None if unknown."""
@@ -56,14 +60,11 @@ class EventHistory:
         selected = selection.vehicles
         for name in selected:
             self._require(name)
-        events = [event for event in self.events if event.vehicle in (ALL, *selected)]
+        reports = {name: self.reports[name] for name in selected}
         from_start = {name: text for name, text in self.from_start.items() if name in selected}
-        return replace(
-            self,
-            events=tuple(events),
-            reports={name: self.reports[name] for name in selected},
-            from_start=from_start,
-        )
+        shown = (ALL, *selected)
+        events = [event for event in self.events if event.vehicle in shown]
+        return replace(self, events=tuple(events), reports=reports, from_start=from_start)
 
     def why(self, vehicle: str | int, *, at: str | None = None) -> Verdict:
         """Return the verdict on a vehicle: usable or not, since when, for how long, and why.
@@ -79,6 +80,7 @@ class EventHistory:
         report = self.reports[name]
         events = [event for event in self.events if event.vehicle in (name, ALL)]
         state = report.vehicles[name]
+        at_time = self._moment(at, events)
         verdict = verdict_of(
             name,
             events,
@@ -87,11 +89,11 @@ class EventHistory:
             unknown=state.unknown,
             times=self.times,
             end=report.now,
-            at=self._moment(at, events),
+            at=at_time,
             since=state.first,
         )
-        others = events_outside(verdict.stories, events)
-        return replace(verdict, others=tuple(others))
+        others = tuple(events_outside(verdict.stories, events))
+        return replace(verdict, others=others)
 
     def verdicts(self, vehicle: VehicleNames = ANY, *, at: str | None = None) -> dict[str, Verdict]:
         """Return the verdict on each vehicle, worst first, or on the named ones in this order; errors as of `why`."""

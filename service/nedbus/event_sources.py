@@ -63,7 +63,10 @@ def why(
 
     Raises the errors of `events` and of `EventHistory.why`.
     """
-    history = source.history() if _is_bus(source) else detect_events(source)
+    if _is_bus(source):
+        history = source.history()
+    else:
+        history = detect_events(source)
     return history.verdicts(vehicle, at=at)
 
 

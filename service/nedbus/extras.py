@@ -20,11 +20,10 @@ def import_optional(extra: str, module: str) -> Any:
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
         # Never suggest installing nedbus by its name alone: on PyPI, this name belongs to another project.
-        hint = (
-            f"in a nedbus clone, run pip install -e '.[{extra}]'"
-            if extra in EXTRAS
-            else f"run pip install {extra}"
-        )
+        if extra in EXTRAS:
+            hint = f"in a nedbus clone, run pip install -e '.[{extra}]'"
+        else:
+            hint = f"run pip install {extra}"
         raise ConfigError(missing, f"not installed; {hint}") from exc
 
 

@@ -153,7 +153,10 @@ class UnexpectedErrors(AbstractContextManager[None]):
         """Log an error and return True; return False for Ctrl-C and exit."""
         if isinstance(error, KeyboardInterrupt | SystemExit):
             return False
-        level = logging.DEBUG if self._logged else logging.ERROR
+        if self._logged:
+            level = logging.DEBUG
+        else:
+            level = logging.ERROR
         self._log.log(level, *self._text, exc_info=error, extra=about("internal_error"))
         self._logged = True
         return True

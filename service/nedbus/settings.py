@@ -291,7 +291,10 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
     valid = {name: value for name, value in values.items() if name not in wrong}
     for name in wrong.keys() & Settings.model_fields.keys():
-        split = split_sources if name == "source" else split_values
+        if name == "source":
+            split = split_sources
+        else:
+            split = split_values
         items = split(values.get(name))
         indices = wrong[name]
         if indices and isinstance(items, list | tuple):
@@ -362,7 +365,9 @@ def _find_key(text: str, name: str, start: int = 0) -> int:
     """Return the index of a key or table from `start` on, which `tomllib` does not report; -1 if there is none."""
     key = re.compile(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", re.MULTILINE)
     match = key.search(text, start)
-    return match.start(1) if match else -1
+    if match:
+        return match.start(1)
+    return -1
 
 
 def _find_source(text: str, sources: Sequence[object], index: int, option: str) -> int:
@@ -370,11 +375,15 @@ def _find_source(text: str, sources: Sequence[object], index: int, option: str) 
     source = sources[index]
     if isinstance(source, str):  # equal sources have equal mistakes
         quoted = re.search(rf"[\"']({re.escape(source)})[\"']", text)
-        return quoted.start(1) if quoted else _find_key(text, "source")
+        if quoted:
+            return quoted.start(1)
+        return _find_key(text, "source")
     tables = [
         match.start(1) for match in re.finditer(r"^[ \t]*\[\[[ \t]*(source)\b", text, re.MULTILINE)
     ]
     if index >= len(tables):  # tables within a list
         return _find_key(text, "source")
     table, end = [*tables, len(text)][index : index + 2]
-    return max(table, _find_key(text[:end], option, table) if option else table)
+    if not option:
+        return table
+    return max(table, _find_key(text[:end], option, table))

@@ -37,7 +37,10 @@ class CdrLayout:
         self.bool_mask = 0
         self.offsets: dict[str, int] = {}
         for name, kind in layout.types.items():
-            padding = 0 if kind.is_text else -size % kind.size
+            if kind.is_text:
+                padding = 0
+            else:
+                padding = -size % kind.size
             if padding:
                 body += f"{padding}x"
             body += kind.form
@@ -64,7 +67,10 @@ class CdrLayout:
             start = f"starts with {payload[:2].hex(' ')}" if payload else "empty"
             return f"the payload is not little-endian CDR ({start})"
         if not size <= len(payload) <= self.limit:
-            sizes = f"{size}" if self.limit == size else f"{size} to {self.limit}"
+            if self.limit == size:
+                sizes = f"{size}"
+            else:
+                sizes = f"{size} to {self.limit}"
             return f"{len(payload)} bytes, expected {sizes} for layout {self.name}"
         wrong = int.from_bytes(payload[:size], "little") & self.bool_mask
         if wrong:
@@ -84,7 +90,8 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     neither 0 nor 1.
     """
     cdr = cdr_layout(layout)
-    if reason := cdr.check(payload):
+    reason = cdr.check(payload)
+    if reason:
         raise DecodeError(f"{reason}{_explain_size(definition, payload, layout)}", definition.name)
     values = cdr.body.unpack_from(payload, len(HEADER))
     return cdr.validation.by_name(cdr.validation.unflatten(values))
@@ -109,7 +116,9 @@ def fitting_layout(definition: Definition[Any], payload: bytes) -> Layout | None
             with suppress(InvalidMessageError):
                 encode_upgraded(definition, decode_with(definition, payload, layout))
                 fitting.append(layout)
-    return fitting[0] if len(fitting) == 1 else None
+    if len(fitting) == 1:
+        return fitting[0]
+    return None
 
 
 def _explain_size(definition: Definition[Any], payload: bytes, layout: Layout) -> str:

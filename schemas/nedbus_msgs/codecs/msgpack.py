@@ -171,7 +171,9 @@ class Codec(Generic[M]):
                 row = unflatten(packed.unpack(values))
             else:
                 row = unpack(payload, use_list=False)[1:]
-            return row if passes_rules(row) else None
+            if passes_rules(row):
+                return row
+            return None
 
         return decode_full_width
 
@@ -206,21 +208,26 @@ class Codec(Generic[M]):
             raise EncodeError(f"{len(values)} values, expected {count}", self.definition.name)
         row = self._validation.check_row(values)
         if row is None:
-            return self.encode(self._to_model(self._by_name(values)))
+            fields = self._by_name(values)
+            return self.encode(self._to_model(fields))
         return self._encode_valid(row)
 
     def _encode_valid(self, row: Values) -> bytes:
         try:
             return self.encode_flat(self._flatten(row))
         except OverflowError:  # beyond float32; the model raises the error
-            return self.encode(self._to_model(self._by_name(row)))
+            fields = self._by_name(row)
+            return self.encode(self._to_model(fields))
 
     def _to_model(self, fields: Mapping[str, object]) -> M:
         try:
             return self.definition.model.model_validate(dict(fields))
         except ValidationError as exc:
             details = exc.errors(include_url=False)
-            violations = [(str(detail["loc"][0]), detail["msg"]) for detail in details]
+            violations = []
+            for detail in details:
+                name = str(detail["loc"][0])
+                violations.append((name, detail["msg"]))
             reason = describe(exc, self.definition)
             raise InvalidMessageError(reason, violations, message=self.definition.name) from exc
 
@@ -249,7 +256,8 @@ class Codec(Generic[M]):
         try:
             return upgrade_with(self.definition, fields)
         except ValidationError as exc:
-            raise DecodeError(describe(exc, self.definition), self.definition.name) from exc
+            reason = describe(exc, self.definition)
+            raise DecodeError(reason, self.definition.name) from exc
 
 
 @cached_on_owner
@@ -262,7 +270,8 @@ def describe(error: ValidationError, definition: Definition[Any]) -> str:
     """Format a validation error as one line: each field with the reason and its value."""
     reasons = []
     for detail in error.errors(include_url=False):
-        reason = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
+        place = ".".join(map(str, detail["loc"]))
+        reason = f"{place}: {detail['msg']}"
         if detail["type"] == "extra_forbidden":
             reason = definition.explain_unknown_field(str(detail["loc"][0]))
         if detail["type"] != "missing":

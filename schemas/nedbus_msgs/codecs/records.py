@@ -152,14 +152,19 @@ class _Conversion:
                 run = None
                 continue
             position = positions[old]
-            begin = position.start if isinstance(position, slice) else position
+            if isinstance(position, slice):
+                begin = position.start
+            else:
+                begin = position
             end = begin + kind.values
             if run is not None and run[1] == begin:
                 begin = run[0]
                 parts.pop()
             run = begin, end
-            is_single = end - begin == 1
-            parts.append(f"values[{begin}]" if is_single else f"*values[{begin}:{end}]")
+            if end - begin == 1:
+                parts.append(f"values[{begin}]")
+            else:
+                parts.append(f"*values[{begin}:{end}]")
         count = sum(kind.values for kind in types.values())
         self.text = f"({', '.join(parts)},)"
         if parts == [f"*values[0:{count}]"]:
@@ -175,7 +180,9 @@ class _Conversion:
             value = repr(kind.absent)
         if kind.is_text:
             return f"encode_text({value})"
-        return f"*{value}" if kind.is_array else value
+        if kind.is_array:
+            return f"*{value}"
+        return value
 
     def _call(self, name: str) -> str:
         """Return the call that converts a field, such as `convert0(values[3], nan)`; add its function."""

@@ -29,7 +29,9 @@ from nedbus_msgs.model.px4_types import (
 
 def _integer(value: float, scale: float) -> int:
     """Convert a value to an integer in units of 1 / scale; NaN and infinity become 0."""
-    return round(value * scale) if math.isfinite(value * scale) else 0
+    if math.isfinite(value * scale):
+        return round(value * scale)
+    return 0
 
 
 class SensorGps(Message):
@@ -197,14 +199,16 @@ class SensorGps(Message):
     def global_position(self) -> GlobalPosition | None:
         """Latitude, longitude [deg] [WGS84] and altitude above mean sea level [m]; None without a 3D fix."""
         has_fix = self.fix_type >= SensorGps.FIX_TYPE_3D
-        return (
-            GlobalPosition.wrapped(self.latitude_deg, self.longitude_deg, self.altitude_msl_m)
-            if has_fix
-            else None
-        )
+        if has_fix:
+            return GlobalPosition.wrapped(
+                self.latitude_deg, self.longitude_deg, self.altitude_msl_m
+            )
+        return None
 
     @property
     def velocity(self) -> Ned | None:
         """Velocity [m/s] [NED]; None without a fix, or while vel_ned_valid is false."""
         is_valid = self.vel_ned_valid and self.fix_type >= SensorGps.FIX_TYPE_2D
-        return Ned(self.vel_n_m_s, self.vel_e_m_s, self.vel_d_m_s) if is_valid else None
+        if is_valid:
+            return Ned(self.vel_n_m_s, self.vel_e_m_s, self.vel_d_m_s)
+        return None

@@ -204,7 +204,9 @@ class VehicleLocalPosition(Message):
     @property
     def global_position(self) -> GlobalPosition | None:
         """Position as latitude, longitude [deg] [WGS84] and altitude [m]; None without position and origin."""
-        return to_global(self) if self.position and self.origin else None
+        if self.position and self.origin:
+            return to_global(self)
+        return None
 
 
 def describe_flags(shares: Mapping[str, float]) -> str:
@@ -217,9 +219,13 @@ def describe_flags(shares: Mapping[str, float]) -> str:
     bad |= {name: shares[name] for name in _WARNINGS if name in shares}
     invalid = [label for name, label in _VALID.items() if bad.get(name, 0.0) >= 1.0]
     unknown = [label for name, label in _VALID.items() if name not in shares]
-    texts = [f"{' '.join(invalid)} invalid"] if invalid else []
-    if unknown:
-        texts.append(f"{'validity' if len(unknown) == len(_VALID) else ' '.join(unknown)} unknown")
+    texts = []
+    if invalid:
+        texts.append(f"{' '.join(invalid)} invalid")
+    if len(unknown) == len(_VALID):
+        texts.append("validity unknown")
+    elif unknown:
+        texts.append(f"{' '.join(unknown)} unknown")
     for name, share in bad.items():
         text = _WARNINGS.get(name) or f"{_VALID[name]} invalid"
         if 0.0 < share < 1.0:

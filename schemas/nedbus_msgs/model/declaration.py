@@ -132,5 +132,8 @@ class RenamedField:
         targets: list[tuple[str, int | None]] = []
         for target in self.new.split():
             field, bracket, index = target.rstrip("]").partition("[")
-            targets.append((field, int(index) if bracket else None))
+            if bracket:
+                targets.append((field, int(index)))
+            else:
+                targets.append((field, None))
         return targets

@@ -162,8 +162,9 @@ class Definition(Generic[M_co]):
         if all(layout.wire is None for layout in layouts.values()):
             # Without a declared number on the wire, the model's own fields have number 0.
             own = Layout(ALL)
+            types = list(self.types.items())
             for layout in list(layouts.values()):
-                if list(layout.types.items()) == list(self.types.items()):
+                if list(layout.types.items()) == types:
                     own = layouts.pop(layout.name)
                     break
             layouts[own.name] = replace(own, wire=0, types=self.types)
@@ -199,14 +200,16 @@ class Definition(Generic[M_co]):
     @cached_property
     def flat_row(self) -> type[FlatRow]:
         """The class of flattened values of this message."""
-        members: dict[str, Any] = {"__slots__": (), "_positions": positions_of(self.types)}
+        positions = positions_of(self.types)
+        members: dict[str, Any] = {"__slots__": (), "_positions": positions}
         return type(f"{self.name}FlatRow", (FlatRow,), members)
 
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout with this name or of this PX4 release; None if there is none."""
         if release not in RELEASES:
             return self.layouts.get(release)
-        until = RELEASES[: RELEASES.index(release) + 1]
+        index = RELEASES.index(release)
+        until = RELEASES[: index + 1]
         for earlier in reversed(until):
             if earlier in self.layouts:
                 return self.layouts[earlier]
@@ -244,11 +247,13 @@ class Definition(Generic[M_co]):
         copied: dict[str, str] = {name: name for name in names if name in self.types}
         converted: dict[str, FieldConversion] = {}
         for name in names:
-            if name in self.older:
-                self._add_older_field(self.older[name], copied, converted)
+            older = self.older.get(name)
+            if older is not None:
+                self._add_older_field(older, copied, converted)
         in_order = {name: copied[name] for name in self.types if name in copied}
         provided = frozenset([*copied, *converted])
-        return UpgradePlan(provided, self.all_fields - provided, in_order, converted)
+        missing = self.all_fields - provided
+        return UpgradePlan(provided, missing, in_order, converted)
 
     def _add_older_field(
         self,
@@ -262,10 +267,12 @@ class Definition(Generic[M_co]):
                 continue
             if index is not None:
                 sources: list[str | None] = [None] * self.types[name].values
-                conversion = converted.setdefault(name, FieldConversion(sources, _as_array))
+                empty = FieldConversion(sources, _as_array)
+                conversion = converted.setdefault(name, empty)
                 conversion.sources[index] = older.name
             elif older.up:
-                converted.setdefault(name, FieldConversion([older.name], older.up))
+                conversion = FieldConversion([older.name], older.up)
+                converted.setdefault(name, conversion)
             elif name not in converted:
                 copied[name] = older.name
 
@@ -382,7 +389,9 @@ def _older_value(older: RenamedField, values: Mapping[str, Any]) -> Any:
     value = values[name]
     if index is not None:
         value = value[index]
-    return value if older.down is None else older.down(value)
+    if older.down is None:
+        return value
+    return older.down(value)
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:

@@ -151,7 +151,9 @@ def _to_python(value: Any, kind: FieldType | None) -> object:
     if kind.is_array and isinstance(value, list | tuple):
         elements = tuple(_to_python(element, field_type(kind.base)) for element in value)
         is_unchanged = isinstance(value, tuple) and all(map(operator.is_, elements, value))
-        return value if is_unchanged else elements
+        if is_unchanged:
+            return value
+        return elements
     if kind.is_float and isinstance(value, str) and value in _FLOAT_NAMES:
         return float(value)
     return value

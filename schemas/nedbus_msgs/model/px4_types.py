@@ -98,11 +98,15 @@ class FieldType(str):
             return elements + (base.absent,) * (self.length - len(value))
         form = f"<{base.code}"
         try:
-            number = value if self.is_float or self.base == "bool" else int(value)
+            if self.is_float or self.base == "bool":
+                number = value
+            else:
+                number = int(value)
             (fitted,) = struct.unpack(form, struct.pack(form, number))
         except (TypeError, ValueError, OverflowError, struct.error):
             return None
-        return fitted if fitted == value or math.isnan(fitted) else None
+        fits = fitted == value or math.isnan(fitted)
+        return fitted if fits else None
 
     @cached_property
     def annotation(self) -> Any:

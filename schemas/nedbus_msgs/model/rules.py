@@ -108,7 +108,10 @@ class InRange(Rule):
         # A valid value must stay valid when rounded to float32; the bounds may be infinite.
         lowest = min(least, float32(least))
         highest = max(greatest, float32(greatest))
-        value = "element" if is_array else _value(field)
+        if is_array:
+            value = "element"
+        else:
+            value = _value(field)
         wrong = f"(({value} < {lowest!r}) or ({value} > {highest!r}))"
         if or_ is not None:
             wrong += f" and ({value} != {or_!r})"

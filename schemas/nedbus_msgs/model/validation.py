@@ -69,7 +69,9 @@ class Validation:
             row: Values = self.validate(values)
         except ValidationError:
             return None
-        return row if self.passes_rules(row) else None
+        if self.passes_rules(row):
+            return row
+        return None
 
     def row_of(self, fields: Mapping[str, object]) -> Values | None:
         """Validate named fields, and return the values of all fields in order, as `check_row` does.
@@ -105,7 +107,10 @@ class Validation:
         for name, kind in self._types.items():
             if kind.base != "float32":
                 continue
-            numbers = values[name] if kind.is_array else (values[name],)
+            if kind.is_array:
+                numbers = values[name]
+            else:
+                numbers = (values[name],)
             for number in numbers:
                 if math.isfinite(number) and abs(number) > _LARGEST_FLOAT32:
                     yield name, f"is beyond the range of float32 (+-{_LARGEST_FLOAT32:.9g})"
@@ -184,7 +189,10 @@ def positions_of(types: Mapping[str, FieldType]) -> dict[str, int | slice]:
     positions: dict[str, int | slice] = {}
     count = 0
     for name, kind in types.items():
-        positions[name] = slice(count, count + kind.values) if kind.is_array else count
+        if kind.is_array:
+            positions[name] = slice(count, count + kind.values)
+        else:
+            positions[name] = count
         count += kind.values
     return positions
 
@@ -213,7 +221,10 @@ def _flat_values(kinds: Sequence[FieldType]) -> str:
         if begin < position:
             parts.append(f"*row[{begin}:{position}]")
         value = f"row[{position}]"
-        parts.append(f"encode_text({value})" if kind.is_text else f"*{value}")
+        if kind.is_text:
+            parts.append(f"encode_text({value})")
+        else:
+            parts.append(f"*{value}")
         begin = position + 1
     parts.append(f"*row[{begin}:]")
     return ", ".join(parts)

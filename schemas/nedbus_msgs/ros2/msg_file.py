@@ -120,7 +120,9 @@ class _Line(NamedTuple):
         if not self.length:
             return 0
         length = _LENGTH.fullmatch(self.length)
-        return int(length[1]) if length else None
+        if length:
+            return int(length[1])
+        return None
 
 
 _Parts = Mapping[str, Mapping[str, _Line]]
@@ -218,5 +220,7 @@ def _range_of(field: MsgField) -> InRange | None:
             f"no number is in the @range of {field.name}, from {least:.9g} to {greatest:.9g}"
         )
     invalid = _INVALID.search(field.comment)
-    or_ = float(invalid[1]) if invalid else None
+    or_ = None
+    if invalid:
+        or_ = float(invalid[1])
     return InRange(field.name, least, greatest, or_=or_, is_array=field.type.is_array)

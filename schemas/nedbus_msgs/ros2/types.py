@@ -58,13 +58,16 @@ def hash_of(layout: Layout, ros2_type: str, *, literal_char: bool = False) -> st
     ids = TYPE_IDS[literal_char]
     fields = []
     for name, kind in layout.types.items():
-        fields.append(describe_field(name, ids[kind.base], kind.length or 0))
+        length = kind.length or 0
+        field = describe_field(name, ids[kind.base], length)
+        fields.append(field)
     return type_hash((ros2_type, fields))
 
 
 def type_hash(*types: tuple[str, Sequence[Mapping[str, object]]]) -> str:
     """Return the RIHS01 hash of the first type, as name and fields; its nested types follow, sorted by name."""
-    root, *referenced = [{"type_name": name, "fields": fields} for name, fields in types]
+    described = [{"type_name": name, "fields": fields} for name, fields in types]
+    root, *referenced = described
     content = {"type_description": root, "referenced_type_descriptions": referenced}
     digest = sha256(json.dumps(content).encode())
     return _RIHS01 + digest.hexdigest()
@@ -98,13 +101,18 @@ def definition_text(definition: Definition[Any], layout: Layout) -> str:
 def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
     """Return the message and layout with a type hash, given with or without `RIHS01_`; None if unknown."""
     digits = _digits_of(text)
-    return _by_hash(False).get(digits) or _by_hash(True).get(digits)
+    known = _by_hash(False).get(digits)
+    if known is not None:
+        return known
+    return _by_hash(True).get(digits)
 
 
 def has_char_hash(text: str) -> bool:
     """Return whether a type hash is known only with `literal_char`."""
     digits = _digits_of(text)
-    return digits in _by_hash(True) and digits not in _by_hash(False)
+    if digits in _by_hash(False):
+        return False
+    return digits in _by_hash(True)
 
 
 def _digits_of(text: str) -> str:

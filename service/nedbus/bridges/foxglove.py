@@ -159,7 +159,9 @@ class FoxgloveServer:
         """Return position and orientation in the local frame: FLU in ENU."""
         east, north, up = ned_to_enu((message.x, message.y, message.z))
         newest = self._newest.get(Address(vehicle, _ATTITUDE))
-        attitude = newest.message if newest else None
+        attitude = None
+        if newest:
+            attitude = newest.message
         x, y, z, w = orientation_of(message, attitude)
         position = messages.Vector3(x=east, y=north, z=up)
         return position, messages.Quaternion(x=x, y=y, z=z, w=w)
@@ -194,7 +196,9 @@ class FoxgloveServer:
         """Return the translation from `map` to the local frame of a message with a global origin, in ENU [m]."""
         north, east = self._map.update(vehicle, message).project(message.ref_lat, message.ref_lon)
         up = message.ref_alt - self._map.altitude
-        return messages.Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
+        if not math.isfinite(up):
+            up = 0.0
+        return messages.Vector3(x=east, y=north, z=up)
 
     def _close_unpublished(self) -> None:
         published = self._bus.publishers()
@@ -251,5 +255,7 @@ def orientation_of(
         if math.isfinite(w + x + y + z):
             return x, y, z, w
     yaw = yaw_ned_to_enu(message.heading)
-    half = yaw / 2 if math.isfinite(yaw) else 0.0
+    half = 0.0
+    if math.isfinite(yaw):
+        half = yaw / 2
     return 0.0, 0.0, math.sin(half), math.cos(half)

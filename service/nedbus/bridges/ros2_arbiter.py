@@ -53,7 +53,10 @@ class Ros2Arbiter:
         namespace = self._namespaces.get(address.vehicle)
         if namespace is None:
             name = address.vehicle.replace("-", "_")
-            namespace = name if name[0].isalpha() else f"px4_{name}"
+            if name[0].isalpha():
+                namespace = name
+            else:
+                namespace = f"px4_{name}"
         return ros2_topic_of(address, namespace.strip("/"))
 
     def update(

@@ -164,7 +164,9 @@ def exit_on_errors() -> Iterator[None]:
         hint = "if a full disk truncated Python's bytecode, delete all __pycache__ folders; --debug shows the traceback"
         raise _exit_with(NedbusError(f"unexpected end of data ({exc}): {hint}"), 1) from exc
     except OSError as exc:
-        where = f"{exc.filename}: " if exc.filename else ""
+        where = ""
+        if exc.filename:
+            where = f"{exc.filename}: "
         raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
     except BaseException as exc:
         # Zenoh raises this class, which cannot be imported

@@ -29,14 +29,18 @@ class _StrictParsing:
         command: Any = self
         try:
             _, _, parsed = command.make_parser(ctx).parse_args(args=list(args))
-            for option, times in Counter(parsed).items():
+            times_of = Counter(parsed)
+            for option, times in times_of.items():
                 if times > 1 and _takes_one_value(option):
                     text = f"given {times} times, but it takes one value"
                     raise typer.BadParameter(text, ctx=ctx, param=option)
             parsed_args: list[str] = super().parse_args(ctx, args)  # type: ignore[misc] # of the command
         except _UsageError as exc:
-            meant = _MEANT.get(getattr(exc, "option_name", ""))
-            known = {name for option in command.get_params(ctx) for name in option.opts}
+            name = getattr(exc, "option_name", "")
+            meant = _MEANT.get(name)
+            known = set[str]()
+            for option in command.get_params(ctx):
+                known.update(option.opts)
             if meant in known:
                 exc.possibilities = [meant]  # type: ignore[attr-defined] # of an unknown option
             raise

@@ -32,7 +32,9 @@ class Recorder:
     @property
     def messages(self) -> int:
         """The number of messages recorded so far."""
-        return 0 if self._writer is None else self._writer.messages
+        if self._writer is None:
+            return 0
+        return self._writer.messages
 
     @property
     def status(self) -> str:
@@ -55,7 +57,10 @@ class Recorder:
         """
         start = time.monotonic()
         now = start
-        end = math.inf if duration is None else start + duration
+        if duration is None:
+            end = math.inf
+        else:
+            end = start + duration
         next_flush = start + _FLUSH_INTERVAL
         # raised once all is written
         with RecordingWriter(self._path) as self._writer, suppress(ClosedError):

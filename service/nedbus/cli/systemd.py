@@ -59,9 +59,9 @@ class Notifier:
         self._daemon = daemon
         address = environment.get("NOTIFY_SOCKET", "")
         self._is_active = address.startswith(("/", "@"))
-        self._send: Callable[..., bool] = (
-            partial(notify, address) if self._is_active else lambda **_: False
-        )
+        self._send: Callable[..., bool] = lambda **_: False
+        if self._is_active:
+            self._send = partial(notify, address)
         self._watchdog = watchdog_interval(environment)
         self._router_deadline = time.monotonic() + TIMINGS.systemd_patience
         self._counted = time.monotonic(), 0  # time, and messages published until then
@@ -124,8 +124,13 @@ class Notifier:
                     self._ticked = False
                     next_ping = now + interval
                     self._send(WATCHDOG=1)
-            pause = TIMINGS.systemd_status if self._is_ready else _START_INTERVAL
-            if self._stop.wait(pause if interval is None else min(pause, interval / 2)):
+            if self._is_ready:
+                pause = TIMINGS.systemd_status
+            else:
+                pause = _START_INTERVAL
+            if interval is not None:
+                pause = min(pause, interval / 2)
+            if self._stop.wait(pause):
                 return
 
     def _is_alive(self, interval: float) -> bool:

@@ -121,7 +121,8 @@ class AsyncBus:
         max_rate: float | None = None,
     ) -> AsyncNewest:
         """Return a view of the newest message of each stream; see `Bus.newest`. It opens on first use."""
-        bus, selection = self._blocking, select(messages, vehicle, instance)
+        bus = self._blocking
+        selection = select(messages, vehicle, instance)
         inbox = bus._make_inbox(selection, "latest", max_rate, None)
 
         def open_receiver() -> Receiver:
@@ -214,7 +215,10 @@ class AsyncBus:
         return self
 
     async def __aexit__(self, exc: object, *_: object) -> None:
-        await self.close(FLUSH_TIMEOUT if exc is None else 0.0)
+        timeout = 0.0
+        if exc is None:
+            timeout = FLUSH_TIMEOUT
+        await self.close(timeout)
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         return await asyncio.get_running_loop().run_in_executor(
@@ -226,7 +230,8 @@ class _Opening(Generic[_T]):
     """What a thread opens for a task: if the task is cancelled meanwhile, it is closed as soon as it is open."""
 
     def __init__(self, open_: Callable[[], _T], *, close: Callable[[_T], object]) -> None:
-        self._open, self._close = open_, close
+        self._open = open_
+        self._close = close
         self._lock = threading.Lock()
         self._opened: _T | None = None
         self._is_abandoned = False
@@ -318,7 +323,8 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
     __aexit__ = _awaited(Publisher.__exit__)
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        cancelled, flow_control = threading.Event(), self._blocking._flow_control
+        cancelled = threading.Event()
+        flow_control = self._blocking._flow_control
 
         def run() -> _T:
             flow_control.cancelled = cancelled

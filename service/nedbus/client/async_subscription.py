@@ -117,7 +117,8 @@ class AsyncSubscription(SubscriptionBase[M_co]):
     async def _open(self) -> None:
         """Open on first use and wait until open; cancelling the wait does not cancel the opening."""
         require_unforked()
-        loop, opening = asyncio.get_running_loop(), self._opening
+        loop = asyncio.get_running_loop()
+        opening = self._opening
         if opening is not None and opening.get_loop() is not loop:
             raise RuntimeError(
                 f"the subscription to {self.name} is bound to another event loop: subscribe in this one"

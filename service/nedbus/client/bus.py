@@ -275,7 +275,8 @@ class Bus(AbstractContextManager["Bus"]):
         Raises NoDataError if no service has data on the vehicle within `timeout` seconds, ArgumentError for `at` if it
         is no time of this data.
         """
-        name, history = vehicle_name(vehicle), self.history(timeout=timeout)
+        name = vehicle_name(vehicle)
+        history = self.history(timeout=timeout)
         if name not in history.vehicles:
             raise NoDataError(f"the event history of vehicle {name}, which services keep,", timeout)
         return history.why(name, at=at)
@@ -370,7 +371,10 @@ class Bus(AbstractContextManager["Bus"]):
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
         """Open another Zenoh session, to the same routers or to `endpoint`; the caller closes it."""
-        return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
+        endpoints = self.routers
+        if endpoint:
+            endpoints = (endpoint,)
+        return open_client(endpoints, timeout=timeout, tls=self._tls)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Close the bus with its subscriptions and publishers. Idempotent.
@@ -391,7 +395,10 @@ class Bus(AbstractContextManager["Bus"]):
             self._finalizer.close_now()
 
     def __exit__(self, exc: object, *_: object) -> None:
-        self.close(FLUSH_TIMEOUT if exc is None else 0.0)
+        timeout = 0.0
+        if exc is None:
+            timeout = FLUSH_TIMEOUT
+        self.close(timeout)
 
     @property
     def _session(self) -> Session:

@@ -227,7 +227,10 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
             continue
         part = replace(given.about(vehicle), service=service)
         known = statuses.get((vehicle, service))
-        sources = part.sources if known is None else (*known.sources, *part.sources)
+        if known is None:
+            sources = part.sources
+        else:
+            sources = (*known.sources, *part.sources)
         statuses[vehicle, service] = replace(part, sources=sources)
     known_of = Counter[str]()
     ranked: list[tuple[bool, int, ServiceStatus]] = []
@@ -333,11 +336,9 @@ class Rejections:
         for sample in samples:
             try:
                 address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
-                content = (
-                    json.loads(sample.payload.to_bytes())
-                    if len(sample.payload) <= limits.REPORT_BYTES
-                    else None
-                )
+                content = None
+                if len(sample.payload) <= limits.REPORT_BYTES:
+                    content = json.loads(sample.payload.to_bytes())
             except (AddressError, ValueError, RecursionError):
                 continue
             if isinstance(content, dict) and (reason := content.get("reason")):
@@ -357,7 +358,8 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     oversized = 0
     invalid = ""
     for raw in replies:
-        key, text = str(raw.key_expr), raw.payload.to_bytes()
+        key = str(raw.key_expr)
+        text = raw.payload.to_bytes()
         # Upper bound of the memory of a parsed reply, measured with CPython 3.11.
         size = (
             4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")

@@ -8,7 +8,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -165,7 +165,8 @@ class _Window:
     def add_intervals(self, intervals: Collection[float]) -> None:
         """Add intervals [s] by Chan's method."""
         (number, mean, squares), added = self.intervals, len(intervals)
-        own, total = fmean(intervals), number + added
+        own = fmean(intervals)
+        total = number + added
         squares += (
             sum([(interval - own) ** 2 for interval in intervals])
             + (own - mean) ** 2 * number * added / total
@@ -199,7 +200,12 @@ class StreamHealth:
     def __init__(self, topic: str) -> None:
         self._topic = get_topic(topic)
         self._is_position = topic in DEFAULT.topics  # the message that has flags and reset counters
-        self._read = FieldReader(_FIELDS if self._is_position else _FIELDS[:1])
+        fields = _FIELDS[:1]
+        counters: Iterable[Quantity] = ()
+        if self._is_position:
+            fields = _FIELDS
+            counters = RESET_COUNTERS
+        self._read = FieldReader(fields)
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
@@ -215,9 +221,7 @@ class StreamHealth:
         # counters of the last, and missing fields
         self._seen: tuple[tuple[int | None, ...], Collection[str]] = (), ()
         self._counters: dict[Quantity, int] = {}  # the last known ones
-        self._resets: dict[Quantity, int] = dict.fromkeys(
-            RESET_COUNTERS if self._is_position else (), 0
-        )
+        self._resets: dict[Quantity, int] = dict.fromkeys(counters, 0)
         self._latencies = Histogram(_LATENCY_BUCKETS)
         self._window = self._last_window = _Window(0)
         self._last: Health | None = None  # when the last message arrived; None after a new one
@@ -269,7 +273,10 @@ class StreamHealth:
         window = self._window
         window.messages += len(values)
         self._lost += sum(lost)
-        times = received if self._received is None else (self._received, *received)
+        if self._received is None:
+            times = received
+        else:
+            times = (self._received, *received)
         if len(times) > 1:
             intervals = [(later - earlier) / 1e9 for earlier, later in pairwise(times)]
             window.add_intervals(intervals)
@@ -346,7 +353,8 @@ class StreamHealth:
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
-        now = time.monotonic_ns() if now is None else now
+        if now is None:
+            now = time.monotonic_ns()
         with self._lock:
             self._measure_waiting()
             if self._last is None:
@@ -357,37 +365,59 @@ class StreamHealth:
 
     def _at_last_message(self) -> Health:
         """Return the health when the last message arrived; its dictionaries belong to others."""
-        window = self._last_window if self._last_window.messages else self._window
+        if self._last_window.messages:
+            window = self._last_window
+        else:
+            window = self._window
         latencies = window.sorted_latencies()
         number, mean, squares = window.intervals
-        rebooted = self._rebooted
-        received = self._received or 0
+        rate = None
+        jitter = None
+        if mean > 0:
+            rate = 1 / mean
+            jitter = math.sqrt(squares / number)
+        latency = None
+        latency_max = None
+        if latencies:
+            latency = latencies[len(latencies) // 2]
+            latency_max = latencies[-1]
+        flags = None
+        flags_ever = None
+        if self._is_position and window.messages:
+            flags = _flag_shares(window.flags)
+        if self._is_position and self._messages:
+            flags_ever = _flag_shares(self._flags)
+        reboot_age = None
+        if self._rebooted is not None:
+            reboot_age = ((self._received or 0) - self._rebooted) / 1e9
         return Health(
-            rate=1 / mean if mean > 0 else None,
+            rate=rate,
             nominal=self._topic.rate,
-            jitter=math.sqrt(squares / number) if mean > 0 else None,
-            latency=latencies[len(latencies) // 2] if latencies else None,
-            latency_max=latencies[-1] if latencies else None,
+            jitter=jitter,
+            latency=latency,
+            latency_max=latency_max,
             age=0.0,
             messages=self._messages,
             lost=self._lost,
             gaps=self._gaps,
             out_of_order=self._out_of_order,
             reboots=self._reboots,
-            flags=_flag_shares(window.flags) if self._is_position and window.messages else None,
-            flags_ever=_flag_shares(self._flags) if self._is_position and self._messages else None,
+            flags=flags,
+            flags_ever=flags_ever,
             usual_rate=self._usual_rate,
             resets=self._resets,
             on_change=self._is_on_change,
             usual_interval=self._median_interval(),
-            reboot_age=None if rebooted is None else (received - rebooted) / 1e9,
+            reboot_age=reboot_age,
         )
 
     def _add_counters(
         self, counters: tuple[int | None, ...], missing: Collection[str], *, rebooted: bool
     ) -> None:
-        # a reboot restarts them
-        self._seen, known = (counters, missing), {} if rebooted else self._counters
+        self._seen = (counters, missing)
+        known = self._counters
+        if rebooted:
+            known = {}  # it restarts them
         for (quantity, name), count in zip(RESET_COUNTERS.items(), counters, strict=True):
             if name not in missing and count is not None:
                 self._resets[quantity] += (count - known.get(quantity, count)) % 256
@@ -400,7 +430,8 @@ class StreamHealth:
         It does with the first timestamp, and with one so far back that it means a reboot.
         """
         self._messages += 1
-        last, steps = self._time, self._steps
+        last = self._time
+        steps = self._steps
         if last is None or timestamp < last:
             return self._step_back(timestamp, last, received)
         self._earlier = last
@@ -416,7 +447,10 @@ class StreamHealth:
         return False
 
     def _step_back(self, timestamp: int, last: int | None, received: int) -> bool:
-        step = None if last is None else timestamp - last
+        if last is None:
+            step = None
+        else:
+            step = timestamp - last
         if (
             step is not None
             and step < -_REBOOT_STEP
@@ -428,8 +462,10 @@ class StreamHealth:
         self._earlier = last or 0
         if step is None or step < -_REBOOT_STEP:
             if step is not None and self._topic.name != _QUEUED:
-                self._reboots, self._rebooted = self._reboots + 1, received
-            self._time, self._usual_step = timestamp, 0.0
+                self._reboots += 1
+                self._rebooted = received
+            self._time = timestamp
+            self._usual_step = 0.0
             self._steps.clear()
             return True
         self._out_of_order += 1
@@ -495,7 +531,9 @@ class StreamState:
         return self.name in ("disconnected", "gone", "stale")
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.reason}" if self.reason else self.name
+        if self.reason:
+            return f"{self.name}: {self.reason}"
+        return self.name
 
 
 def silence_of(
@@ -506,7 +544,9 @@ def silence_of(
         return "disconnected"
     if age > ABSENT and publishers == 0:
         return "gone"
-    return "stale" if age > stale_after else None
+    if age > stale_after:
+        return "stale"
+    return None
 
 
 def stream_state(
@@ -531,14 +571,19 @@ def stream_state(
             "duplicate", f"{publishers} publishers: stop one, or give it another vehicle"
         )
     reasons = []
-    usual = None if health.on_change else health.usual_rate
+    if health.on_change:
+        usual = None
+    else:
+        usual = health.usual_rate
     if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
         reasons.append(f"{health.rate:.1f} Hz, usually {usual:.0f}")
     # else it is the latency of an old message
     is_current = health.age is None or health.age < TIMINGS.stale
     if health.latency is not None and health.latency > _LATE and is_current:
         reasons.append(f"{format_duration(health.latency)} late, or clocks differ")
-    return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")
+    if reasons:
+        return StreamState("slow", ", ".join(reasons))
+    return StreamState("ok")
 
 
 def describe_stream(health: Health, state: StreamState) -> str:
@@ -546,7 +591,10 @@ def describe_stream(health: Health, state: StreamState) -> str:
 
     A reboot is mentioned for 60 s.
     """
-    doubts = "ok" if health.flags is None else describe_flags(health.flags)
+    if health.flags is None:
+        doubts = "ok"
+    else:
+        doubts = describe_flags(health.flags)
     texts = [text for text in (str(state), doubts) if text != "ok"]
     if state.name != "duplicate":
         if health.gaps:
@@ -569,7 +617,10 @@ def health_of_last(
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
     if age is None:
-        age = 0.0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent) / 1e9
+        if sample.sent is None:
+            age = 0.0
+        else:
+            age = max(0, clock.utc_ns() - sample.sent) / 1e9
     last = replace(stream.snapshot(0), age=age)
     if measured is None:
         return last

@@ -55,7 +55,9 @@ class Job:
     @property
     def runs_at(self) -> float:
         """The monotonic time of the next call [s]."""
-        return min((self._due, *self._requested)) if self._requested else self._due
+        if self._requested:
+            return min((self._due, *self._requested))
+        return self._due
 
     def wake(self, at: float = 0.0) -> None:
         """Call the job now, or at the first tick after a monotonic time [s]; any thread may call this."""
@@ -77,15 +79,17 @@ class Job:
             self._requested.difference_update([at for at in tuple(self._requested) if at <= now])
         try:  # not `with self._errors`, which costs two calls
             with self._running:
-                pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
+                if self._ended:
+                    pause = math.inf
+                else:
+                    pause = max(_MIN_PAUSE, self._call(now))
         except BaseException as exc:  # noqa: BLE001 - not even SystemExit may end this thread
             self._errors.survives(exc)
             pause = _RETRY_PAUSE
-        self._due = (
-            now + pause
-            if pause < TICK or pause == math.inf
-            else math.floor((now + pause) / TICK) * TICK
-        )
+        if pause < TICK or pause == math.inf:
+            self._due = now + pause
+        else:
+            self._due = math.floor((now + pause) / TICK) * TICK
 
 
 class CallThread:
@@ -127,15 +131,19 @@ class CallThread:
 def _run_jobs() -> None:
     global _sleeps_until  # noqa: PLW0603 - a process has one I/O thread
     while True:
-        now, _sleeps_until = time.monotonic(), 0.0
+        now = time.monotonic()
+        _sleeps_until = 0.0
         for job in tuple(_jobs):
             if job.runs_at <= now:
                 job.run(now)
         # from here `wake` puts an item; after the next line only for an earlier time
         _sleeps_until = math.inf
         _sleeps_until = due = min((job.runs_at for job in tuple(_jobs)), default=math.inf)
+        timeout = None
+        if due != math.inf:
+            timeout = max(0.0, due - time.monotonic())
         with suppress(queue.Empty):
-            _woken.get(timeout=None if due == math.inf else max(0.0, due - time.monotonic()))
+            _woken.get(timeout=timeout)
 
 
 _thread = CallThread("nedbus-io")

@@ -56,7 +56,10 @@ class _View:
                 self._answer = False, Publishers()
             self._asked = time.monotonic()
         connected, publishers = self._answer
-        return connected, publishers[address] or (0 if publishers.complete else None)
+        count = publishers[address]
+        if not count and not publishers.complete:
+            return connected, None
+        return connected, count
 
 
 @dataclass(slots=True, eq=False)
@@ -108,18 +111,17 @@ class NewestMessage(Generic[M_co]):
     @property
     def health(self) -> Health:
         """The health of the stream, measured on the messages that its view has received."""
-        return (
-            health_of_last(self.sample, age=self.age)
-            if self._measured is None
-            else self._measured.snapshot()
-        )
+        if self._measured is None:
+            return health_of_last(self.sample, age=self.age)
+        return self._measured.snapshot()
 
     def _put(self, sample: Sample[Any], arrived: float) -> None:
         """Replace the message, except by a retained one that is older."""
         if not sample.retained:
             measured = self._measured or StreamHealth(sample.topic)
             missing = sample.provenance.missing
-            received, latency = int(arrived), sample.latency
+            received = int(arrived)
+            latency = sample.latency
             measured.add(
                 sample.message,
                 received=received,
@@ -184,7 +186,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
                 raise ArgumentError(
                     "topic", topic, f"an address, such as {names}", problem="has several streams"
                 )
-            return streams[next(iter(streams))] if streams else self._streams[key]
+            if streams:
+                return streams[next(iter(streams))]
+            return self._streams[key]
 
     @overload  # type: ignore[override] # a class selects the type of the message
     def get(self, key: type[_M], /) -> NewestMessage[_M] | None: ...
@@ -221,11 +225,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latency histogram of a stream since the start [s]; None if it is not measured."""
         stream = self._streams.get(address)
-        return (
-            stream._measured.latencies
-            if stream is not None and stream._measured is not None
-            else None
-        )
+        if stream is not None and stream._measured is not None:
+            return stream._measured.latencies
+        return None
 
     def forget(self, address: Address, *, silence: float = 0.0) -> None:
         """Remove a stream unless it has been silent for less than `silence` s; its next sample starts a new one."""
@@ -243,7 +245,10 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
                 stream = self._by_topic[address.topic][address] = NewestMessage(sample, self._view)
                 self._sorted = None
             self._streams[address] = stream
-            stream._put(sample, self._arrival(sample) if received is None else received)
+            if received is None:
+                stream._put(sample, self._arrival(sample))
+            else:
+                stream._put(sample, received)
         return stream
 
     def _sorted_addresses(self) -> list[Address]:
@@ -266,7 +271,9 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         utc = clock.utc_ns()
         before = self._to_utc
         if sample.retained:
-            return -math.inf if sample.sent is None else now - max(0, utc - sample.sent)
+            if sample.sent is None:
+                return -math.inf
+            return now - max(0, utc - sample.sent)
         self._to_utc, arrival = utc - now, now - max(0, utc - sample.received)
         if arrival < self._latest:
             arrival += self._to_utc - before
@@ -294,7 +301,9 @@ class NewestBase(Monitor):
         self, inbox: Inbox, topics: Iterable[str], ask: Callable[[], tuple[bool, Publishers]]
     ) -> None:
         super().__init__()
-        self._inbox, self._wanted, self._view.ask = inbox, frozenset(topics), ask
+        self._inbox = inbox
+        self._wanted = frozenset(topics)
+        self._view.ask = ask
 
     @property
     def closed(self) -> bool:

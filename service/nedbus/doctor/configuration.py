@@ -38,7 +38,10 @@ def check_service(
     `offline`: check only the text, without access to files, certificates and endpoints.
     """
     settings, mistakes = find_mistakes(file, **(given or {}))
-    endpoints = settings.connect if settings.is_client else settings.listen
+    if settings.is_client:
+        endpoints = settings.connect
+    else:
+        endpoints = settings.listen
     if settings.router_config is not None:
         replaced = {name for name in ("listen", "connect") if getattr(settings, name)}
         mistakes += check_router_file(settings.router_config, offline=offline, replaced=replaced)
@@ -175,7 +178,10 @@ def _try_listen(endpoint: str) -> Finding | None:
     if parts is None:  # a Unix domain socket
         return None
     _, host, _ = parts
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    if ":" in host:
+        family = socket.AF_INET6
+    else:
+        family = socket.AF_INET
     try:
         with socket.socket(family) as probe:
             probe.bind((host, 0))

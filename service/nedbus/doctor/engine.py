@@ -71,5 +71,7 @@ def _run(check: Check) -> list[Finding]:
 def _late(check: Check, seconds: float) -> Finding:
     seen = f"no result within {seconds:g} s"
     advice = "try again; if this persists, a DNS server may not be answering"
-    state: State = "wrong" if check.name == "endpoint" else "unknown"
+    state: State = "unknown"
+    if check.name == "endpoint":
+        state = "wrong"
     return Finding(check.name, check.subject, state, seen, advice)

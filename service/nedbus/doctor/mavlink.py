@@ -145,5 +145,7 @@ def _describe_clients(name: str, system: SystemTraffic) -> Finding:
     )
     seen = f"sends its ULog stream to {list_names(clients)}"
     advice = "PX4 streams to one client: it refuses 'nedbus serve' while another one receives"
-    state: State = "ok" if system.sends_log_to_nedbus else "warning"
+    state: State = "warning"
+    if system.sends_log_to_nedbus:
+        state = "ok"
     return Finding("mavlink", name, state, seen, advice)

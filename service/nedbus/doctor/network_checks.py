@@ -252,7 +252,9 @@ def _check_reports(seen: Observation) -> Iterator[Finding]:
         since = format_since(current.since, report.now)
         text = f"{current.text[: limits.PEER_TEXT]}{since}"
         advice = f"see the events before it with 'nedbus why --vehicle {name}'"
-        state: State = "wrong" if current.severity == "bad" else "warning"
+        state: State = "warning"
+        if current.severity == "bad":
+            state = "wrong"
         yield Finding("vehicle", name, state, text, advice)
 
 
@@ -385,7 +387,10 @@ def _clocks(seen: Observation) -> dict[str, _Offset]:
         if delay is None:
             continue
         # A positive delay includes the network latency.
-        error = 0.0 if delay < 0 else _CLOCK_WARNING
+        if delay < 0:
+            error = 0.0
+        else:
+            error = _CLOCK_WARNING
         clocks[f"publisher of {address}"] = _Offset(-delay, error)
     return clocks
 
@@ -414,9 +419,13 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
 
 
 def _clock_finding(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:
-    direction = "ahead of" if offset > 0 else "behind"
+    direction = "behind"
+    if offset > 0:
+        direction = "ahead of"
     text = f"{clock} is {format_duration(abs(offset))} {direction} {reference}"
-    state: State = "wrong" if abs(offset) > _CLOCK_WRONG else "warning"
+    state: State = "warning"
+    if abs(offset) > _CLOCK_WRONG:
+        state = "wrong"
     return Finding("clock", name, state, text, advice)
 
 

@@ -93,7 +93,10 @@ class Observation:
                 if not key.startswith(own):
                     _add_key(self.elsewhere, key)
         for address, last in islice(newest.items(), limits.EXAMINED_NAMES):
-            self.ages[address] = last.age if math.isfinite(last.age) else None
+            if math.isfinite(last.age):
+                self.ages[address] = last.age
+            else:
+                self.ages[address] = None
         self.listened = time.monotonic() - start
 
     def _query(self, bus: Bus, session: Session) -> None:

@@ -76,7 +76,8 @@ def reach_endpoint(endpoint: str) -> Finding | None:
         else:
             socket.create_connection((host, port), _CONNECT_TIMEOUT).close()
     except (socket.gaierror, UnicodeError):  # UnicodeError: an empty label, such as in a..b
-        seen, advice = f"cannot resolve host name {host}", "correct the name, or use the IP address"
+        seen = f"cannot resolve host name {host}"
+        advice = "correct the name, or use the IP address"
     except ConnectionRefusedError:
         seen = "connection refused, probably because nothing listens on this port"
         advice = (
@@ -186,14 +187,19 @@ def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls 
         reason = exc.reason
     is_new = reason not in wrong and not settings.left_out & _PEM_FILES.keys()
     if reason and is_new:
-        name = "tls_certificate" if "tls_certificate" in given else list(given)[-1]
+        if "tls_certificate" in given:
+            name = "tls_certificate"
+        else:
+            name = list(given)[-1]
         findings.append((name, Finding("certificate", str(given[name]), "wrong", reason, advice)))
     return findings, tls
 
 
 def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
     """Return the validity of a certificate file; for a private key, None if it is valid."""
-    kind = "PRIVATE KEY" if name.endswith("_key") else "CERTIFICATE"
+    kind = "CERTIFICATE"
+    if name.endswith("_key"):
+        kind = "PRIVATE KEY"
     try:
         check_pem(path, kind)
     except ConfigError as exc:

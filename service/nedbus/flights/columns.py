@@ -36,8 +36,10 @@ class Decoded(NamedTuple):
     @classmethod
     def empty(cls, definition: Definition[Any], count: int) -> Self:
         """Return `count` invalid messages without any field set."""
+        messages = arrays_of(definition).absent(count)
+        valid = np.zeros(count, bool)
         absent = np.zeros(count, [(name, bool) for name in definition.types])
-        return cls(arrays_of(definition).absent(count), np.zeros(count, bool), absent)
+        return cls(messages, valid, absent)
 
     def utc_columns(self) -> dict[str, npt.NDArray[Any]]:
         """Return the columns of the valid messages for `UtcEstimate`, without the fields that all messages lack."""
@@ -129,13 +131,16 @@ class _Part:
             return ""
         first_reason = ""
         for payload in payloads:
-            reason = None if self._are_usual([payload]) else self._stream.check(payload)
-            if reason:
-                first_reason = first_reason or reason
-                self._unusable.append(len(self))
-                self._data += bytes(self._size)
+            if self._are_usual([payload]):
+                reason = None
             else:
+                reason = self._stream.check(payload)
+            if not reason:
                 self._data += payload[: self._size]  # PX4 appends bytes
+                continue
+            first_reason = first_reason or reason
+            self._unusable.append(len(self))
+            self._data += bytes(self._size)
         return first_reason
 
     def _are_usual(self, payloads: Sequence[bytes]) -> bool:
@@ -143,8 +148,10 @@ class _Part:
         head = self._stream.head
         if not head:
             return True
-        has_size = {*map(len, payloads)} == {self._size}
-        return has_size and all(payload.startswith(head) for payload in payloads)
+        sizes = {*map(len, payloads)}
+        if sizes != {self._size}:
+            return False
+        return all(payload.startswith(head) for payload in payloads)
 
     def decode(self, definition: Definition[Any]) -> Decoded:
         """Return the messages as those of a definition."""
@@ -164,7 +171,8 @@ def _decode_table(
     plan = definition.plan(tuple(columns))
     decoded = Decoded.empty(definition, len(table))
     messages = decoded.messages
-    for name in definition.all_fields - (plan.provided - stream.lacking):
+    provided = plan.provided - stream.lacking
+    for name in definition.all_fields - provided:
         decoded.absent[name] = True
     for name, converted in _convert_columns(stream, table).items():
         columns[name] = converted.values
@@ -180,8 +188,8 @@ def _decode_table(
     decoded.valid[:] = arrays_of(definition).valid_mask(messages)
     for name in stream.strict_bools & columns.keys():
         is_no_bool = columns[name].astype(np.int64) > 1  # a byte that is neither 0 nor 1
-        # of any element, if the field is an array
-        is_invalid = is_no_bool.reshape(len(table), -1).any(axis=1)
+        elements = is_no_bool.reshape(len(table), -1)
+        is_invalid = elements.any(axis=1)
         decoded.valid[is_invalid] = False
     return decoded
 
@@ -214,10 +222,11 @@ def _to_column(kind: Any, values: list[Any]) -> npt.NDArray[Any]:
 
 def _decode_rows(definition: Definition[Any], rows: Collection[Mapping[str, Any]]) -> Decoded:
     decoded = Decoded.empty(definition, len(rows))
+    arrays = arrays_of(definition)
     for index, fields in enumerate(rows):
         with suppress(ValidationError):
             message = upgrade_with(definition, fields)
-            decoded.messages[index] = arrays_of(definition).of([message])[0]
+            decoded.messages[index] = arrays.of([message])[0]
             decoded.valid[index] = True
             for name in definition.all_fields - message.model_fields_set:
                 decoded.absent[name][index] = True
@@ -261,8 +270,10 @@ def make_batches(messages: Iterable[FlightMessage]) -> Iterator[FlightBatch]:
         payloads = b"".join(message.encoded.payload for message in own)
         arrays, _ = arrays_of(definition).decode(payloads)
         addresses = [message.address for message in own]
-        indices = {address: index for index, address in enumerate(dict.fromkeys(addresses))}
-        index = np.fromiter((indices[address] for address in addresses), np.intp, len(own))
+        distinct = dict.fromkeys(addresses)
+        indices = {address: index for index, address in enumerate(distinct)}
+        numbers = [indices[address] for address in addresses]
+        index = np.array(numbers, np.intp)
         yield FlightBatch(
             arrays,
             definition.model,

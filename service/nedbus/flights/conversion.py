@@ -78,7 +78,10 @@ def convert_files(
     paths = [Path(path).expanduser() for path in sources]
     _load_writer()  # raises ConfigError without the extra, before the files are read
     names = parse_topics(topics if isinstance(topics, str) else ",".join(topics))
-    name = None if vehicle is None else check_vehicle(vehicle_name(vehicle))
+    if vehicle is None:
+        name = None
+    else:
+        name = check_vehicle(vehicle_name(vehicle))
     with open_messages(paths, ReadOptions(topics_of(names), name)) as flight:
         summary = convert_flight(flight, Path(output).expanduser(), on_progress=on_progress)
         known = {address.topic for address in flight.definitions}
@@ -137,10 +140,15 @@ def convert(
                 if rejections.count and not writer.messages:
                     raise SourceError(str(path), rejections.problem)
     except OSError as exc:  # an OutputError names the temporary file
-        cause = exc.__cause__ if isinstance(exc.__cause__, OSError) else exc
+        if isinstance(exc.__cause__, OSError):
+            cause = exc.__cause__
+        else:
+            cause = exc
         raise OutputError(path, cause) from exc
     written = counted(writer.messages, "message")
-    return f"{written}, {rejections.count} rejected" if rejections.count else written
+    if rejections.count:
+        return f"{written}, {rejections.count} rejected"
+    return written
 
 
 @dataclass(slots=True)

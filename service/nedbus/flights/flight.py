@@ -166,7 +166,10 @@ class Flight(AbstractContextManager["Flight"]):
         if Selection(vehicle=vehicle).vehicles == (ANY,):
             vehicle = self._vehicle
         selection = Selection(names, vehicle, instance)
-        topics = None if selection.topics == (ANY,) else set(selection.topics)
+        if selection.topics == (ANY,):
+            topics = None
+        else:
+            topics = set(selection.topics)
         period = _Period(self._seconds(start, "start"))
         if end is not None:
             period = _Period(period.start, self._seconds(end, "end"))
@@ -326,7 +329,10 @@ class Flight(AbstractContextManager["Flight"]):
             watched = zip(self._watches, self._readers, strict=True)
             return [watch.results(reader) for watch, reader in watched]
         # a file may have other topics only
-        topics = None if self._options.topics is None else _BUILT_IN.topics
+        if self._options.topics is None:
+            topics = None
+        else:
+            topics = _BUILT_IN.topics
         options = replace(self._options, topics=topics)
         offsets: list[Mapping[str, UtcOffset | str]] = []
         for path in self._paths:
@@ -495,7 +501,10 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
             raise ClosedError
         address, definition, encoded, received, provenance = next(self._messages)
         codec = codec_of(definition)
-        decode = codec.decode_row if self._rows else codec.decode
+        if self._rows:
+            decode = codec.decode_row
+        else:
+            decode = codec.decode
         message: Any = decode(encoded.payload)
         return Sample(message, address, received, provenance=provenance)
 
@@ -544,7 +553,9 @@ class FlightSamples(Generic[M_co], AbstractContextManager["FlightSamples[M_co]"]
         """Raise AddressError, because the files have none of the selected addresses."""
         readers = self._readers
         addresses = sorted(self._flight._definitions_of(readers))
-        where = readers[0].path if len(readers) == 1 else f"any of the {len(readers)} files"
+        where: Path | str = f"any of the {len(readers)} files"
+        if len(readers) == 1:
+            where = readers[0].path
         matching(where, addresses, self._selection)
 
 
@@ -556,7 +567,9 @@ def close_all(readers: Sequence[FlightReader]) -> None:
 
 def boot_utc_of(readers: Sequence[FlightReader]) -> int:
     """Return the Unix time of the boot in the metadata of the only file [us]; 0 if unknown, or for several files."""
-    return readers[0].boot_utc if len(readers) == 1 else 0
+    if len(readers) == 1:
+        return readers[0].boot_utc
+    return 0
 
 
 def _start_of(reader: FlightReader, utc: Mapping[str, UtcOffset | str]) -> float:
@@ -564,7 +577,10 @@ def _start_of(reader: FlightReader, utc: Mapping[str, UtcOffset | str]) -> float
     starts = []
     for message in reader.ahead:
         offset = utc.get(message.address.vehicle)
-        stamp = None if message.error else message.timestamp
+        if message.error:
+            stamp = None
+        else:
+            stamp = message.timestamp
         if isinstance(offset, UtcOffset) and stamp is not None:
             starts.append(int(offset.unix_us(stamp)) / 1e6 - message.at)
     if not starts:

@@ -57,7 +57,9 @@ def require_files(paths: Sequence[Path]) -> Sequence[Path]:
 def renamed(address: Address, names: Names) -> Address:
     """Return an address with the name that its vehicle has among several files."""
     name = names.get(address.vehicle, address.vehicle)
-    return address if name == address.vehicle else Address(name, address.topic, address.instance)
+    if name == address.vehicle:
+        return address
+    return Address(name, address.topic, address.instance)
 
 
 def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict[str, str]]:

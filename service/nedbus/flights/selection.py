@@ -12,11 +12,12 @@ def parse_topics(text: str) -> tuple[str, ...]:
     """Parse `TOPIC,TOPIC`; a message name selects all of its topics; raise AddressError for an invalid name."""
     if not text:
         return ()
-    names = tuple(part.strip() for part in text.split(","))
+    names = [part.strip() for part in text.split(",")]
     for name in names:
-        if name not in (ANY, *MESSAGES):
+        is_known = name == ANY or name in MESSAGES
+        if not is_known:
             get_topic(name)
-    return names
+    return tuple(names)
 
 
 def topics_of(names: Collection[str]) -> Set[str] | None:
@@ -39,7 +40,9 @@ def absent_topics(names: Collection[str], topics: Collection[str], where: str) -
 
 
 def _topics_of(name: str) -> Set[str]:
-    return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
+    if name in MESSAGES:
+        return MESSAGES[name].topics.keys()
+    return {name}
 
 
 def matching(
@@ -75,9 +78,9 @@ def single_match(path: Path, addresses: Sequence[Address], selection: Selection)
     The first instance of a topic that only the file defines has no instance number: the topic alone selects it.
     """
     matches = matching(path, addresses, selection)
-    is_one_topic = len({(address.vehicle, address.topic) for address in matches}) == 1
+    topics = {(address.vehicle, address.topic) for address in matches}
     plain = [address for address in matches if address.instance is None]
-    if is_one_topic and len(plain) == 1:
+    if len(topics) == 1 and len(plain) == 1:
         matches = plain
     lacking = []
     for part in ("topic", "vehicle", "instance"):
@@ -102,4 +105,6 @@ def require_one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle
 def _list(addresses: Sequence[Address]) -> str:
     text = ", ".join(map(str, addresses[: limits.SHOWN_NAMES]))
     more = len(addresses) - limits.SHOWN_NAMES
-    return f"{text} and {more} more" if more > 0 else text
+    if more > 0:
+        return f"{text} and {more} more"
+    return text

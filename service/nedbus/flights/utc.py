@@ -66,11 +66,13 @@ def find_utc(
     if not isinstance(flight, str | Path):
         return _utc_of_samples(flight, vehicle)
     path = Path(flight).expanduser()
+    selection = Selection(vehicle=vehicle)
     with open_reader(path) as reader:
         offsets = read_utc(reader)
-        addresses = matching(path, sorted(reader.definitions), Selection(vehicle=vehicle))
-        require_one_vehicle(path, addresses, vehicle)
-        return offsets[addresses[0].vehicle]
+        addresses = sorted(reader.definitions)
+    selected = matching(path, addresses, selection)
+    require_one_vehicle(path, selected, vehicle)
+    return offsets[selected[0].vehicle]
 
 
 def _utc_of_arrays(flight: Mapping[str, MessageArray]) -> UtcOffset | str:
@@ -79,9 +81,12 @@ def _utc_of_arrays(flight: Mapping[str, MessageArray]) -> UtcOffset | str:
     estimate = UtcEstimate()
     for stream, messages in flight.items():
         metadata: Mapping[str, Any] = messages.dtype.metadata or {}
-        provided = set(messages.dtype.names or ()).difference(metadata.get("missing", ()))
-        names = provided.intersection(UTC_COLUMNS)
-        estimate.add(stream, {name: messages[name] for name in names})
+        missing = metadata.get("missing", ())
+        columns = {}
+        for name in messages.dtype.names or ():
+            if name in UTC_COLUMNS and name not in missing:
+                columns[name] = messages[name]
+        estimate.add(stream, columns)
     return estimate.result()
 
 
@@ -90,10 +95,12 @@ def _utc_of_samples(samples: Iterable[Sample[Any]], vehicle: str) -> UtcOffset |
 
     estimate = UtcEstimate()
     selected = [sample for sample in samples if vehicle in (ANY, sample.vehicle)]
-    require_one_vehicle("the samples", (sample.address for sample in selected), vehicle)
+    addresses = [sample.address for sample in selected]
+    require_one_vehicle("the samples", addresses, vehicle)
     for sample in selected:
         columns = {}
-        for name, value in zip(UTC_COLUMNS, _READ(sample.message), strict=True):
+        values = _READ(sample.message)
+        for name, value in zip(UTC_COLUMNS, values, strict=True):
             if value is not None and name not in sample.missing:
                 columns[name] = [value]
         estimate.add(sample.address.stream, columns)
@@ -116,9 +123,14 @@ def utc_of_columns(
 
     estimates = {address.vehicle: UtcEstimate() for address in reader.definitions}
     for address in sorted(columns):
-        decoded = columns[address].decode(reader.definitions[address])
-        estimates[address.vehicle].add(address.stream, decoded.utc_columns())
-    return {vehicle: estimate.result(reader.boot_utc) for vehicle, estimate in estimates.items()}
+        definition = reader.definitions[address]
+        decoded = columns[address].decode(definition)
+        estimate = estimates[address.vehicle]
+        estimate.add(address.stream, decoded.utc_columns())
+    results = {}
+    for vehicle, estimate in estimates.items():
+        results[vehicle] = estimate.result(reader.boot_utc)
+    return results
 
 
 class FileUtc:
@@ -153,7 +165,8 @@ class FileUtc:
         if not provides_utc(stream.definition):
             intact = [payload for payload in payloads if not stream.check(payload)]
             stamps = [stream.timestamp(payload)[0] or 0 for payload in intact]
-            self._estimates[address.vehicle].add(address.stream, {"timestamp": stamps})
+            estimate = self._estimates[address.vehicle]
+            estimate.add(address.stream, {"timestamp": stamps})
             return
         columns = self._columns.setdefault(address, Columns())
         columns.add(Run(stream, payloads, []))
@@ -170,8 +183,13 @@ class FileUtc:
             self._add_columns(address, columns, reader.definitions[address])
         self._columns.clear()
         vehicles = {address.vehicle for address in reader.definitions}
-        return {vehicle: self._estimates[vehicle].result(reader.boot_utc) for vehicle in vehicles}
+        results = {}
+        for vehicle in vehicles:
+            estimate = self._estimates[vehicle]
+            results[vehicle] = estimate.result(reader.boot_utc)
+        return results
 
     def _add_columns(self, address: Address, columns: Columns, definition: Definition[Any]) -> None:
         decoded = columns.decode(definition)
-        self._estimates[address.vehicle].add(address.stream, decoded.utc_columns())
+        estimate = self._estimates[address.vehicle]
+        estimate.add(address.stream, decoded.utc_columns())

@@ -267,10 +267,13 @@ class RecordingWriter(AbstractContextManager["RecordingWriter"]):
 
     def _metadata(self, address: Address, provenance: Provenance) -> dict[str, str]:
         """Return what a channel says about its messages."""
+        instance = ""
+        if address.instance is not None:
+            instance = str(address.instance)
         metadata = {
             "vehicle": address.vehicle,
             "topic": address.topic,
-            "instance": "" if address.instance is None else str(address.instance),
+            "instance": instance,
             "source": provenance.source or "",
             "boot_time_utc_us": str(self._boot_utc or ""),
             "start_time_us": str(self._starts.get(address.vehicle, "")),

@@ -131,14 +131,17 @@ def _cause_without_echo(name: str, states: Mapping[str, State], ratio: float, ec
     """Return what is known without the fields that PX4 received: not whether a jump had a new reset_counter."""
     if states[name] == "rejected":
         cause = _cause_of_rejection(name, states, ratio)
-        return "" if cause == Cause.JUMP or math.isnan(ratio) else cause
+        is_unknown = cause == Cause.JUMP or math.isnan(ratio)
+        return "" if is_unknown else cause
     if states[name] != "not received":
         return ""
     if echo.is_mocap:
         return Cause.MOCAP
     if echo.is_type_unsupported:
         return Cause.TYPE
-    return Cause.NO_ECHO if echo.is_sent else Cause.STOPPED
+    if echo.is_sent:
+        return Cause.NO_ECHO
+    return Cause.STOPPED
 
 
 def _wrong_field(name: str, echo: Echo) -> str:
@@ -162,11 +165,14 @@ def _cause_of_rejection(name: str, states: Mapping[str, State], ratio: float) ->
     """Return which mistake rejects these quantities together."""
     rejected = {quantity for quantity, state in states.items() if state == "rejected"}
     if name == "yaw":
-        return Cause.QUATERNION_ORDER if ratio > _LARGE_RATIO or len(rejected) == 1 else ""
+        is_order = ratio > _LARGE_RATIO or len(rejected) == 1
+        return Cause.QUATERNION_ORDER if is_order else ""
     if rejected >= {"position", "height", "velocity"}:
         return Cause.ENU
     if rejected >= {"position", "velocity"}:
         return Cause.TURNED
     if name == "height":
         return Cause.UP
-    return Cause.DELAY if name == "velocity" else Cause.JUMP
+    if name == "velocity":
+        return Cause.DELAY
+    return Cause.JUMP

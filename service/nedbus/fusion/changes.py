@@ -38,7 +38,10 @@ def fusion_changes(
         vehicle = vehicles.setdefault(sample.vehicle, _Vehicle())
         if not vehicle.tracker.add_sample(sample):
             continue
-        own = None if sent is None else sent.get(sample.vehicle)
+        if sent is None:
+            own = None
+        else:
+            own = sent.get(sample.vehicle)
         report = vehicle.tracker.fusion(sample.vehicle, own)
         quantities = [(quantity.state, quantity.cause) for quantity in report.quantities]
         state = (quantities, report.remarks, report.missing)

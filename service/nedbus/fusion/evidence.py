@@ -318,14 +318,19 @@ class FusionTracker:
     def _describe_echo(self, sent: PositionStatus | None) -> Echo:
         is_mocap = self._is_recent(self._mocap)
         is_unsupported = self._is_recent(self._unsupported, _TEXT_TIME)
-        is_sent = None if sent is None else sent.rate > 0
+        if sent is None:
+            is_sent = None
+        else:
+            is_sent = sent.rate > 0
         received = self._received
         if received is None or not self._is_recent(self._echo_times[-1]):
             return Echo(is_mocap=is_mocap, is_type_unsupported=is_unsupported, is_sent=is_sent)
         age = 0.0
         if received.timestamp_sample:
             age = (received.timestamp - received.timestamp_sample) / 1e6
-        is_ahead = self._newest_sample > self.now + _AHEAD
+        ahead = 0.0
+        if self._newest_sample > self.now + _AHEAD:
+            ahead = self._ahead
         is_counting = len(self._changes) == _CONFIRMED and self._changes[0] > self.now - _WINDOW
         return Echo(
             is_echoed=True,
@@ -338,7 +343,7 @@ class FusionTracker:
             has_velocity=_is_known(received.velocity),
             norm_error=_norm_error(received.q),
             age=age,
-            ahead=self._ahead if is_ahead else 0.0,
+            ahead=ahead,
             counts_messages=is_counting,
             quality=received.quality,
         )
@@ -376,12 +381,17 @@ class FusionTracker:
 
 
 def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
+    if isinstance(value, int | float):
+        return float(value)
+    return math.nan
 
 
 def _largest(ratio: object) -> float:
     """Return the largest test ratio of all axes; NaN if one is NaN."""
-    axes = ratio if isinstance(ratio, tuple | list) else [ratio]
+    if isinstance(ratio, tuple | list):
+        axes = ratio
+    else:
+        axes = [ratio]
     values = [_number(axis) for axis in axes]
     if any(map(math.isnan, values)):
         return math.nan

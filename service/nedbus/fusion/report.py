@@ -56,7 +56,9 @@ class Fusion:
         states = {quantity.state for quantity in self.quantities}
         if "fused" in states:
             return True
-        return None if states <= {"unknown"} else False
+        if states <= {"unknown"}:
+            return None
+        return False
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -97,7 +99,9 @@ class Fusion:
                 text += f" (test ratio {max(ratios):.2g})"
             if starts:
                 text += f" since {min(starts):.1f} s"
-            lines.append(f"{text}: {cause}" if cause else text)
+            if cause:
+                text += f": {cause}"
+            lines.append(text)
         return lines
 
     @property

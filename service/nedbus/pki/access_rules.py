@@ -64,7 +64,8 @@ def write_access_rules(
     subjects = [
         f'{{ id: "vehicles", cert_common_names: {json.dumps(list(map(certificate_name, names)))} }},'
     ]
-    rules, policies = list[str](), list[str]()
+    rules = list[str]()
+    policies = list[str]()
     for vehicle, name in zip(names, map(certificate_name, names), strict=True):
         keys = json.dumps([key.format(p=prefix, v=vehicle) for key in _KEYS])
         rules += [

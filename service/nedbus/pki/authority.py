@@ -262,13 +262,19 @@ def _sign(
     """Return a certificate for a key; without an issuer, a self-signed CA certificate."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = clock.now()
+    if days is None:
+        if issuer is None:
+            days = _CA_DAYS
+        else:
+            days = DAYS
+    until = now + dt.timedelta(days=days)
     if issuer is None:
-        until = now + dt.timedelta(days=_CA_DAYS if days is None else days)
+        signed_by = subject
         ends = until
         constraints = x509.BasicConstraints(ca=True, path_length=0)
         allowed = {"key_cert_sign", "crl_sign"}
     else:
-        until = now + dt.timedelta(days=DAYS if days is None else days)
+        signed_by = issuer.subject
         ends = min(until, issuer.not_valid_after_utc)
         constraints = x509.BasicConstraints(ca=False, path_length=None)
         allowed = {"digital_signature"}
@@ -277,7 +283,7 @@ def _sign(
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(subject if issuer is None else issuer.subject)
+        .issuer_name(signed_by)
         .public_key(key)
         .serial_number(x509.random_serial_number())
         # The clock of a vehicle may be behind at boot.

@@ -68,12 +68,15 @@ def make_bundle(
         "name": vehicle,
         "target": str(target),
     }
+    source = ""
+    if sources:
+        source = f"source = {json.dumps(list(sources))}\n"
     values = {field: json.dumps(value) for field, value in strings.items()} | {
         "vehicle": vehicle,
         "common_name": name,
         "pki": f"{target}/pki",
         "router": routers[0],
-        "source": f"source = {json.dumps(list(sources))}\n" if sources else "",
+        "source": source,
         "until": f"{certificate.not_valid_after_utc:%Y-%m-%d}",
     }
     temporary = output.with_name(f".{os.getpid()}-part-{output.name}")

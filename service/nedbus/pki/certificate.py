@@ -52,7 +52,10 @@ class Certificate:
         """
         x509 = import_optional("pki", "cryptography.x509")
         try:
-            load = x509.load_pem_x509_certificate if pem else x509.load_der_x509_certificate
+            if pem:
+                load = x509.load_pem_x509_certificate
+            else:
+                load = x509.load_der_x509_certificate
             loaded = load(data)
             hosts = list[str]()
             for extension in loaded.extensions:

@@ -168,19 +168,22 @@ class _Table:
         """Add the age and the fields of a stream, and the requested quantities that follow from them."""
         values = _pick(stream.messages, match.rows)
         if is_linear:
-            _interpolate(name, values, _pick(stream.messages, match.following), match.weight)
+            following = _pick(stream.messages, match.following)
+            _interpolate(name, values, following, match.weight)
         fields = values.dtype.names or ()
         is_absent = match.rows == _ABSENT
         self.columns[f"{name}.age"] = match.age
         for field in fields:
-            self.columns[f"{name}.{field}"] = values[field]
-            self.absent[f"{name}.{field}"] = is_absent
+            column = f"{name}.{field}"
+            self.columns[column] = values[field]
+            self.absent[column] = is_absent
         for field, mask in stream.absent.items():
-            # Row _ABSENT, the last one, is the appended element.
-            self.absent[f"{name}.{field}"] = np.append(mask, True)[match.rows]
+            with_absent = np.append(mask, True)  # row _ABSENT, the last one
+            self.absent[f"{name}.{field}"] = with_absent[match.rows]
         for field in requested.intersection(derived_from(fields)):
-            self.columns[f"{name}.{field}"] = derive_column(values, field)  # interpolated
-            self.absent[f"{name}.{field}"] = is_absent
+            column = f"{name}.{field}"
+            self.columns[column] = derive_column(values, field)  # interpolated
+            self.absent[column] = is_absent
 
     def to_array(self, missing: set[str]) -> MessageArray:
         """Return the columns as a structured array whose dtype names those in `missing`."""
@@ -226,8 +229,9 @@ def _choose_streams(
         if topic != ANY and topic not in arrays:
             known = f"one of {', '.join(arrays)}"
             raise AddressError("topic", topic, known, problem="is not among these arrays")
-    is_all = not topics or ANY in topics
-    chosen = arrays if is_all else [name for name in arrays if name in names]
+    chosen = list(arrays)
+    if topics and ANY not in topics:
+        chosen = [name for name in arrays if name in names]
     return {name: StreamArray(arrays[name], {}) for name in chosen}
 
 
@@ -241,7 +245,8 @@ def _start_of(opened: ReadStreams | None) -> int:
 def _offset_of(opened: ReadStreams | None, streams: Streams) -> UtcOffset | None:
     """Return the UTC offset of the streams; None if it is unknown."""
     if opened is None or opened.unix_times:
-        return utc_of({name: stream.messages for name, stream in streams.items()})
+        arrays = {name: stream.messages for name, stream in streams.items()}
+        return utc_of(arrays)
     return utc_offset_of(opened.flight, opened.addresses[0].vehicle)
 
 
@@ -262,7 +267,8 @@ def _choose(
         raise ArgumentError("fields", sorted(unknown), known, problem="are in no stream")
     chosen = {}
     for name, column in columns.items():
-        if name in {"timestamp", "utc"} or not names[name].isdisjoint(fields):
+        is_time = name in {"timestamp", "utc"}
+        if is_time or not names[name].isdisjoint(fields):
             chosen[name] = column
     return chosen
 
@@ -278,7 +284,8 @@ def _match(stamps: _Ints, times: _Ints, *, nearest: bool) -> _Match:
     """Match each time with the last message of a stream before it, or with the nearest one."""
     if not len(stamps):
         none = np.full(len(times), _ABSENT)
-        return _Match(none, none, weight=np.zeros(len(times)), age=np.full(len(times), np.nan))
+        age = np.full(len(times), np.nan)
+        return _Match(none, none, weight=np.zeros(len(times)), age=age)
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
     before = np.searchsorted(ordered, times, side="right") - 1
@@ -305,7 +312,10 @@ def _pick(messages: MessageArray, rows: _Ints) -> MessageArray:
     if is_absent.any():
         for field in values.dtype.names or ():
             base = values.dtype[field].base
-            values[field][is_absent] = np.nan if base.kind == "f" else base.type()
+            absent = base.type()
+            if base.kind == "f":
+                absent = np.nan
+            values[field][is_absent] = absent
     return values
 
 
@@ -332,7 +342,9 @@ def _interpolate(
             is_same = is_same.all(axis=1, keepdims=True)  # an equal element changes on the arc
             middle = _slerp(first, second, parts)
         else:
-            unit = definition.meaning(name) if definition else ""
+            unit = ""
+            if definition:
+                unit = definition.meaning(name)
             middle = _linear(first, second, parts, _period(unit))
         values[name][between] = np.where(is_same, first, middle)
 

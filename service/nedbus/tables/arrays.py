@@ -80,17 +80,24 @@ def array_of(flight: Flight, address: Address, *, unix_times: bool = False) -> S
         reason = columns.reason
         if reason and not valid.any():
             raise SourceError(str(reader.path), f"no message of {own.stream} can be read: {reason}")
-        skipped = f"skipped {np.sum(~valid)} of {len(valid)} messages of {own.stream} as invalid"
-        columns.skipped = f"{skipped} ({reason})" if reason else skipped
+        count = np.sum(~valid)
+        columns.skipped = f"skipped {count} of {len(valid)} messages of {own.stream} as invalid"
+        if reason:
+            columns.skipped += f" ({reason})"
         messages = messages[valid]
         absent = absent[valid]
-    masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
+    masks = {}
+    for name in absent.dtype.names or ():
+        if absent[name].any():
+            masks[name] = absent[name]
     if masks:
         types = [(name, messages.dtype[name]) for name in definition.names]
-        messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
+        dtype = np.dtype(types, metadata={"missing": tuple(masks)})
+        messages = messages.view(dtype)
     if unix_times:
         utc = require_utc(flight, address.vehicle)
-        messages["timestamp"] = utc.unix_us(messages["timestamp"].astype(np.int64))
+        stamps = messages["timestamp"].astype(np.int64)
+        messages["timestamp"] = utc.unix_us(stamps)
     return StreamArray(messages, masks)
 
 
@@ -98,8 +105,10 @@ def array_warnings(flight: Flight) -> list[tuple[Path, str]]:
     """Return damage and skipped messages so far, each with its file."""
     remarks = []
     for reader, streams in zip(flight._readers, flight._columns, strict=True):
-        texts = [*reader.warnings, *(columns.skipped for columns in streams.values())]
-        remarks += [(reader.path, text) for text in texts if text]
+        skipped = [columns.skipped for columns in streams.values()]
+        for text in (*reader.warnings, *skipped):
+            if text:
+                remarks.append((reader.path, text))
     return remarks
 
 
@@ -117,7 +126,8 @@ def recording_start(
     for vehicle, streams in by_vehicle.items():
         start = _start_of_vehicle(flight, streams)
         if start and unix_times:
-            start = int(require_utc(flight, vehicle).unix_us(start))
+            utc = require_utc(flight, vehicle)
+            start = int(utc.unix_us(start))
         starts.append(start)
     return min(starts, default=0)
 
@@ -134,12 +144,15 @@ def _start_of_vehicle(flight: Flight, addresses: Sequence[Address]) -> int:
         _, own = flight._find(address)
         columns = flight._columns[number][own]
         if columns.times:
-            stamps = columns.decode(reader.definitions[own]).messages["timestamp"]
+            decoded = columns.decode(reader.definitions[own])
+            stamps = decoded.messages["timestamp"].astype(float)
+            times = np.array(columns.times, float)
             firsts.append(min(columns.times))
-            offsets.append(np.array(columns.times, float) - stamps.astype(float))
+            offsets.append(times - stamps)
     if not offsets:
         return 0
-    offset = round(np.median(np.concatenate(offsets)))
+    joined = np.concatenate(offsets)
+    offset = round(np.median(joined))
     return max(0, min(firsts) - offset)
 
 
@@ -153,7 +166,10 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
     if library not in ("pandas", "polars"):
         raise ArgumentError("dataframe", library, "pandas or polars")
     package = import_optional(library, library)
-    convert = _pandas_column if library == "pandas" else _polars_column
+    if library == "pandas":
+        convert = _pandas_column
+    else:
+        convert = _polars_column
     columns: dict[str, Any] = {}
     for name in messages.dtype.names or ():
         values = messages[name]

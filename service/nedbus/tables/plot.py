@@ -75,7 +75,9 @@ class _Stream(NamedTuple):
         """Return the message nearest in time; None if it is far from that."""
         distances = np.abs(self.seconds - seconds)
         nearest = distances.argmin()
-        return self.messages[nearest] if distances[nearest] <= _NEAR else None
+        if distances[nearest] <= _NEAR:
+            return self.messages[nearest]
+        return None
 
 
 class _Row(NamedTuple):
@@ -172,7 +174,8 @@ def draw_figure(
     label = _label_times(axes["altitude"], drawn, start, times)
     for name in {"speed", lowest}:
         axes[name].set_xlabel(label)
-    figure.supxlabel("\n".join(_missing_notes(drawn)), fontsize="small")
+    notes = "\n".join(_missing_notes(drawn))
+    figure.supxlabel(notes, fontsize="small")
     if marks:
         _draw_events(figure, axes["events"], marks)
     return figure
@@ -206,7 +209,8 @@ def draw_field_figure(
         _draw_field(axes[name], drawn, name)
     if len(drawn) > 1:
         first.legend(fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
-    axes[lowest].set_xlabel(_label_times(first, drawn, start, times))
+    label = _label_times(first, drawn, start, times)
+    axes[lowest].set_xlabel(label)
     if marks:
         _draw_events(figure, axes["events"], marks)
     return figure
@@ -245,7 +249,10 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
             known.update(_plottable(stream.messages))
         names = ", ".join(sorted(known))
         raise ConfigError("--field", f"no selected stream has a number {name!r}; they have {names}")
-    meaning = DERIVED[name].meaning if name in DERIVED else name
+    if name in DERIVED:
+        meaning = DERIVED[name].meaning
+    else:
+        meaning = name
     axes.set_title(meaning, fontsize="medium", loc="right", parse_math=False)
     axes.grid(alpha=0.3)
 
@@ -298,18 +305,20 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
         if begin is not None:
             utc.append(begin)
     has_utc = len(utc) == len(streams) and max(utc) - min(utc) < 1.0
-    shift = utc[0] if has_utc else start
+    shift = start
+    unit = Times.unit("boot")
+    if has_utc:
+        shift = utc[0]
+        unit = Times.unit("vehicle")
     low, high = axes.get_xlim()
     low += shift
     high += shift
     step = _step_of(high - low)
-    ticks = np.arange(np.ceil(low / step), high / step) * step
+    first = np.ceil(low / step)
+    ticks = np.arange(first, high / step) * step
+    labels = [f"{tick:.7g}" for tick in ticks]
     if has_utc:
         labels = [format_utc(tick).removesuffix(".0") for tick in ticks]
-        unit = Times.unit("vehicle")
-    else:
-        labels = [f"{tick:.7g}" for tick in ticks]
-        unit = Times.unit("boot")
     axes.set_xticks(ticks - shift, labels)
     return f"time [{unit}]"
 
@@ -331,7 +340,8 @@ def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None
         messages = stream.messages
         tracks.append((messages["y"], messages["x"]))
         altitudes.append((stream.seconds, -messages["z"]))
-        speeds.append((stream.seconds, np.hypot(messages["vx"], messages["vy"])))
+        speed = np.hypot(messages["vx"], messages["vy"])
+        speeds.append((stream.seconds, speed))
     _draw_lines(axes["track"], streams, "xy_valid", tracks, width=1.2)
     _draw_lines(axes["altitude"], streams, "z_valid", altitudes, width=1.0)
     _draw_lines(axes["speed"], streams, "v_xy_valid", speeds, width=0.9)
@@ -352,15 +362,17 @@ def _mark_ends(axes: Any, stream: _Stream) -> None:
     is_valid = stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])
     track = stream.messages[is_valid]
     if len(track):
-        first, last = track[0], track[-1]
+        first = track[0]
+        last = track[-1]
         color = stream.color
         axes.plot(first["y"], first["x"], "o", color=color, markersize=7, fillstyle="none")
         axes.plot(last["y"], last["x"], "s", color=color, markersize=4)
 
 
 def _mark_resets(axes: Any, stream: _Stream) -> None:
-    resets = np.union1d(stream.resets("z_reset_counter"), stream.resets("vz_reset_counter"))
-    for time in resets:
+    of_height = stream.resets("z_reset_counter")
+    of_speed = stream.resets("vz_reset_counter")
+    for time in np.union1d(of_height, of_speed):
         axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
 
 
@@ -375,7 +387,8 @@ def _draw_lines(
     """Plot a line per stream, thin where its flag is false; thin parts affect the limits only if nothing is valid."""
     has_valid = False
     for stream, (_, y) in zip(streams, lines, strict=True):
-        if np.any(stream.messages[flag] & np.isfinite(y)):
+        is_valid = stream.messages[flag] & np.isfinite(y)
+        if is_valid.any():
             has_valid = True
     for stream, (x, y) in zip(streams, lines, strict=True):
         # below all other lines
@@ -395,7 +408,9 @@ def _rows(streams: Sequence[_Stream]) -> list[_Row]:
     """Return the rows of all flags, of heading resets, and of other reset counters that change."""
     rows = []
     for stream in streams:
-        suffix = f" {stream.address}" if len(streams) > 1 else ""
+        suffix = ""
+        if len(streams) > 1:
+            suffix = f" {stream.address}"
         missing = missing_of(stream.messages)
         for flag in _FLAGS:
             if flag not in missing:
@@ -416,13 +431,20 @@ def _draw_flags(axes: Any, rows: Sequence[_Row]) -> None:
             axes.plot(times, heights, "|", color=stream.color, markersize=7)
             continue
         flag = stream.messages[field]
-        color = _WARNING_COLOR if field == "dead_reckoning" else stream.color
+        if field == "dead_reckoning":
+            color = _WARNING_COLOR
+        else:
+            color = stream.color
         before = np.append(False, flag[:-1])
         is_shown = flag | before  # fill to the first message without the flag
         axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
-    size = "x-small" if len(rows) > _MANY_ROWS else "small"
-    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=size)
-    axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
+    size = "small"
+    if len(rows) > _MANY_ROWS:
+        size = "x-small"
+    labels = [row.label for row in rows]
+    axes.set_yticks(range(len(rows)), labels, fontsize=size)
+    limits = (len(rows) - 0.4, -0.6)
+    axes.set(title="flags and resets", ylim=limits)
     axes.grid(axis="x", alpha=0.3)
 
 
@@ -439,10 +461,13 @@ def _marks(
         by_vehicle[stream.address.vehicle].append(stream)
     rows: dict[str, list[_Mark]] = {}
     for vehicle in sorted(by_vehicle):
-        suffix = f" {vehicle}" if len(by_vehicle) > 1 else ""
+        suffix = ""
+        if len(by_vehicle) > 1:
+            suffix = f" {vehicle}"
         seconds = np.concatenate([stream.seconds for stream in by_vehicle[vehicle]])
         period = float(seconds.min()), float(seconds.max())
-        spans = spans_of([event for event in timed if event.vehicle == vehicle])
+        own = [event for event in timed if event.vehicle == vehicle]
+        spans = spans_of(own)
         for name, marks in _marks_of(spans, start, period).items():
             rows[name + suffix] = sorted(marks, key=lambda mark: mark.begin)
     return dict(sorted(rows.items(), key=lambda row: _rank(row[1])))
@@ -472,7 +497,10 @@ def _marks_of(
         begin = span.since + offset
         if not first - margin <= begin <= last + margin:
             continue
-        end = last if span.until is None else min(span.until + offset, last)
+        if span.until is None:
+            end = last
+        else:
+            end = min(span.until + offset, last)
         end = max(begin, end)
         row = KINDS[event.kind].row or event.kind.replace("_", " ")
         # Conditions that begin with the same event share a mark, which ends when the last condition ends.
@@ -487,7 +515,9 @@ def _text_of(event: Event, row: str) -> str:
     """Return the label of an event; none if it would repeat the name of its row."""
     if event.kind == "mode":
         return event.names[-1]
-    return "" if event.text == row else event.text
+    if event.text == row:
+        return ""
+    return event.text
 
 
 def _mark_events(
@@ -538,7 +568,8 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
             axes.broken_barh([bar], (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0)
             axes.plot(mark.begin, number, marker, color=color, markersize=size)
     axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
-    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
+    limits = (len(rows) - 0.4, -0.6)
+    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=limits)
     axes.grid(axis="x", alpha=0.3)
     figure.draw_without_rendering()  # computes the layout, on which the space for labels depends
     gap = _GAP * _DPI / 72  # pixels
@@ -546,7 +577,8 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
         limit = float(axes.get_window_extent().x1)
         for mark in reversed(marks):
             _draw_label(axes, mark, number, limit)
-            limit = float(axes.transData.transform((mark.begin, number))[0]) - gap
+            x, _ = axes.transData.transform((mark.begin, number))
+            limit = float(x) - gap
 
 
 def _draw_label(axes: Any, mark: _Mark, row: int, limit: float) -> None:

@@ -152,7 +152,10 @@ def read_streams(
     is_several = not isinstance(path, FlightPath)
     streams = Streams()
     for address in chosen:
-        name = f"{address.vehicle}/{address.stream}" if is_several else address.stream
+        if is_several:
+            name = f"{address.vehicle}/{address.stream}"
+        else:
+            name = address.stream
         streams[name] = array_of(flight, address, unix_times=is_several)
     for file, text in array_warnings(flight):
         _log.warning("%s: %s", file, text, extra=about("damaged", source=str(file), reason=text))
@@ -167,7 +170,10 @@ def read_plotted(
     Raises the errors of `read`.
     """
     topics = frozenset(topics)
-    options = ReadOptions(topics if len(paths) == 1 else topics | _UTC_TOPICS)
+    read = topics
+    if len(paths) > 1:
+        read = topics | _UTC_TOPICS
+    options = ReadOptions(read)
     # a vehicle may have another name here
     selects = Selection(selection.topics, instance=selection.instance).matches
     flight = open_arrays(paths, options, selects)
@@ -275,5 +281,10 @@ def _topics(names: Sequence[str] | None) -> Set[str] | None:
     topics = set()
     for name in names:
         parts = [part for part in name.split("/") if not part.isdecimal()]
-        topics.add(parts[-1] if parts else name)
-    return None if ANY in topics else topics
+        if parts:
+            topics.add(parts[-1])
+        else:
+            topics.add(name)
+    if ANY in topics:
+        return None
+    return topics

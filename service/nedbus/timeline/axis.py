@@ -40,8 +40,10 @@ class Axis:
         if not parts:
             return None
         place = self.zero + round(seconds * 1e6)
-        number = bisect_right(parts, place, key=attrgetter("begin")) - 1
-        return place - parts[max(0, number)].base
+        following = bisect_right(parts, place, key=attrgetter("begin"))
+        number = max(0, following - 1)
+        part = parts[number]
+        return place - part.base
 
     def seconds_of(self, vehicle: str, stamp: int) -> float | None:
         """Return the time on the axis of a timestamp of a vehicle [us], the first if several boots have it."""

@@ -33,17 +33,22 @@ class _Stream(Generic[M]):
 
     @property
     def is_advancing(self) -> bool:
-        return len(self.items) > 1 and self.first < self.last
+        return self.first < self.last
 
     def since(self, start: int) -> _Stream[M] | None:
         """Return the part from a timestamp on, None if it does not advance."""
         items = [item for item in self.items if item.stamp >= start]
         part = _Stream(items)
-        return part if items and part.is_advancing else None
+        if items and part.is_advancing:
+            return part
+        return None
 
     def drop_old(self) -> None:
         """Leave out a first message that was sent long before the recording of its stream began."""
-        if len(self.items) > 1 and _is_old(self.items[0], self.items[1]):
+        if len(self.items) < 2:
+            return
+        first, second = self.items[:2]
+        if _is_old(first, second):
             del self.items[0]
 
 
@@ -76,7 +81,8 @@ def first_of(items: Sequence[Item[M]], start: int) -> Item[M]:
         advancing = since_start or advancing
     if not advancing:
         return _first_without_clock(streams, start)
-    return _earliest(_main_clock(advancing).streams)
+    clock = _main_clock(advancing)
+    return _earliest(clock.streams)
 
 
 def _streams_of(items: Iterable[Item[M]]) -> list[_Stream[M]]:
@@ -96,7 +102,8 @@ def _streams_of(items: Iterable[Item[M]]) -> list[_Stream[M]]:
 def _first_without_clock(streams: Sequence[_Stream[M]], start: int) -> Item[M]:
     """Return the first message of streams that do not advance: the earliest since `start`, else that of the file."""
     if start:
-        current = [stream for stream in streams if stream.first >= start - NEAR]
+        earliest = start - NEAR
+        current = [stream for stream in streams if stream.first >= earliest]
         if current:
             return _earliest(current)
     return streams[0].items[0]
@@ -126,4 +133,6 @@ def _is_old(first: Item[M], second: Item[M]) -> bool:
         return False
     if second.log < first.log:
         return False  # the recorder's clock was set back
-    return (second.stamp - first.stamp) - (second.log - first.log) > NEAR
+    step = second.stamp - first.stamp
+    elapsed = second.log - first.log
+    return step - elapsed > NEAR

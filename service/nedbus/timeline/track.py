@@ -125,7 +125,8 @@ class Track(Generic[M]):
         place = self._place(item)
         if place is None:
             self.doubtful.append(item)
-            if len(self.doubtful) >= _CONFIRM or self._is_set_back():
+            is_enough = len(self.doubtful) >= _CONFIRM
+            if is_enough or self._is_set_back():
                 return self._decide()
             return []
         if self._has_gone_on():
@@ -152,7 +153,8 @@ class Track(Generic[M]):
         before = self.last.get(item.stream, 0)
         is_back = item.stamp < before
         agrees = _agree(item.lag, self.lag)
-        if is_back and item.log is not None and (self.is_unix or not agrees):
+        may_restart = self.is_unix or not agrees
+        if is_back and item.log is not None and may_restart:
             return None  # late, set back, or rebooted
         if not agrees and self._continues_doubtful(item):
             return None  # the new clock has reached the time of the old one
@@ -177,11 +179,14 @@ class Track(Generic[M]):
             return False
         if item.stamp == self._batched.get(item.stream):
             return True  # sent twice with one timestamp
-        return before < item.stamp <= min(before + LATENESS, self.newest)
+        latest = min(before + LATENESS, self.newest)
+        return before < item.stamp <= latest
 
     def _continues_doubtful(self, item: Item[M]) -> bool:
         """Return whether the log time of a message runs with that of the doubtful ones."""
-        return bool(self.doubtful) and _agree(item.lag, self.doubtful[-1].lag)
+        if not self.doubtful:
+            return False
+        return _agree(item.lag, self.doubtful[-1].lag)
 
     def _place_before_change(self, item: Item[M]) -> int | None:
         """Return the place of a message from before the last change of the clock, as of a stream in a later batch."""
@@ -220,20 +225,21 @@ class Track(Generic[M]):
                 stamp = item.stamp
             else:
                 stamp = self._stamp_of_outlier(item, newest)
-            placed.append(Placed(self.base + stamp, item))
+            place = self.base + stamp
+            placed.append(Placed(place, item))
         return placed
 
     def _stamp_of_outlier(self, item: Item[M], newest: int) -> int:
         """Return the timestamp at whose place a message is that does not continue the clock."""
         before = self.last.get(item.stream, 0)
         is_same_clock = is_unix_time(item.stamp) == self.is_unix
-        # a stream may begin with old messages
-        is_old = is_same_clock and before < item.stamp < newest
+        is_between = before < item.stamp < newest
+        is_old = is_same_clock and is_between  # a stream may begin with old messages
         is_late = self._is_late(item, newest)
-        if before not in (0, item.stamp) and not is_old:
-            is_far = abs(item.stamp - before) > LATENESS
-            if item.log is None or is_far:
-                self.unordered[item.message.address] += 1
+        continues = before in (0, item.stamp) or is_old
+        is_far = abs(item.stamp - before) > LATENESS
+        if not continues and (item.log is None or is_far):
+            self.unordered[item.message.address] += 1
         if item.log is None and item.stamp < before:
             return before  # a log keeps the order of each stream
         if not is_late and item.stamp <= newest:
@@ -255,7 +261,8 @@ class Track(Generic[M]):
         if len(ahead) < _AGREEING:
             return False
         middle = median_low(item.stamp for item in ahead)
-        streams = {id(item.stream) for item in ahead if abs(item.stamp - middle) <= NEAR}
+        agreeing = [item for item in ahead if abs(item.stamp - middle) <= NEAR]
+        streams = {id(item.stream) for item in agreeing}
         return len(streams) >= _AGREEING
 
     def _is_set_back(self) -> bool:
@@ -293,7 +300,8 @@ class Track(Generic[M]):
             is_same_clock = is_unix_time(item.stamp) == is_unix
             return is_same_side and is_same_clock and item.stamp <= middle + NEAR
 
-        begin = [is_on_clock(item) for item in items].index(True)
+        on_clock = [is_on_clock(item) for item in items]
+        begin = on_clock.index(True)
         return _Change(begin, items[begin], is_ahead, is_unix)
 
     def _is_pause(self, change: _Change[M]) -> bool:
@@ -303,19 +311,22 @@ class Track(Generic[M]):
         elapsed = self._elapsed(change.first)
         if not change.is_unix or elapsed is None:
             return True
-        # otherwise the log times run on: the clock was set
-        return change.first.stamp - self.newest - elapsed <= NEAR
+        step = change.first.stamp - self.newest
+        return step - elapsed <= NEAR  # otherwise the log times run on: the clock was set
 
     def _begin_part(self, change: _Change[M]) -> None:
         """Begin a new part of the axis: the clock was set, or the vehicle rebooted."""
         gap = self._elapsed(change.first)
         if gap is None:
-            is_reboot = not (change.is_ahead or change.is_unix or self.is_unix)
-            gap = change.first.stamp if is_reboot else 0
+            has_unix_time = change.is_unix or self.is_unix
+            gap = 0
+            if not change.is_ahead and not has_unix_time:  # a reboot
+                gap = change.first.stamp
         if change.is_unix and self.is_unix:
             self.changes += 1
         self._previous = _Part(self.base, self.lag)
-        self.begin(change.first, self.base + self.newest + gap)
+        place = self.base + self.newest + gap
+        self.begin(change.first, place)
         self.last.clear()
 
     def _elapsed(self, item: Item[M]) -> int | None:
@@ -323,9 +334,9 @@ class Track(Generic[M]):
         if item.log is None or self.log is None:
             return None
         elapsed = item.log - self.log
-        if not 0 <= elapsed <= _CREDIBLE_PAUSE:
-            return None
-        return elapsed
+        if 0 <= elapsed <= _CREDIBLE_PAUSE:
+            return elapsed
+        return None
 
     def _is_possible(self, change: _Change[M], items: Sequence[Item[M]], *, is_end: bool) -> bool:
         """Return whether the vehicle's clock may have changed to that of these messages."""
@@ -341,7 +352,10 @@ class Track(Generic[M]):
     def _may_have_gone_back(self, change: _Change[M], items: Sequence[Item[M]]) -> bool:
         """Return whether the vehicle may have rebooted, or its Unix time may have been set back."""
         first = change.first
-        set_back = {item.stream for item in items if self.last.get(item.stream, 0) > item.stamp}
+        set_back = set[Any]()
+        for item in items:
+            if self.last.get(item.stream, 0) > item.stamp:
+                set_back.add(item.stream)
         if first.log is None or self.log is None:  # a log: a few streams may have waited in a queue
             return len(set_back) >= min(_AGREEING, len(self.last))
         if change.is_unix != self.is_unix:

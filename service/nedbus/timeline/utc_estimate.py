@@ -61,10 +61,12 @@ class UtcEstimate:
         for name in names:
             utc = _utc_of(name, columns, stamps)
             is_used = is_unix_time(utc) & ~is_unix_time(stamps)
-            if is_used.any():
-                rows = np.stack([stamps, utc - stamps])
-                key = _SourceKey(FIELDS.index(name), stream)
-                self._sources[key].append(rows[:, is_used])
+            if not is_used.any():
+                continue
+            offsets = utc - stamps
+            rows = np.stack([stamps, offsets])
+            key = _SourceKey(FIELDS.index(name), stream)
+            self._sources[key].append(rows[:, is_used])
 
     def result(self, boot_utc: int = 0) -> UtcOffset | str:
         """Return the offset, or why it is unknown, "" without UTC; `boot_utc`: of the file's metadata [us]."""
@@ -75,7 +77,8 @@ class UtcEstimate:
             others = {DEFAULT_TOPIC: without_utc[DEFAULT_TOPIC]}
         compared = others if with_utc else without_utc
         stamps = _joined([*with_utc.values(), *compared.values()])
-        unix = int(np.sum(is_unix_time(stamps)))
+        is_unix = is_unix_time(stamps)
+        unix = int(np.sum(is_unix))
         if unix > len(stamps) / 2:
             return UtcOffset("timestamp", 0, unix, 0)
         period = _period(_joined(others.values()))
@@ -119,7 +122,9 @@ def _find_agreement(stream: str, times: _Ints, offsets: _Ints, others: _Period) 
     `others`: the period of the timestamps of other streams [us].
     """
     own = _period(times)
-    is_apart = own.first > others.last + _APART or own.last < others.first - _APART
+    is_later = own.first > others.last + _APART
+    is_earlier = own.last < others.first - _APART
+    is_apart = is_later or is_earlier
     if is_apart and len(offsets) > 1:
         return (
             f"the timestamps of {stream}, which has UTC, are not on the clock of the other messages"
@@ -127,15 +132,15 @@ def _find_agreement(stream: str, times: _Ints, offsets: _Ints, others: _Period) 
     parts = _stable_parts(times, offsets)
     if parts is None:
         low, high = np.quantile(offsets, [0.05, 0.95]) / 1e6
-        return (
-            f"the UTC of {stream} varies by {high - low:.0f} s: a drift, or several clocks or boots"
-        )
+        spread = f"{high - low:.0f} s"
+        return f"the UTC of {stream} varies by {spread}: a drift, or several clocks or boots"
     final = parts[0]
     offset = int(np.median(final))
     corrected = 0
     if len(parts) > 1:
         corrected = offset - int(np.median(parts[1]))
-    return UtcOffset(stream, offset, len(final), int(np.ptp(final)), corrected)
+    variation = int(np.ptp(final))
+    return UtcOffset(stream, offset, len(final), variation, corrected)
 
 
 def _to_ints(values: Any) -> _Ints:
@@ -145,10 +150,12 @@ def _to_ints(values: Any) -> _Ints:
 
 def _period(times: npt.NDArray[Any]) -> _Period:
     """Return the period of all but a few wild times since boot."""
-    since_boot = times[~np.asarray(is_unix_time(times), bool)]
+    is_unix = np.asarray(is_unix_time(times), bool)
+    since_boot = times[~is_unix]
     if not len(since_boot):
         return _Period()
-    return _Period(*np.quantile(since_boot, [0.02, 0.98]))
+    first, last = np.quantile(since_boot, [0.02, 0.98])
+    return _Period(first, last)
 
 
 def _stable_parts(times: Any, offsets: Any) -> list[Any] | None:
@@ -157,9 +164,9 @@ def _stable_parts(times: Any, offsets: Any) -> list[Any] | None:
     if len(near) >= _AGREEING * len(offsets):
         return [near]
     # without single wild values
-    medians = np.median([times[:-2], times[1:-1], times[2:]], axis=0)
-    has_several_boots = (np.diff(medians) < -_TOLERANCE).any()
-    if has_several_boots:
+    smooth = np.median([times[:-2], times[1:-1], times[2:]], axis=0)
+    is_back = np.diff(smooth) < -_TOLERANCE
+    if is_back.any():  # several boots
         return None
     few = (1 - _AGREEING) * len(offsets)
     parts = list[Any]()
@@ -173,7 +180,8 @@ def _stable_parts(times: Any, offsets: Any) -> list[Any] | None:
         offsets = offsets[:begin]
     if len(parts[0]) < _CONFIRMED:
         return None
-    if np.ptp([np.median(part) for part in parts]) > _CORRECTION_RANGE:
+    typical = [np.median(part) for part in parts]
+    if np.ptp(typical) > _CORRECTION_RANGE:
         return None
     return parts
 
@@ -182,8 +190,9 @@ def _last_correction(offsets: Any) -> int:
     """Return the index from which on offsets agree with the last ones, apart from a few."""
     is_late = _is_near(offsets, _tail(offsets))
     # the sum of +1 for another offset, and -1 for one of the last, is greatest where the last ones begin
-    balance = np.cumsum(np.where(is_late, -1, 1))
-    return int(np.argmax(np.append(0, balance)))
+    steps = np.where(is_late, -1, 1)
+    balance = np.append(0, np.cumsum(steps))
+    return int(np.argmax(balance))
 
 
 def _tail(offsets: Any) -> Any:

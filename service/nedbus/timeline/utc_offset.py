@@ -63,7 +63,9 @@ def unix_seconds(time: float, offset: float | None) -> float | None:
     if offset is None:
         return None
     unix = time + offset
-    return unix if is_unix_time(unix * 1e6) else None
+    if is_unix_time(unix * 1e6):
+        return unix
+    return None
 
 
 def utc_text(times: Sequence[float]) -> str:

@@ -154,7 +154,10 @@ class VehicleClock:
         if time < last - REORDER_WINDOW:
             self._older.setdefault(stream, math.inf if now is None else now)
         if self._is_other_clock(time, newest, now):
-            kind = TimeKind.STEP if is_unix_time(time) else TimeKind.REBOOT
+            if is_unix_time(time):
+                kind = TimeKind.STEP
+            else:
+                kind = TimeKind.REBOOT
             return self._begin(stream, time, now, kind)
         self._known.add(stream, time)
         return Reading(TimeKind.LATE, time, self.boot)
@@ -212,7 +215,9 @@ class VehicleClock:
         if self._modulus is None or newest is None:
             return time
         elapsed = self._elapsed(now)
-        passed = _UNKNOWN_PAUSE if elapsed is None else 1e6 * elapsed + _MARGIN
+        passed: float = _UNKNOWN_PAUSE
+        if elapsed is not None:
+            passed = 1e6 * elapsed + _MARGIN
         begin = newest - newest % self._modulus
         same = begin + time
         after = begin + self._modulus + time
@@ -232,5 +237,8 @@ class VehicleClock:
         passed = 1e6 * elapsed
         is_ahead = time > newest + passed + _UNKNOWN_PAUSE
         is_confirmed = 0 <= time - self._ahead <= _UNKNOWN_PAUSE
-        self._ahead = time if is_ahead else math.inf
+        if is_ahead:
+            self._ahead = time
+        else:
+            self._ahead = math.inf
         return is_ahead and not is_confirmed

@@ -25,13 +25,16 @@ class Decision:
 
     def __str__(self) -> str:
         if not self.is_default:
-            verb = "allows" if self.is_allowed else "denies"
+            verb = "denies"
+            if self.is_allowed:
+                verb = "allows"
             return f"rule {self.rules[0]} {verb} it"
         if self.is_allowed:
             return "no rule denies it"
         if not self.rules:
             return "no rule is for such messages of this certificate"
-        return f"none of its rules includes this key: {', '.join(self.rules)}"
+        names = ", ".join(self.rules)
+        return f"none of its rules includes this key: {names}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,19 +71,23 @@ class AccessControl:
         self._is_allowed_by_default = section["default_permission"] == "allow"
         # A limit of sizes has messages, flows and key expressions like a rule.
         self._size_limits = [_parse_rule(limit) for limit in filters]
-        rules = {rule["id"]: _parse_rule(rule) for rule in section["rules"] or ()}
+        parsed = [_parse_rule(rule) for rule in section["rules"] or ()]
+        rules = {rule.name: rule for rule in parsed}
         self._rules = defaultdict[str, list[AccessRule]](list)  # by subject
         for policy in section["policies"] or ():
+            own = [rules[name] for name in policy["rules"] if name in rules]
             for subject in policy["subjects"]:
-                self._rules[subject] += [rules[name] for name in policy["rules"] if name in rules]
+                self._rules[subject] += own
         self._common: list[str] = []  # subjects of every certificate
         self._subjects = defaultdict[str, list[str]](list)  # of one, by its common name
         for subject in section["subjects"] or ():
-            if not subject["cert_common_names"]:
-                self._common.append(subject["id"])
+            name = subject["id"]
+            certificates = subject["cert_common_names"]
+            if not certificates:
+                self._common.append(name)
                 continue
-            for certificate in subject["cert_common_names"]:
-                self._subjects[certificate].append(subject["id"])
+            for certificate in certificates:
+                self._subjects[certificate].append(name)
 
     @property
     def certificates(self) -> list[str]:
@@ -90,7 +97,8 @@ class AccessControl:
     def rules_of(self, certificate: str) -> list[AccessRule]:
         """Return the rules that apply to the certificate with this common name."""
         rules: list[AccessRule] = []
-        for subject in (*self._common, *self._subjects.get(certificate, ())):
+        own = self._subjects.get(certificate, ())
+        for subject in (*self._common, *own):
             rules += self._rules.get(subject, ())
         return rules
 
@@ -102,20 +110,20 @@ class AccessControl:
         if not self.is_enabled:
             return Decision(is_allowed=True, is_default=True)
         wanted = zenoh.KeyExpr(key)
-        rules = [rule for rule in self.rules_of(certificate) if rule.is_for(message, flow)]
+        own = self.rules_of(certificate)
+        rules = [rule for rule in own if rule.is_for(message, flow)]
         including = [rule for rule in rules if rule.includes(wanted)]
         if not including:
-            names = tuple(rule.name for rule in rules)
-            return Decision(self._is_allowed_by_default, names, is_default=True)
+            names = [rule.name for rule in rules]
+            return Decision(self._is_allowed_by_default, tuple(names), is_default=True)
         deciding = min(including, key=lambda rule: rule.is_allowed)
         return Decision(deciding.is_allowed, (deciding.name,))
 
     def limits_size(self, key: str) -> bool:
         """Return whether the router limits the size of messages that clients put on this key."""
         wanted = zenoh.KeyExpr(key)
-        return any(
-            limit.is_for("put", "ingress") and limit.includes(wanted) for limit in self._size_limits
-        )
+        of_puts = [limit for limit in self._size_limits if limit.is_for("put", "ingress")]
+        return any(limit.includes(wanted) for limit in of_puts)
 
 
 def _parse_rule(rule: Mapping[str, Any]) -> AccessRule:

@@ -46,14 +46,17 @@ class TopicKey:
     @classmethod
     def parse(cls, key: str) -> Self:
         """Parse a key of rmw_zenoh; raise DecodeError for any other key."""
-        match = _KEY.fullmatch(key) if len(key) <= limits.KEY_TEXT and "//" not in key else None
+        match = None
+        if len(key) <= limits.KEY_TEXT and "//" not in key:
+            match = _KEY.fullmatch(key)
         if match is None:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
         return cls(int(match[1]), match[2], match[3], match[4])
 
     def token(self, kind: Literal["MP", "MS"], session: str, node: str, entity: int) -> str:
         """Return the liveliness token of a node's publisher (MP), which ROS 2 lists, or of its subscription (MS)."""
-        topic, end = self.topic.replace("/", "%"), f"{self.dds_type}/{self.type_hash}/{_QOS}"
+        topic = self.topic.replace("/", "%")
+        end = f"{self.dds_type}/{self.type_hash}/{_QOS}"
         return f"@ros2_lv/{self.domain}/{session}/0/{entity}/{kind}/%/%/{node}/%{topic}/{end}"
 
     def __str__(self) -> str:
@@ -118,7 +121,9 @@ class PublisherToken:
     def gid(self) -> bytes | None:
         """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same gid."""
         match = _PX4_NODE.fullmatch(self.node)
-        return bytes.fromhex(match[1]) if match else None
+        if match:
+            return bytes.fromhex(match[1])
+        return None
 
 
 def gid_of_token(token: str) -> bytes:
@@ -136,4 +141,7 @@ def node_token(domain: int, session: str, node: str) -> str:
 
 def px4_publishers_key_expr(domain: int | None) -> str:
     """Return the key expression for the tokens of all publishers of PX4 messages, in one domain or (None) in all."""
-    return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{PX4_TYPES}/*/*"
+    domains = "*"
+    if domain is not None:
+        domains = str(domain)
+    return f"@ros2_lv/{domains}/*/*/*/MP/*/*/*/*/{PX4_TYPES}/*/*"

@@ -168,7 +168,10 @@ def read_router_config(path: Path | None = None) -> RouterConfig:
     """
     from .access_control import AccessControl
 
-    config = zenoh.Config() if path is None else _parse_config(path)
+    if path is None:
+        config = zenoh.Config()
+    else:
+        config = _parse_config(path)
     sessions = int(_get(config, "transport/unicast/max_sessions"))
     access = AccessControl(_get(config, "access_control"), _get(config, "low_pass_filter"))
     return RouterConfig(
@@ -236,7 +239,9 @@ def _parse_config(path: Path) -> zenoh.Config:
             line, column = map(int, position.groups())
         # Strip the source excerpt and source paths that Zenoh's parser adds.
         message = re.search(r'(?:msg: "|= )(.*?)(?: at /|", location)', text, re.DOTALL)
-        reason = message[1].replace("`", "'") if message else "not a Zenoh configuration"
+        reason = "not a Zenoh configuration"
+        if message:
+            reason = message[1].replace("`", "'")
         raise ConfigError.in_file(path, reason, line=line, column=column) from exc
     return config
 

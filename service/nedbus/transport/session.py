@@ -100,7 +100,6 @@ def open_client(
     check_endpoints(endpoints, where="connect")
     settings: dict[str, object] = {
         **COMMON_SETTINGS,
-        **({"transport/link/tls": tls.zenoh_settings()} if tls is not None else {}),
         "mode": "client",
         "transport/link/tx/lease": round(1000 * TIMINGS.lease),
         "connect/endpoints": list(endpoints),
@@ -112,7 +111,10 @@ def open_client(
         # Including key and headers; larger messages from peers are rejected.
         "transport/link/rx/max_message_size": limits.REPLY_BYTES + 2**12,
     }
-    timeout = math.inf if timeout is None else timeout
+    if tls is not None:
+        settings["transport/link/tls"] = tls.zenoh_settings()
+    if timeout is None:
+        timeout = math.inf
     end = time.monotonic() + timeout
     stop = stop or threading.Event()
     reason = ""
@@ -129,7 +131,9 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # For most failures Zenoh reports only "Unable to connect".
-    cause = resolution_error(endpoints) or (tls.explain() if tls is not None else None)
+    cause = resolution_error(endpoints)
+    if not cause and tls is not None:
+        cause = tls.explain()
     if (
         not cause
         and (tls is None or tls.certificate is None)
@@ -138,7 +142,10 @@ def open_client(
         cause = (
             "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
         )
-    secure = [] if cause or stop.is_set() else _tls_ports(endpoints)
+    if cause or stop.is_set():
+        secure = []
+    else:
+        secure = _tls_ports(endpoints)
     advice = f"{' and '.join(secure)} speaks TLS: use tls/ instead of tcp/" if secure else ""
     reason = cause or ("" if "Unable to connect" in reason else reason)
     raise ConnectError(endpoints, timeout, reason, advice=advice)
@@ -197,15 +204,15 @@ def translate_error(error: zenoh.ZError) -> NedbusError:
 
     The error text decides, because `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
     """
-    return (
-        ClosedError()
-        if _CLOSED.search(str(error))
-        else NedbusError(f"Zenoh reports: {error_reason(error)}")
-    )
+    if _CLOSED.search(str(error)):
+        return ClosedError()
+    return NedbusError(f"Zenoh reports: {error_reason(error)}")
 
 
 def error_reason(error: zenoh.ZError) -> str:
     """Return the reason reported by the operating system, else the whole text without source paths."""
     text = re.sub(r" at /\S+", "", str(error)).strip()
     match = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
-    return match[1].lower() if match else text
+    if match:
+        return match[1].lower()
+    return text

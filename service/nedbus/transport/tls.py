@@ -86,7 +86,8 @@ class Tls:
         import ssl
 
         try:
-            ours, peer = self.context(), self.context(server=True)
+            ours = self.context()
+            peer = self.context(server=True)
         except OSError:
             return f"{self.ca} is not a CA certificate"
         if self.certificate is None:
@@ -96,11 +97,14 @@ class Tls:
                 ssl.cert_time_to_seconds(str(certificate["notAfter"]))
                 for certificate in peer.get_ca_certs()
             )
-            return f"{self.ca} has expired" if until < clock.utc() else None
+            if until < clock.utc():
+                return f"{self.ca} has expired"
+            return None
         ours.check_hostname = False
         ours.verify_mode = ssl.CERT_NONE  # the server is this process
         peer.verify_mode = ssl.CERT_REQUIRED
-        to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+        to_server = ssl.MemoryBIO()
+        to_client = ssl.MemoryBIO()
         client = ours.wrap_bio(to_client, to_server)
         server = peer.wrap_bio(to_server, to_client, server_side=True)
         for side in (client, server, client, server):  # the steps of a handshake
@@ -135,9 +139,12 @@ def check_pem(path: str | Path, kind: str) -> None:
     text = Path(path).read_text(errors="replace")
     labels = _LABEL.findall(text)
     if not any(label.endswith(kind) for label in labels):
-        problem = (
-            f"contains a {labels[0].lower()}" if labels else "is not PEM" if text else "is empty"
-        )
+        if labels:
+            problem = f"contains a {labels[0].lower()}"
+        elif text:
+            problem = "is not PEM"
+        else:
+            problem = "is empty"
         hint = "check whether two files are swapped" if labels else "create one with 'nedbus pki'"
         raise ConfigError("tls", f"{path} {problem}, but a {kind.lower()} is required: {hint}")
 

@@ -55,7 +55,10 @@ class Uplinks:
         # The destination of an open link is the dialled endpoint, but its host name may have been resolved.
         dialled = [link.dst for link in self._session.info.links()]
         for uplink in self._uplinks:
-            is_up = bool(dialled) if self._is_client else self._is_linked(uplink.name, dialled)
+            if self._is_client:
+                is_up = bool(dialled)
+            else:
+                is_up = self._is_linked(uplink.name, dialled)
             if is_up != uplink.is_up:
                 self._change(uplink, is_up)
 
@@ -106,7 +109,10 @@ class Uplinks:
         if not endpoint.startswith(("tls/", "quic/")):
             return ""
         missing = "set tls_ca, tls_certificate and tls_key, which are missing"
-        explanation = self._tls.explain() if self._tls else missing
+        if self._tls:
+            explanation = self._tls.explain()
+        else:
+            explanation = missing
         return f" ({explanation})" if explanation else ""
 
 

@@ -35,7 +35,8 @@ class VehicleDirectory:
     def __init__(
         self, follow: Callable[[], LivelinessTokens | FleetTokens], *, prefix: str
     ) -> None:
-        self._prefix, self._follow = prefix, follow
+        self._prefix = prefix
+        self._follow = follow
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._addresses: dict[str, Address] = {}  # by token key

@@ -47,7 +47,8 @@ def probe_writes(
     # the `**` of readers does not match a chunk that starts with @
     probe = f"@doctor/{secrets.token_hex(8)}"
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
-    missing, capacity = dict(keys), len(keys) + _SPARE
+    missing = dict(keys)
+    capacity = len(keys) + _SPARE
 
     def receive() -> bool:
         for sample in islice(iter(subscriber.handler.try_recv, None), capacity):
@@ -76,7 +77,9 @@ def probe_writes(
                 )
             if _wait(receive, _RETRY):
                 break
-    refused: WriteVerdict = "denied" if matched else "unknown"
+    refused: WriteVerdict = "unknown"
+    if matched:
+        refused = "denied"
     return {vehicle: refused if key in missing else "allowed" for key, vehicle in keys.items()}
 
 

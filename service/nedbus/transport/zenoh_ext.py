@@ -47,8 +47,11 @@ def follow_heartbeats(
         newest: Heartbeats = {}
         with suppress(zenoh.ZError):  # already undeclared
             for heartbeat in islice(iter(subscriber.handler.try_recv, None), limits.HEARTBEATS):
-                key, payload = str(heartbeat.key_expr), heartbeat.payload.to_bytes()
-                publisher = _parse_key(key) if len(key) <= limits.KEY_TEXT else None
+                key = str(heartbeat.key_expr)
+                payload = heartbeat.payload.to_bytes()
+                publisher = None
+                if len(key) <= limits.KEY_TEXT:
+                    publisher = _parse_key(key)
                 # peers may send malformed heartbeats
                 if publisher is not None and len(payload) == _PAYLOAD_BYTES:
                     newest[publisher] = int.from_bytes(payload, "little")
@@ -60,7 +63,9 @@ def follow_heartbeats(
 @lru_cache(1024)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
     match = _KEY.fullmatch(heartbeat)
-    return None if match is None else (match[1], f"{match[2]}:{match[3]}")
+    if match is None:
+        return None
+    return match[1], f"{match[2]}:{match[3]}"
 
 
 class RetransmitRequest:

@@ -65,7 +65,10 @@ class Conditions:
             if burst.has_ended(kind, time):
                 del self._bursts[kind]
                 # rejections end; the others are single events
-                at = burst.end if kind == "rejected" else burst.begin
+                if kind == "rejected":
+                    at = burst.end
+                else:
+                    at = burst.begin
                 self.emit(_finding_of_burst(kind, burst), "", at)
         for event in self._frequency.settle(time):
             self._report(event)
@@ -103,7 +106,8 @@ class Conditions:
 
         `changed`: time when the condition began or ended, if earlier than `time`.
         """
-        changed = time if changed is None else changed
+        if changed is None:
+            changed = time
         if finding.change == "begin":
             self.begin(finding, topic, time, changed)
         elif finding.change == "end":
@@ -324,7 +328,9 @@ def _finding_of_losses(burst: _Burst) -> Finding:
         messages = f"about {messages}"
         streams = f"{streams} and the ULog stream" if streams else "the ULog stream"
     duration = burst.end - burst.begin
-    within = f" in {format_duration(duration)}" if duration >= 1 else ""
+    within = ""
+    if duration >= 1:
+        within = f" in {format_duration(duration)}"
     text = f"{messages} lost{within} ({streams})"
     numbers = {"messages": burst.count, "duration": duration}
     return Finding("lost", "once", text, names, numbers)
@@ -360,7 +366,9 @@ class _Frequency:
         """Return how many events like one are reported within WINDOW, by what is alike in them."""
         of_kind = (event.kind, None)
         if event.change == "once":
-            alike = event.text if event.kind == "text" else (event.names, event.severity)
+            alike: object = event.text
+            if event.kind != "text":
+                alike = (event.names, event.severity)
             return {(event.kind, alike): rules.EQUAL_EVENTS, of_kind: rules.SINGLE_EVENTS}
         # flags of a kind may change in any combination
         if of_kind in self._suppressed:

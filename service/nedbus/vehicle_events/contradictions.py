@@ -324,7 +324,9 @@ class Comparison:
 
 def _accuracy(value: float) -> float:
     """Return the accuracy of a GNSS receiver [m], or a usual one if it provides none."""
-    return value if value > 0.0 else rules.UNKNOWN_ACCURACY
+    if value > 0.0:
+        return value
+    return rules.UNKNOWN_ACCURACY
 
 
 def atmosphere_error(climbed: float) -> float:
@@ -426,7 +428,9 @@ class _Contradiction:
 
     def _begin(self, references: str, lasted: float) -> Finding:
         size = f"{abs(self.worst):.0f} m"
-        side = "above" if self.worst > 0.0 else "below"
+        side = "below"
+        if self.worst > 0.0:
+            side = "above"
         if self.quantity == "height":
             text = f"height {size} {side} {references} while z_valid is true"
         elif self.quantity == "position":

@@ -102,7 +102,10 @@ class ChangeDetector:
         is_same = missing is self.missing or missing == self.missing
         if is_same and state == self._state:
             return None
-        before = {} if last is None else self._by_name(last, self.missing)
+        if last is None:
+            before = {}
+        else:
+            before = self._by_name(last, self.missing)
         self._state = state
         self.missing = missing
         return self._detect(before, self._by_name(message, missing))
@@ -221,12 +224,17 @@ class AidDetector(ChangeDetector):
         if kind == before:
             return
         # one condition replaces the other at once
-        age = 0.0 if before and kind else (self.stamp - self._since) / 1e6
+        if before and kind:
+            age = 0.0
+        else:
+            age = (self.stamp - self._since) / 1e6
         if before:
             text = end or KINDS[before].end.format(self._label)
             yield Finding(before, "end", text, (self.topic,), age=age)
         if kind:
-            severity: Severity | None = "info" if self.topic in KINDS[kind].minor else None
+            severity: Severity | None = None
+            if self.topic in KINDS[kind].minor:
+                severity = "info"
             initial = kind == "aid_unused" and self._is_first
             text = KINDS[kind].begin.format(self._label) + self._explain()
             yield Finding(
@@ -346,8 +354,13 @@ def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterat
                 changed.setdefault(change, []).append(name)
         for (is_event, change_name), flags in sorted(changed.items()):
             labels = ", ".join(kind.flags[flag] for flag in flags)
-            text = kind.begin if change_name == "begin" else kind.end
-            severity: Severity | None = "info" if kind.minor.issuperset(flags) else None
+            if change_name == "begin":
+                text = kind.begin
+            else:
+                text = kind.end
+            severity: Severity | None = None
+            if kind.minor.issuperset(flags):
+                severity = "info"
             yield Finding(
                 kind.name,
                 change_name,
@@ -362,9 +375,13 @@ def _change_of_flag(kind: Kind, was: object, now: object) -> _FlagChange | None:
     """Return how the condition of a flag changes; None for an unknown value."""
     if was is None:
         is_initial = now == kind.bad and kind.initial
-        return _FlagChange(is_event=False, change="begin") if is_initial else None
+        if is_initial:
+            return _FlagChange(is_event=False, change="begin")
+        return None
     if now is None:
-        return _FlagChange(is_event=False, change="end") if was == kind.bad else None
+        if was == kind.bad:
+            return _FlagChange(is_event=False, change="end")
+        return None
     if was == now:
         return None
     return _FlagChange(is_event=True, change="begin" if now == kind.bad else "end")
@@ -410,7 +427,9 @@ def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
             initial = was is None or not before
             # a vehicle may have no GNSS receiver
             is_info = initial and kind == "few_satellites"
-            severity: Severity | None = "info" if is_info else None
+            severity: Severity | None = None
+            if is_info:
+                severity = "info"
             yield Finding(
                 kind,
                 "begin",
@@ -499,13 +518,17 @@ def _level_of_satellites(count: int | None) -> int | None:
         return None
     if count < rules.FEW_SATELLITES:
         return 2
-    return 1 if count < rules.ENOUGH_SATELLITES else 0
+    if count < rules.ENOUGH_SATELLITES:
+        return 1
+    return 0
 
 
 def _level_of_jamming(indicator: int, state: int) -> int:
     if state > 1 or indicator >= rules.JAMMING_BEGIN:
         return 2
-    return 1 if indicator >= rules.JAMMING_END else 0
+    if indicator >= rules.JAMMING_END:
+        return 1
+    return 0
 
 
 def _detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -576,7 +599,9 @@ def _detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
-    was = _warning_of(before) if before else 0
+    was: int | None = 0
+    if before:
+        was = _warning_of(before)
     warning = _warning_of(after)
     if warning is None or was is None or was == warning:
         return
@@ -590,7 +615,9 @@ def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
         text = f"battery no longer {rules.WARNINGS.get(was, was)}{left}"
         yield Finding("battery", "end", text, numbers=numbers)
         return
-    severity: Severity | None = "watch" if warning in (1, 7) else None
+    severity: Severity | None = None
+    if warning in (1, 7):
+        severity = "watch"
     text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
     yield Finding(
         "battery",

@@ -74,7 +74,9 @@ class Event:
     @property
     def origin(self) -> str:
         """The author: "px4" for log messages of an autopilot, "nedbus" for events derived from messages."""
-        return "px4" if self.kind == "text" else "nedbus"
+        if self.kind == "text":
+            return "px4"
+        return "nedbus"
 
     @property
     def is_minor(self) -> bool:
@@ -207,7 +209,9 @@ def _begin_of(event: Event, earlier: Sequence[Event]) -> int | None:
     for index in reversed(range(len(earlier))):
         begin = earlier[index]
         if (begin.vehicle, begin.kind) == (event.vehicle, event.kind):
-            return index if event.time - begin.time <= WILD else None
+            if event.time - begin.time <= WILD:
+                return index
+            return None
     return None
 
 

@@ -183,7 +183,9 @@ class EventLog:
             known = self.vehicles.get(vehicle)
             if known is None and self.is_full:
                 return State("watch", f"no events: more than {limits.VEHICLES} vehicles", None, ())
-            return known.state(time) if known is not None else state_of(())
+            if known is not None:
+                return known.state(time)
+            return state_of(())
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
         """Return the retained events after the first `seen` reported ones, and the number of all reported events."""

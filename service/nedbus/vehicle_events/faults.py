@@ -109,7 +109,10 @@ def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> I
         is_recent = event.time > report.now - expected.within
         is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
         if is_recent and is_selected and event.severity != "info":
-            name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
+            if event.vehicle == ALL:
+                name = report.host
+            else:
+                name = f"vehicle {event.vehicle}"
             at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
             lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[: limits.SHOWN_NAMES]

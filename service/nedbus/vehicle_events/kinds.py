@@ -67,7 +67,9 @@ class Kind:
 
     def conditions(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the flags of an event, one condition each; `("",)` for a kind without flags."""
-        return names if self.flags else ("",)
+        if self.flags:
+            return names
+        return ("",)
 
 
 _ESTIMATE: Final = "VehicleLocalPosition"

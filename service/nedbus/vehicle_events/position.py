@@ -99,9 +99,13 @@ class PositionDetector(ChangeDetector):
         findings = super().add(message, missing)
         if findings is not None:
             return findings
-        has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
+        north = abs(motion[0] - before[0])
+        east = abs(motion[1] - before[1])
+        has_moved = north > _MIN_STEP or east > _MIN_STEP
         is_valid = self._state[0]
-        step = self._unexplained_step() if has_moved and is_valid else None
+        step = None
+        if has_moved and is_valid:
+            step = self._unexplained_step()
         if step is None and self._jump is None:
             return None
         return self._track_jump(step)
@@ -130,7 +134,9 @@ class PositionDetector(ChangeDetector):
         # as text, because NaN equals NaN
         is_same_origin = str(_origin_of(before)) == str(_origin_of(after))
         is_comparable = after["xy_valid"] and "xy" not in quantities and is_same_origin
-        step = self._unexplained_step() if is_comparable else None
+        step = None
+        if is_comparable:
+            step = self._unexplained_step()
         yield from self._track_jump(step)
 
     def _detect_origin(self, before: Fields, after: Fields) -> Iterator[Finding]:
@@ -141,7 +147,8 @@ class PositionDetector(ChangeDetector):
         is_back = self._left == returned_to and self.stamp - self.earlier <= 1e6 * WILD
         self._left = _Left(self.stamp, _origin_of(before))
         if is_back:
-            finding = replace(finding, numbers={**finding.numbers, ALONE: 1})
+            numbers = {**finding.numbers, ALONE: 1}
+            finding = replace(finding, numbers=numbers)
         yield finding
 
     def _unexplained_step(self) -> _Step | None:
@@ -151,8 +158,10 @@ class PositionDetector(ChangeDetector):
             return None
         before = _Motion._make(self._motion_before)
         motion = _Motion._make(self._motion)
-        north = motion.x - before.x - (motion.vx + before.vx) / 2 * seconds
-        east = motion.y - before.y - (motion.vy + before.vy) / 2 * seconds
+        mean_vx = (motion.vx + before.vx) / 2
+        mean_vy = (motion.vy + before.vy) / 2
+        north = motion.x - before.x - mean_vx * seconds
+        east = motion.y - before.y - mean_vy * seconds
         speed = math.hypot(motion.vx, motion.vy)
         limit = JUMP_DISTANCE + JUMP_SHARE * speed * seconds
         if north * north + east * east > limit * limit:
@@ -219,7 +228,10 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         known.append(_describe(name, numbers))
     sizes = [abs(size) for name, size in numbers.items() if name != "heading"]
     is_small = not unknown and all(size < SMALL_RESET for size in sizes)
-    severity: Severity | None = "info" if is_small else None
+    is_large = any(size >= LARGE_CORRECTION for size in sizes)
+    severity: Severity | None = None
+    if is_small:
+        severity = "info"
     return Finding(
         "reset",
         "once",
@@ -227,7 +239,7 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         tuple(quantities),
         numbers,
         severity=severity,
-        is_large=any(size >= LARGE_CORRECTION for size in sizes),
+        is_large=is_large,
     )
 
 
@@ -235,8 +247,9 @@ def _describe(name: Quantity, numbers: Mapping[str, float]) -> str:
     """Return the text for a quantity of a reset, whose `numbers` have its sizes."""
     reset = _RESETS[name]
     sizes = {key: numbers[key] for key in reset.names}
-    degrees = math.degrees(sizes[reset.names[0]])
-    return reset.text.format(**sizes, size=math.hypot(*sizes.values()), degrees=degrees)
+    first, *_ = sizes.values()
+    size = math.hypot(*sizes.values())
+    return reset.text.format(**sizes, size=size, degrees=math.degrees(first))
 
 
 def _sizes_of(reset: Event) -> dict[Quantity, float]:
@@ -246,7 +259,8 @@ def _sizes_of(reset: Event) -> dict[Quantity, float]:
         keys = _RESETS[name].names
         is_known = reset.numbers.keys() >= set(keys)
         if is_known and name in reset.names:
-            sizes[name] = math.hypot(*(reset.numbers[key] for key in keys))
+            values = [reset.numbers[key] for key in keys]
+            sizes[name] = math.hypot(*values)
     return sizes
 
 
@@ -299,14 +313,17 @@ def _has_origin(fields: Fields) -> bool:
 
 def _move_of_origin(before: Fields, after: Fields) -> Finding | None:
     projection = MapProjection(before["ref_lat"], before["ref_lon"])
-    distance = math.hypot(*projection.project(after["ref_lat"], after["ref_lon"]))
+    north, east = projection.project(after["ref_lat"], after["ref_lon"])
+    distance = math.hypot(north, east)
     up = after["ref_alt"] - before["ref_alt"]
     if not math.isfinite(up):
         up = 0.0
     largest = max(distance, abs(up))
     if largest < _SMALLEST_MOVE:
         return None
-    severity: Severity | None = "info" if largest < SMALL_RESET else None
+    severity: Severity | None = None
+    if largest < SMALL_RESET:
+        severity = "info"
     text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
     numbers = {"distance": distance, "up": up}
     return Finding("origin_moved", "once", text, numbers=numbers, severity=severity)

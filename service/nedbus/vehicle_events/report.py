@@ -49,11 +49,13 @@ class VehicleReport:
     @property
     def is_silent(self) -> bool:
         """True if no message arrives from the vehicle."""
-        return "silent" in self.kinds or "gone" in self.kinds
+        return not {"silent", "gone"}.isdisjoint(self.kinds)
 
     def is_forgotten(self, now: float) -> bool:
         """Return True if the vehicle has been silent for an hour."""
-        return self.is_silent and self.since is not None and now - self.since >= TIMINGS.forgotten
+        if not self.is_silent or self.since is None:
+            return False
+        return now - self.since >= TIMINGS.forgotten
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +71,9 @@ class AccountReport:
     def about(self, vehicle: str) -> AccountReport:
         """Return what this report says about one vehicle; events of the link and the reader become its events."""
         vehicles = {}
-        if vehicle in self.vehicles:
-            vehicles[vehicle] = self.vehicles[vehicle]
+        known = self.vehicles.get(vehicle)
+        if known is not None:
+            vehicles[vehicle] = known
         events = []
         for event in self.events:
             if event.vehicle == vehicle:
@@ -88,9 +91,10 @@ class AccountReport:
         events_each = math.ceil(len(self.events) / number)
         parts = []
         for part in range(number):
-            own = names[part * vehicles_each :][:vehicles_each]
-            events = self.events[part * events_each :][:events_each]
-            vehicles = {name: self.vehicles[name] for name in own}
+            of_names = slice(part * vehicles_each, (part + 1) * vehicles_each)
+            of_events = slice(part * events_each, (part + 1) * events_each)
+            vehicles = {name: self.vehicles[name] for name in names[of_names]}
+            events = self.events[of_events]
             parts.append(replace(self, vehicles=vehicles, events=events))
         return parts
 
@@ -120,8 +124,8 @@ def report_of(
     for name, vehicle in list(event_log.vehicles.items()):
         state = event_log.state(name, now)
         vehicles[name] = _report_of_vehicle(vehicle, state, reported, to_utc)
-    later = tuple(event.later(to_utc) for event in events)
-    return AccountReport(service, host, now + to_utc, vehicles, later)
+    later = [event.later(to_utc) for event in events]
+    return AccountReport(service, host, now + to_utc, vehicles, tuple(later))
 
 
 def _report_of_vehicle(
@@ -132,20 +136,24 @@ def _report_of_vehicle(
     for (kind, flag), condition in [*vehicle.conditions.items()]:
         if KINDS[kind].validity:
             flags[flag] = max(0.0, condition.since + to_utc)
-    held = [*vehicle.conditions.values(), *vehicle.usual.values()]
-    faults = [condition for condition in held if condition.severity != "info"]
+    active = [*vehicle.conditions.values(), *vehicle.usual.values()]
+    faults = [condition for condition in active if condition.severity != "info"]
     unreported = [condition for condition in faults if condition.begin.identity not in reported]
     kinds = [condition.kind for condition in state.conditions]
     topics = sorted(vehicle.topics, key=lambda topic: (topic not in TOPICS, topic))
+    since = None
+    if state.since is not None:
+        since = max(0.0, state.since + to_utc)
+    held = [condition.later(to_utc) for condition in dict.fromkeys(unreported)]
     return VehicleReport(
         severity=state.severity,
         text=state.text,
-        since=None if state.since is None else max(0.0, state.since + to_utc),
+        since=since,
         kinds=tuple(dict.fromkeys(kinds)),
         flags=flags,
         topics=tuple(topics[: limits.REPORTED_TOPICS]),
         has_position=vehicle.main is not None,
-        held=tuple(condition.later(to_utc) for condition in dict.fromkeys(unreported)),
+        held=tuple(held),
         unknown=vehicle.unknown,
         first=max(0.0, vehicle.first + to_utc),
     )

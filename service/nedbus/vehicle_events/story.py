@@ -44,7 +44,9 @@ class Span(Condition):
     @property
     def stop(self) -> float:
         """The time of its end; infinite while it is active."""
-        return math.inf if self.until is None else self.until
+        if self.until is None:
+            return math.inf
+        return self.until
 
     @property
     def is_of_estimate(self) -> bool:
@@ -59,7 +61,10 @@ class Span(Condition):
     def holds(self, time: float) -> bool:
         """Return True if the condition is active at `time`, or the single event is recent."""
         is_single = self.until == self.since
-        stop = self.since + RECENT if is_single else self.stop
+        if is_single:
+            stop = self.since + RECENT
+        else:
+            stop = self.stop
         return self.since <= time < stop
 
     def is_active(self, time: float) -> bool:
@@ -94,7 +99,9 @@ class Story:
     @property
     def stop(self) -> float:
         """The time of its end; infinite while it is active."""
-        return math.inf if self.until is None else self.until
+        if self.until is None:
+            return math.inf
+        return self.until
 
     @property
     def is_bad(self) -> bool:
@@ -124,7 +131,10 @@ class Story:
 
     def when(self, times: Times, now: float) -> str:
         """Format the period of the fault; `now`: the current time, or the end of the file."""
-        until = now if self.until is None else self.until
+        if self.until is None:
+            until = now
+        else:
+            until = self.until
         return times.period(self._dated_begin(), self.end, until - self.since)
 
     def _dated_begin(self) -> Event | None:
@@ -230,7 +240,10 @@ def story_of(
     """Return the story of a single event, or of the condition that an event begins or ends."""
     spans = spans_of(events, conditions)
     for span in spans:
-        ends = [span.begin] if span.end is None else [span.begin, span.end]
+        if span.end is None:
+            ends = [span.begin]
+        else:
+            ends = [span.begin, span.end]
         if event.identity in [end.identity for end in ends]:
             return _make_story(_together(span, spans), spans, events, topics)
     return None
@@ -391,8 +404,11 @@ def _make_story(
     stop = max(member.stop for member in group)
     ends = [member.end for member in group if member.end is not None]
     last = [end for end in ends if end.time == stop]
-    end = last[0] if last else None
-    used = {*ends, *(member.begin for member in group)}
+    end = None
+    if last:
+        end = last[0]
+    begins = [member.begin for member in group]
+    used = {*begins, *ends}
     before = [event for event in _evidence(span, spans, events) if event not in used]
     used.update(before)
     after: list[Event] = []
@@ -403,6 +419,7 @@ def _make_story(
     for event in notable:
         if event.change == "once" and stop <= event.time <= stop + TOGETHER:
             after.append(event)
+    meanwhile = [event for event in notable if span.since <= event.time < stop]
     return Story(
         spans=tuple(group),
         what=_text_of(group),
@@ -411,7 +428,7 @@ def _make_story(
         begin=None if span.initial else span.begin,
         end=end,
         before=tuple(before),
-        meanwhile=tuple(event for event in notable if span.since <= event.time < stop),
+        meanwhile=tuple(meanwhile),
         after=tuple(after),
         lacking=_lacking(span, topics),
     )

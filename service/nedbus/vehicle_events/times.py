@@ -52,7 +52,9 @@ class Times:
         """Return the Unix time of an event [s], None if unknown."""
         if self.is_live:
             return event.time + self.ahead
-        return None if event.boot is None else self.utc_of_boot(event.vehicle, event.boot)
+        if event.boot is None:
+            return None
+        return self.utc_of_boot(event.vehicle, event.boot)
 
     def utc_of_boot(self, vehicle: str, boot: float) -> float | None:
         """Convert a time since a vehicle's boot, which may already be Unix time, to Unix time [s]; None if unknown."""
@@ -64,7 +66,9 @@ class Times:
             return "host"
         if self.utc(event) is not None:
             return "vehicle"
-        return "start" if event.boot is None else "boot"
+        if event.boot is None:
+            return "start"
+        return "boot"
 
     @staticmethod
     def unit(clock: str) -> str:
@@ -86,7 +90,9 @@ class Times:
 
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
         """Format a period and its duration [s]; `begin` and `end` are None if they are outside the data."""
-        still = "until now" if self.is_live else "until the end"
+        still = "until the end"
+        if self.is_live:
+            still = "until now"
         duration = f"({format_duration(lasted)})"
         if begin is None:
             return f"from the first message {still} {duration}"

@@ -113,7 +113,8 @@ class Vehicle(Conditions):
             detector.resumes_at = time + detector.pause
         if address.topic in _FUSION_TOPICS:
             self._fusion.add(address.topic, message, address.instance)
-        self._before, detector.time = detector.time, time
+        self._before = detector.time
+        detector.time = time
         before = detector.stamp
         earlier = detector.earlier
         findings: Iterable[Finding] = detector.add(message, missing) or ()
@@ -159,7 +160,8 @@ class Vehicle(Conditions):
         self.last_seen = time
         if "rejected" not in self._bursts:
             text = f"{topic} rejected: {reason}"
-            self.emit(Finding("rejected", "begin", text, (topic, reason)), topic, time)
+            finding = Finding("rejected", "begin", text, (topic, reason))
+            self.emit(finding, topic, time)
         self._count("rejected", time, 1, topic)
 
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
@@ -173,9 +175,11 @@ class Vehicle(Conditions):
             self._update_duplicate(self.main.stream, time, is_duplicate=state == "duplicate")
         if state == "gone":
             self._fall_silent("gone", self.main.stream, time)
-        elif state == "stale" or (
-            state is None and is_connected and time - self._main_time > rules.SILENCE
-        ):
+            return
+        is_silent = state == "stale"
+        if state is None and is_connected:
+            is_silent = time - self._main_time > rules.SILENCE
+        if is_silent:
             self._fall_silent("silent", self.main.stream, time)
 
     def _update_duplicate(self, stream: str, time: float, *, is_duplicate: bool) -> None:
@@ -192,7 +196,10 @@ class Vehicle(Conditions):
         if (kind, "") in self.conditions or ("gone", "") in self.conditions:
             return
         silent = self.conditions.pop(("silent", ""), None)
-        since = self._main_time if silent is None else silent.since
+        if silent is None:
+            since = self._main_time
+        else:
+            since = silent.since
         age = max(0.0, time - since)
         text = f"gone: no publisher of {stream}"
         if kind == "silent":
@@ -232,7 +239,8 @@ class Vehicle(Conditions):
             self.emit(finding, "", self._main_time - age_of_first)
         if resumed:
             text = kind.end.format(", ".join(resumed))
-            self.emit(Finding(kind.name, "end", text, tuple(resumed)), "", self._main_time)
+            finding = Finding(kind.name, "end", text, tuple(resumed))
+            self.emit(finding, "", self._main_time)
 
     def _reopen_unused(self) -> None:
         """Decide anew on the streams that had no detector, because another one was preferred."""
@@ -266,7 +274,9 @@ class Vehicle(Conditions):
     @property
     def unknown(self) -> tuple[str, ...]:
         """Flags that the position estimate in use does not provide."""
-        return () if self._position is None else self._position.unknown
+        if self._position is None:
+            return ()
+        return self._position.unknown
 
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream; None if it has no events, or a preferred stream is in use."""
@@ -323,7 +333,8 @@ class Vehicle(Conditions):
             return None
         if address.topic != rules.POSITIONS[-1] or current.topic == rules.POSITIONS[-1]:
             return None
-        return ChangeDetector(_SAMPLE, (), partial(self._detect_equal, address.instance or 0))
+        detect = partial(self._detect_equal, address.instance or 0)
+        return ChangeDetector(_SAMPLE, (), detect)
 
     def _close_candidates(self) -> None:
         """Stop comparing the estimates of the EKFs with the vehicle's."""
@@ -333,13 +344,14 @@ class Vehicle(Conditions):
 
     def _detector_of(self, topic: str, instance: int) -> ChangeDetector | None:
         """Return a detector for a topic other than the positions, None if it has no events."""
-        own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        own = None
+        if topic in BY_TOPIC:
+            own = detectors.detection_of(BY_TOPIC[topic].name)
+        explain = partial(self._explain, topic)
         if topic in rules.AID_SOURCES:
-            return AidDetector(
-                topic, lambda primary: primary == self._ekf, partial(self._explain, topic)
-            )
+            return AidDetector(topic, lambda primary: primary == self._ekf, explain)
         if topic in rules.VISION:
-            return VisionDetector(self._is_vision_fused, partial(self._explain, topic))
+            return VisionDetector(self._is_vision_fused, explain)
         if topic in REFERENCES:
             return ReferenceDetector(topic, self._comparison, own)
         if topic == MAGNETOMETER:
@@ -347,8 +359,10 @@ class Vehicle(Conditions):
         if own is None:
             return None
         if topic == _EKF:
-            own = own._replace(detect=partial(self._detect_flags, instance, own.detect))
-        return detectors.TextDetector(*own) if topic == "log_message" else ChangeDetector(*own)
+            detect = partial(self._detect_flags, instance, own.detect)
+            own = own._replace(detect=detect)
+        detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
+        return detector(*own)
 
     def _detect_flags(
         self,
@@ -360,7 +374,9 @@ class Vehicle(Conditions):
         if instance != self._ekf:
             return detectors.detect_unused(instance, before, after)
         flags = [after[name] for name in _VISION_FLAGS if after[name] is not None]
-        is_fused = any(flags) if flags else None
+        is_fused = None
+        if flags:
+            is_fused = any(flags)
         if is_fused != self._vision[0]:
             self._vision = is_fused, after["timestamp"]
         return detect(before, after)
@@ -371,7 +387,8 @@ class Vehicle(Conditions):
         if before and before["timestamp_sample"] == vehicle[0]:
             own = tuple(before[name] for name in _SAMPLE)
             self._equal[instance] = vehicle == own
-        if self._equal.get(instance) and not self._equal.get(self._ekf, True):
+        primary_is_equal = self._equal.get(self._ekf, True)
+        if self._equal.get(instance) and not primary_is_equal:
             yield detectors.selected(instance, None)
 
     def _sample_of_vehicle(self) -> tuple[object, ...]:
@@ -398,7 +415,8 @@ class Vehicle(Conditions):
 
         self._supersede(Address(self.name, _EKF, instance), is_over)
         for ekf in (old, instance):
-            detector = self._detectors.get(Address(self.name, _EKF, ekf))
+            address = Address(self.name, _EKF, ekf)
+            detector = self._detectors.get(address)
             if detector is not None:
                 for finding in detector.again(detectors.HEALTHY):
                     self.emit(finding, _EKF, self.time)
@@ -419,7 +437,10 @@ class Vehicle(Conditions):
 
     def _set_boot(self, boot: float, time: float, *, is_queued: bool) -> None:
         """Set the time since boot, ignoring a single one that disagrees with the last one and the time since then."""
-        expected = boot if self.boot is None else self.boot + time - self.time
+        if self.boot is None:
+            expected = boot
+        else:
+            expected = self.boot + time - self.time
         was_off = self._is_off
         self._is_off = is_queued or abs(boot - expected) > 1e-6 * REORDER_WINDOW
         is_single = self._is_off and not was_off and not is_queued

@@ -311,7 +311,9 @@ def _when_valid(faults: Sequence[Story], times: Times, since: float | None) -> s
         return "in flight"
     if not times.is_live:
         return "throughout"
-    return "now" if since is None else f"since {times.text_at(since)} UTC"
+    if since is None:
+        return "now"
+    return f"since {times.text_at(since)} UTC"
 
 
 class _Evidence(NamedTuple):
@@ -346,14 +348,18 @@ def _lateness(worst: Story) -> float:
     """Return the seconds after the start of a fault in which texts are still its evidence."""
     if worst.begin is not None:
         return TOGETHER
-    return math.inf if worst.is_bad else -WINDOW
+    if worst.is_bad:
+        return math.inf
+    return -WINDOW
 
 
 def _first_bad(texts: Iterable[Event], worst: Story) -> list[Event]:
     """Return the first bad text during a fault, unless it is the fault."""
     for text in texts:
         if text.severity == "bad" and _is_during(worst, text.time):
-            return [] if text is worst.begin else [text]
+            if text is worst.begin:
+                return []
+            return [text]
     return []
 
 
@@ -449,7 +455,10 @@ def _others(
     """Return the worst other fault of each kind, worst first; `ranked`: all stories, worst first."""
     largest: dict[str, Story] = {}
     for story in ranked:
-        key = story.what if story.kind == "text" else story.kind
+        if story.kind == "text":
+            key = story.what
+        else:
+            key = story.kind
         largest.setdefault(key, story)
     parts = []
     for story in largest.values():
@@ -483,4 +492,6 @@ def _what(story: Story) -> str:
 
 def _count(story: Story, stories: Iterable[Story]) -> str:
     number = sum(other.kind == story.kind for other in stories)
-    return f" (one of {number})" if number > 1 else ""
+    if number > 1:
+        return f" (one of {number})"
+    return ""

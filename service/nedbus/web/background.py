@@ -61,7 +61,10 @@ class Background:
         except OSError as exc:
             raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
         except (ValueError, TypeError, LookupError, RecursionError) as exc:
-            reason = f"{exc} is missing" if isinstance(exc, KeyError) else str(exc)
+            if isinstance(exc, KeyError):
+                reason = f"{exc} is missing"
+            else:
+                reason = str(exc)
             expected = "expected GeoJSON, or an image with a world file, in WGS 84"
             raise ConfigError("--map", f"{path} cannot be drawn ({reason}): {expected}") from exc
         if not self.rings and self.pixels is None:

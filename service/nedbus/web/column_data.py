@@ -79,14 +79,17 @@ class Tracks:
         """Choose the number of slots, and of points per slot, for these tracks; clear all lines."""
         self._tracks = dict(tracks)
         self._seen = [0 for _ in tracks]
-        sizes = [track.history.size for track in tracks.values()]
-        written = [min(track.history.written, track.history.size) for track in tracks.values()]
+        histories = [track.history for track in tracks.values()]
+        sizes = [history.size for history in histories]
+        written = [min(history.written, history.size) for history in histories]
         longest = max(sizes, default=1)
         share = limits.PAGE_TRACK_POINTS // max(1, len(tracks))
         slots = max(_LEAST_POINTS, min(longest, share))
         # A history that has just begun need not be drawn as coarsely as a full one.
-        expected = max(2 * max(written, default=1), limits.PAGE_TRACK_POINTS)
-        self._step = math.ceil(min(longest, expected) / slots)
+        most_written = max(written, default=1)
+        expected = max(2 * most_written, limits.PAGE_TRACK_POINTS)
+        drawn = min(longest, expected)
+        self._step = math.ceil(drawn / slots)
         self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
         cells = (self._slots + 2) * len(tracks)
         self.source.data = {name: np.full(cells, math.nan) for name in _COLUMNS}
@@ -100,7 +103,9 @@ class Tracks:
         if end == seen:
             return
         self._seen[index] = end
-        ring = _Ring(cells, index * (self._slots + 2), self._slots, _lines_of(address, track))
+        base = index * (self._slots + 2)
+        lines = _lines_of(address, track)
+        ring = _Ring(cells, base, self._slots, lines)
         first = seen // self._step * self._step
         points = history.points(first, end)
         is_broken = False
@@ -108,10 +113,16 @@ class Tracks:
             east = point[_EAST]
             is_new_slot = position % self._step == 0
             is_broken = math.isnan(east) or (is_broken and not is_new_slot)
-            north = math.nan if is_broken else round(point[_NORTH], 2)
-            line = ring.lines.doubtful if point[_DOUBTFUL] > 0 else ring.lines.valid
+            if is_broken:
+                north = math.nan
+            else:
+                north = round(point[_NORTH], 2)
+            line = lines.valid
+            if point[_DOUBTFUL] > 0:
+                line = lines.doubtful
             ring.put(position // self._step, round(east, 2), line, north)
-        ring.put((end - 1) // self._step + 1, math.nan, ring.lines.valid, math.nan)
+        newest = (end - 1) // self._step
+        ring.put(newest + 1, math.nan, lines.valid, math.nan)
 
 
 class _Lines(NamedTuple):

@@ -69,7 +69,9 @@ class EventTimeline:
     def format_time(self, seconds: float) -> str:
         """Format an event time as on the time axes."""
         seconds += self.clock_offset
-        return format_utc(seconds) if self.unit == "UTC" else f"{seconds:.1f}"
+        if self.unit == "UTC":
+            return format_utc(seconds)
+        return f"{seconds:.1f}"
 
     def format_clock(self, seconds: float) -> str:
         """Format an event time with the name of its clock; for a recording, add the seconds since its start."""
@@ -91,7 +93,9 @@ class EventTimeline:
         stories = self._find_stories_cached(vehicle, at)
         if at is None:
             stories = [story for story in reversed(stories) if _is_recent(story, now)]
-        return stories[0] if stories else None
+        if stories:
+            return stories[0]
+        return None
 
     def verdict(self, vehicle: str, end: float, at: float | None = None) -> Verdict:
         """Return the verdict on a time, by default on the whole recording or the ten minutes before `end`."""
@@ -100,11 +104,14 @@ class EventTimeline:
         if cached is not None and end - cached.end < _VERDICT_AGE:
             return cached.verdict
         begin = end - PAST
-        events = self._by_vehicle.get(vehicle, [])[-limits.PAGE_STORY_EVENTS :]
+        events = self._by_vehicle.get(vehicle, [])
+        events = events[-limits.PAGE_STORY_EVENTS :]
         if self.times.is_live:
             events = [event for event in events if event.time > begin]
         known = self.event_log.vehicles.get(vehicle)
-        since = None if known is None else max(known.first, begin)
+        since = None
+        if known is not None:
+            since = max(known.first, begin)
         topics, held = self._evidence(vehicle)
         verdict = verdict_of(
             vehicle, events, held, topics=topics, times=self.times, end=end, at=at, since=since
@@ -123,15 +130,21 @@ class EventTimeline:
         for name in self._by_vehicle:
             for story in self._find_stories_cached(name, None):
                 faults.append((name, story))
-        return sorted(faults, key=lambda fault: fault[1].since)
+        faults.sort(key=lambda fault: fault[1].since)
+        return faults
 
     def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:
         events = self._by_vehicle.get(vehicle, [])
         topics, held = self._evidence(vehicle)
         if isinstance(at, Event):
             story = story_of(at, events, held, topics=topics)
-            return [] if story is None else [story]
-        moment = None if at is None else at + _URL_RESOLUTION
+            if story is None:
+                return []
+            return [story]
+        if at is None:
+            moment = None
+        else:
+            moment = at + _URL_RESOLUTION
         latest = events[-limits.PAGE_STORY_EVENTS :]
         return stories_of(latest, held, topics=topics, at=moment)
 
@@ -156,7 +169,9 @@ class EventTimeline:
             self._by_vehicle.setdefault(event.vehicle, []).append(event)
         self._spans = {}
         for name, events in self._by_vehicle.items():
-            initial = list(vehicles[name].initial) if name in vehicles else []
+            initial: list[Condition] = []
+            if name in vehicles:
+                initial = list(vehicles[name].initial)
             self._spans[name] = spans_of(events, initial)
 
 

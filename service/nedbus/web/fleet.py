@@ -90,7 +90,9 @@ class VehicleView:
     @property
     def grade(self) -> str:
         """The severity of the state, with "ok" for "info"."""
-        return "ok" if self.state.severity == "info" else self.state.severity
+        if self.state.severity == "info":
+            return "ok"
+        return self.state.severity
 
     @property
     def lost(self) -> int:
@@ -114,7 +116,9 @@ class VehicleView:
             return "none yet"
         text = f"{position.north:z.1f} m north, {position.east:z.1f} m east"
         if math.isfinite(position.altitude):
-            name = "altitude" if position.is_altitude_global else "height"
+            name = "height"
+            if position.is_altitude_global:
+                name = "altitude"
             text += f", {name} {position.altitude:z.1f} m"
         if not position.common or projection is None:
             return text
@@ -168,8 +172,14 @@ class Fleet:
         origin: Origin | None = None,
         long: HistorySize = LONG,
     ) -> None:
-        self.monitor = Monitor() if monitor is None else monitor
-        self.origin = Origin() if origin is None else origin
+        if monitor is None:
+            self.monitor = Monitor()
+        else:
+            self.monitor = monitor
+        if origin is None:
+            self.origin = Origin()
+        else:
+            self.origin = origin
         self.streams: dict[Address, PageStream] = {}
         self.snapshot = FleetSnapshot(0.0)
         self._long = long
@@ -184,7 +194,9 @@ class Fleet:
         address = sample.address
         is_estimate = is_position(address) and address.topic != TRUTH
         with self._lock:
-            truth = self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None
+            truth = None
+            if is_estimate:
+                truth = self.streams.get(Address(address.vehicle, TRUTH))
             stream = self.streams.get(address)
             if stream is not None:
                 stream.add(sample, time, truth)
@@ -259,7 +271,10 @@ class Fleet:
         self, stream: PageStream, address: Address, newest: NewestMessage[Any], now: Snapshot
     ) -> StreamView:
         health = now.healths.get(address) or newest.health
-        publishers = None if now.alive is None else now.alive[address]
+        if now.alive is None:
+            publishers = None
+        else:
+            publishers = now.alive[address]
         state = stream_state(health, publishers=publishers, connected=not now.link)
         return StreamView(address, stream, newest, health, state, self._rejected[address])
 
@@ -294,7 +309,9 @@ def _status(views: Sequence[StreamView]) -> dict[str, StatusValue]:
             return StatusValue()
         return StatusValue(describe(view.newest.message), view.silence)
 
-    gps = "vehicle_gps_position" if "vehicle_gps_position" in by_topic else "sensor_gps"
+    gps = "sensor_gps"
+    if "vehicle_gps_position" in by_topic:
+        gps = "vehicle_gps_position"
     return {
         "mode": value_of("vehicle_status", _mode_of),
         "armed": value_of("vehicle_status", _arming_of),
@@ -308,12 +325,16 @@ def _mode_of(message: Any) -> str:
 
 
 def _arming_of(message: Any) -> str:
-    return "armed" if message.arming_state == _ARMED else "disarmed"
+    if message.arming_state == _ARMED:
+        return "armed"
+    return "disarmed"
 
 
 def _charge_of(message: Any) -> str:
     remaining = message.remaining
-    return f"{100 * remaining:.0f} %" if 0 <= remaining <= 1 else ""
+    if 0 <= remaining <= 1:
+        return f"{100 * remaining:.0f} %"
+    return ""
 
 
 def _fix_of(message: Any) -> str:

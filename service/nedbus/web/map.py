@@ -190,7 +190,10 @@ class Map:
                 south=position.north - half,
                 north=position.north + half,
             )
-        shown = focused if focused and self.focus == "vehicle" else placed
+        if focused and self.focus == "vehicle":
+            shown = focused
+        else:
+            shown = placed
         points = [np.array([(position.east, position.north) for _, position in shown])]
         if not shown:
             points = [np.zeros((1, 2))]
@@ -225,7 +228,10 @@ class Map:
             x = (mark.left + mark.right) / 2
             width = len(name) * _LETTER + 2 * _MARK
             is_left = x + width > border  # otherwise it would extend beyond the map
-            begin = x - width if is_left else x
+            if is_left:
+                begin = x - width
+            else:
+                begin = x
             label = _Box("", begin, begin + width, mark.top, mark.top + _HEIGHT)
             # Labels of severe vehicles may cover the markers of all others.
             covered = [
@@ -256,19 +262,33 @@ class Map:
         heading = getattr(view.main.newest.message, "heading", math.nan)
         colours = self._style.colours
         colour = self._style.vehicle_colour(view.number)
+        fill = colours["ground"]
+        if view.has_position:
+            fill = colour
+        edge = colour
+        if view.grade != "ok":
+            edge = colours[view.grade]
+        label = view.vehicle
+        if is_left is None:
+            label = ""
+        align = "left"
+        offset = 11
+        if is_left:
+            align = "right"
+            offset = -11
         return {
             "east": round(at.east, 3),
             "north": round(at.north, 3),
             "angle": round(math.pi / 2 - heading, 3),
             "shape": MARKERS[view.grade],
             "colour": colour,
-            "fill": colour if view.has_position else colours["ground"],
-            "edge": colour if view.grade == "ok" else colours[view.grade],
-            "label": "" if is_left is None else view.vehicle,
+            "fill": fill,
+            "edge": edge,
+            "label": label,
             "name": view.vehicle,
             "words": view.state.text,
-            "align": "right" if is_left else "left",
-            "offset": -11 if is_left else 11,
+            "align": align,
+            "offset": offset,
         }
 
     def _draw(self) -> figure:
@@ -369,7 +389,9 @@ class Map:
 def _radius(view: VehicleView) -> float:
     """Return the radius of the ring around a vehicle: the accuracy of its position [m], 0 if it is unknown."""
     eph: float = view.main.newest.message.eph
-    return round(eph, 1) if 0 < eph < math.inf else 0.0
+    if 0 < eph < math.inf:
+        return round(eph, 1)
+    return 0.0
 
 
 def _widen(low: float, high: float) -> tuple[float, float]:

@@ -66,7 +66,9 @@ class Recording:
     @property
     def length(self) -> float:
         """Duration read so far [s]."""
-        return self.entries[-1].time if self.entries else 0.0
+        if self.entries:
+            return self.entries[-1].time
+        return 0.0
 
     def _read(self) -> None:
         replay = self._replay
@@ -93,7 +95,8 @@ class Recording:
             if payload is not None:
                 content = payload
                 row = codec_of(DEFAULT).decode_row(payload)
-                self.overview.add(Sample(row, address, round(message.at * 1e9)), message.at)
+                sample = Sample(row, address, round(message.at * 1e9))
+                self.overview.add(sample, message.at)
             if message.rejected is None and address not in self.indices:
                 self.timeline.set_clock(address.vehicle, message.timestamp / 1e6, message.at)
         self.indices.setdefault(address, []).append(len(self.entries))
@@ -133,11 +136,15 @@ class Player:
         elapsed = now - self._ticked
         self._ticked = now
         if self._play.active:
-            speed = float(self._speed.value) if self._speed.value in _SPEEDS else 1.0
-            self.time = min(self.time + elapsed * speed, self.recording.length)
+            speed = 1.0
+            if self._speed.value in _SPEEDS:
+                speed = float(self._speed.value)
+            position = self.time + elapsed * speed
+            self.time = min(position, self.recording.length)
         if self._slider.value == self._shown:
             self._shown = round(self.time, 1)
-            self._slider.update(end=max(1.0, self.recording.length), value=self._shown)
+            end = max(1.0, self.recording.length)
+            self._slider.update(end=end, value=self._shown)
         self._feed()
 
     def toggle(self, *, pause: bool = False) -> None:
@@ -150,7 +157,8 @@ class Player:
         self.fleet.clear()
         self.time = min(max(0.0, seconds), self.recording.length)
         recording = self.recording
-        self._next = bisect_left(recording.entries, self.time - _MINUTE, key=_time_of)
+        begin = self.time - _MINUTE
+        self._next = bisect_left(recording.entries, begin, key=_time_of)
         for index in self._last_before(self._next):
             self._add(index)
         for address, stream in self.fleet.streams.items():
@@ -189,7 +197,8 @@ class Player:
             return
         message: Any
         if isinstance(content, bytes):
-            message = codec_of(BY_TOPIC[address.topic]).decode_row(content)
+            codec = codec_of(BY_TOPIC[address.topic])
+            message = codec.decode_row(content)
         else:
             message = SimpleNamespace(timestamp=content)
         sample = Sample(message, address, received)

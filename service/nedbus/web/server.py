@@ -76,7 +76,10 @@ def serve_live(
     Raises ConfigError for an invalid background, ListenError if the address is not available.
     """
     live = LiveFleet(bus, selection, version=version)
-    background = None if options.background is None else Background(options.background)
+    if options.background is None:
+        background = None
+    else:
+        background = Background(options.background)
     server = WebServer(
         options,
         lambda page: Viewer(page, live.fleet, live.timeline, background=background),
@@ -101,7 +104,10 @@ def serve_recording(
     Raises ConfigError or SourceError if a file cannot be read, and the errors of `serve_live`.
     """
     recording = Recording(*paths)
-    background = None if options.background is None else Background(options.background)
+    if options.background is None:
+        background = None
+    else:
+        background = Background(options.background)
 
     def open_page(document: Document) -> None:
         player = Player(recording)
@@ -231,7 +237,9 @@ def _shown_host(host: str) -> str:
     """Return a host as a browser on this machine needs it in a URL."""
     if host in _WILDCARDS:
         return "127.0.0.1"
-    return f"[{host}]" if ":" in host else host
+    if ":" in host:
+        return f"[{host}]"
+    return host
 
 
 class _HttpServer(HTTPServer):

@@ -137,7 +137,10 @@ class TimelinePlot:
         }
 
     def _bar(self, span: Span, row: int, begin: float, end: float) -> dict[str, Any]:
-        until = end if span.until is None else min(end, span.until)
+        if span.until is None:
+            until = end
+        else:
+            until = min(end, span.until)
         return {
             "begin": max(begin, span.since) * 1e3,
             "end": until * 1e3,
@@ -149,7 +152,10 @@ class TimelinePlot:
         """Label the rows with their vehicles; `hidden`: number of vehicles without a row."""
         labels: dict[Any, Any] = {}
         for name, row in rows.items():
-            labels[row] = "link, page" if name == ALL else name[:14]
+            if name == ALL:
+                labels[row] = "link, page"
+            else:
+                labels[row] = name[:14]
         padding = max(_LEAST_ROWS - len(rows), 0) / 2
         low = 0.4 - padding
         if hidden:
@@ -220,7 +226,10 @@ class Plots:
         bars = []
         for span in spans:
             if span.severity != "info" and span.until != span.since:
-                until = end if span.until is None else span.until
+                if span.until is None:
+                    until = end
+                else:
+                    until = span.until
                 bars.append(
                     {
                         "begin": span.since * 1e3,

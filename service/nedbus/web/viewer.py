@@ -75,8 +75,14 @@ class Viewer:
         self._fleet = fleet
         self._timeline = timeline
         self._player = player
-        self._overview = player.recording.overview if player is not None else fleet
-        self._style = LIGHT if query.get("theme") == "light" else DARK
+        if player is not None:
+            self._overview = player.recording.overview
+        else:
+            self._overview = fleet
+        if query.get("theme") == "light":
+            self._style = LIGHT
+        else:
+            self._style = DARK
         self._name = title
         self._document = document
         self._ticks = 0
@@ -137,7 +143,8 @@ class Viewer:
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[: limits.PEER_TEXT]
-        if drawn.isdecimal() and self._sent - int(drawn) >= _WINDOW:
+        is_behind = drawn.isdecimal() and self._sent - int(drawn) >= _WINDOW
+        if is_behind:
             return
         self._sent += 1
         if self._drawn.value:
@@ -152,7 +159,10 @@ class Viewer:
         self._map.update(snapshot, self._overview, chosen)
         if self._ticks % _TEXT_TICKS == 0:
             self._go_to_requested()
-            moment = snapshot.time if self.pinned is None else self.pinned
+            if self.pinned is None:
+                moment = snapshot.time
+            else:
+                moment = self.pinned
             self._update_text(snapshot, chosen, moment)
             self._update_plots(snapshot, chosen, moment)
         self._ticks += 1
@@ -171,7 +181,10 @@ class Viewer:
         if event.vehicle != ALL:
             self._choose(event.vehicle)
         self._go_to(event.time)
-        self._event = event if event.vehicle != ALL else None
+        if event.vehicle != ALL:
+            self._event = event
+        else:
+            self._event = None
 
     def _choose(self, vehicle: str) -> None:
         self.chosen = vehicle
@@ -203,10 +216,16 @@ class Viewer:
         panels = self._panels
         player = self._player
         bad = sum(view.grade == "bad" for view in snapshot.vehicles)
-        self._document.title = f"({bad} bad) {self._name}" if bad else self._name
+        if bad:
+            self._document.title = f"({bad} bad) {self._name}"
+        else:
+            self._document.title = self._name
         self._clock.args = {"start": self._timeline.clock_offset, "clock": self._timeline.unit}
-        clock = self._timeline.format_clock(snapshot.time) if snapshot.time or player else ""
-        wanted = str(self._search.value_input or "").strip().lower()
+        clock = ""
+        if snapshot.time or player:
+            clock = self._timeline.format_clock(snapshot.time)
+        wanted = str(self._search.value_input or "")
+        wanted = wanted.strip().lower()
         rows = []
         for view in snapshot.vehicles:
             if wanted in f"{view.vehicle}\n{view.state.text}".lower():
@@ -244,7 +263,10 @@ class Viewer:
             story = self._timeline.story(chosen.vehicle, now, at, chosen.state.conditions)
             if story is not None:
                 is_now = self._player is None and self.pinned is None
-                moment = None if is_now else story.since
+                if is_now:
+                    moment = None
+                else:
+                    moment = story.since
                 verdict = self._timeline.verdict(chosen.vehicle, end, moment)
             if self.pinned is not None:
                 spans = self._timeline.spans.get(chosen.vehicle, ())
@@ -286,21 +308,31 @@ class Viewer:
             set_time_range(self._plots.range, begin, end)
         else:
             first = max(begin, now - _MINUTE)
-            set_time_range(self._plots.range, first, min(first + _MINUTE, max(end, 1.0)))
+            last = min(first + _MINUTE, max(end, 1.0))
+            set_time_range(self._plots.range, first, last)
         events = self._events_of_chosen()
-        self._plots.mark_events(events, self._timeline.spans.get(vehicle, ()), end)
+        spans = self._timeline.spans.get(vehicle, ())
+        self._plots.mark_events(events, spans, end)
         self._update_timeline(snapshot, begin, end, now)
-        since = 0.0 if self._map.is_long else now - _MINUTE
+        if self._map.is_long:
+            since = 0.0
+        else:
+            since = now - _MINUTE
         recent = [event for event in events if since < event.time <= now + 1.0]
         self._map.mark_events(recent, chosen, self._overview)
 
     def _history(self, address: Address, *, is_long: bool) -> History | None:
         """Return the points of a stream: of all the time, or of the last minute."""
-        fleet = self._overview if is_long else self._fleet
+        if is_long:
+            fleet = self._overview
+        else:
+            fleet = self._fleet
         stream = fleet.streams.get(address)
         if stream is None:
             return None
-        return stream.long if is_long else stream.minute
+        if is_long:
+            return stream.long
+        return stream.minute
 
     def _update_timeline(
         self, snapshot: FleetSnapshot, begin: float, end: float, now: float
@@ -308,7 +340,10 @@ class Viewer:
         timeline = self._timeline
         if self._player is None:  # live, the timeline begins with the first event
             times = [event.time for event in timeline.events if event.time > begin]
-            first = times[0] if times else now
+            if times:
+                first = times[0]
+            else:
+                first = now
             begin = max(begin, min(first, now - _MINUTE) - 1.0)
         names = [view.vehicle for view in snapshot.vehicles if view.vehicle != self.chosen]
         if self.chosen:
@@ -390,7 +425,9 @@ class Viewer:
 
     def _moment(self) -> float | None:
         """Return the shown moment [s]; None for the current time of live vehicles."""
-        return self.pinned if self._player is None else self._player.time
+        if self._player is None:
+            return self.pinned
+        return self._player.time
 
     def _show_next(self) -> None:
         now = self._moment()

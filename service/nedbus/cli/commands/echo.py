@@ -79,7 +79,11 @@ def echo(
         write(form(sample, fields))
         return True
 
-    mode: Mode = "every" if every else "latest"
+    mode: Mode = "latest"
+    if every:
+        mode = "every"
+    if once:
+        count = 1
     with (
         open_bus() as bus,
         bus.subscribe(
@@ -91,7 +95,7 @@ def echo(
         ) as subscription,
     ):
         try:
-            follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
+            follow(bus, subscription, print_one, count=count, duration=duration)
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has read enough
                 counts = subscription.counts

@@ -74,7 +74,10 @@ def _follow(
     sent: "dict[str, PositionStatus]",
 ) -> "Iterator[Sample[Any]]":
     """Yield live samples, and update what is sent."""
-    end = math.inf if duration is None else time.monotonic() + duration
+    if duration is None:
+        end = math.inf
+    else:
+        end = time.monotonic() + duration
     next_status = 0.0
     has_data = False
     with bus.subscribe(*FUSION_TOPICS, vehicle=vehicles or ANY, mode="every") as subscription:

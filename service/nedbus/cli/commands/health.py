@@ -163,7 +163,9 @@ class _Check:
         self._is_refused = is_published and not own
         if age is None:
             latencies = [sample.latency for sample in own if sample.latency is not None]
-            age = max(0.0, min(latencies)) if latencies else None
+            age = None
+            if latencies:
+                age = max(0.0, min(latencies))
         self.ages = {}
         if own and age is not None:
             self.ages[vehicle] = age
@@ -188,9 +190,12 @@ class _Check:
 
     def fields(self, faults: Sequence[str]) -> dict[str, object]:
         """Return the result as fields of a JSON object."""
+        reason = None
+        if faults:
+            reason = faults[0]
         return {
             "healthy": not faults,
-            "reason": faults[0] if faults else None,
+            "reason": reason,
             "services": len(self._services),
             "sources": len(self._source_names),
             "vehicles": self.ages,
@@ -284,7 +289,9 @@ class _Check:
         for name in self._shared_vehicles():
             yield f"vehicle {name} has several publishers: stop one, or give it another vehicle id"
         unreported = AccountReport("", _HOST, 0.0, _reports_of(self._unreported_answers()))
-        host = _HOST if wanted.is_local else None
+        host = None
+        if wanted.is_local:
+            host = _HOST
         faults = faults_of([*self._reports, unreported], wanted.expected, only=host)
         faults += self._faults_of_answers(faults)
         for fault in faults:

@@ -123,7 +123,9 @@ def _source_row(source: SourceStatus) -> list[str]:
         lost = f"~{lost}"  # gaps in a ULog stream make it an estimate
     remark = source.error or source.overload
     if not remark:
-        remark = f"{len(source.stale)} gone" if source.stale else "-"
+        remark = "-"
+        if source.stale:
+            remark = f"{len(source.stale)} gone"
     cells = (
         source.source,
         source.state,
@@ -143,15 +145,19 @@ def _stream_row(service: ServiceStatus, source: SourceStatus, stream: StreamStat
     if vehicle in service.refused:
         text = "refused by the router"
     else:
-        publishers = 1 if stream.address in source.addresses else 0
+        publishers = 0
+        if stream.address in source.addresses:
+            publishers = 1
         text = describe_stream(health, stream_state(health, publishers=publishers))
         if TOPICS.keys().isdisjoint(names):
             text += ", by PX4's definition"
-    return [
-        to_text(stream.address),
-        "-" if health.rate is None else f"{health.rate:.1f}",
-        f"{health.nominal:g}" if health.nominal else "-",
-        "-" if health.age is None else format_duration(health.age),
-        str(health.messages),
-        text,
-    ]
+    rate = "-"
+    if health.rate is not None:
+        rate = f"{health.rate:.1f}"
+    nominal = "-"
+    if health.nominal:
+        nominal = f"{health.nominal:g}"
+    age = "-"
+    if health.age is not None:
+        age = format_duration(health.age)
+    return [to_text(stream.address), rate, nominal, age, str(health.messages), text]

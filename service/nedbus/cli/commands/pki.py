@@ -147,14 +147,18 @@ def renew(
     """
     now = clock.now()
     entries = certificates.list_certificates(folder)
-    if unknown := sorted({*(names or ())} - {entry.name for entry in entries}):
+    unknown = sorted({*(names or ())} - {entry.name for entry in entries})
+    if unknown:
         raise PkiError(
             f"{folder} has no certificate named {unknown[0]!r}: 'nedbus pki list' shows all names"
         )
     due = [
         entry for entry in entries if entry.certificate.is_due(now, within) and not entry.problem
     ]
-    chosen = [entry for entry in entries if entry.name in names] if names else due
+    if names:
+        chosen = [entry for entry in entries if entry.name in names]
+    else:
+        chosen = due
     for entry in chosen:
         _write_paths(certificates.renew_certificate(entry, replace_key=new_key, days=days))
     if chosen:
@@ -204,16 +208,26 @@ def rules(
             if name.startswith(CERTIFICATE_PREFIX)
         )
     elif source is not None:
-        text = sys.stdin.read() if str(source) == "-" else source.read_text(encoding="utf-8")
+        if str(source) == "-":
+            text = sys.stdin.read()
+        else:
+            text = source.read_text(encoding="utf-8")
         given.update(filter(None, (line.partition("#")[0].strip() for line in text.splitlines())))
-    if unknown := sorted(given - set(before)) if remove else []:
-        raise ConfigError(str(file), f"its access rules do not name vehicle {unknown[0]!r}")
-    wanted = {*before, *given} if add else set(before) - given if remove else given
+    wanted = given
+    if add:
+        wanted = {*before, *given}
+    elif remove:
+        unknown = sorted(given - set(before))
+        if unknown:
+            raise ConfigError(str(file), f"its access rules do not name vehicle {unknown[0]!r}")
+        wanted = set(before) - given
     certificates.write_access_rules(file, wanted, prefix=prefix)
     for sign, names in (("+", wanted - {*before}), ("-", {*before} - wanted)):
         for name in sorted(names):
             write(f"{sign} {name}")
-    changed = "no change" if wanted == {*before} else "restart the router to apply them"
+    changed = "restart the router to apply them"
+    if wanted == {*before}:
+        changed = "no change"
     write_stderr(f"{file} names {counted(len(wanted), 'vehicle')}: {changed}")
 
 

@@ -52,7 +52,9 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
     selection = Selection(ANY, vehicle or ANY)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=selection.vehicles)}
-    measured = _measured_by_services(bus) if newest else {}
+    measured: dict[str, Health] = {}
+    if newest:
+        measured = _measured_by_services(bus)
     selected = {address for address in everything if selection.matches(address)}
     streams = []
     for address in sorted(selected | newest.keys()):
@@ -73,7 +75,9 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
         if everything.complete or published:
             absence = explain_absence(bus, published, vehicle or ())
         what = f"no vehicle {' or '.join(vehicle)}" if vehicle else "no vehicle"
-        known = "is published" if everything.complete else "is known yet"
+        known = "is known yet"
+        if everything.complete:
+            known = "is published"
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {absence.reason}")
         is_failure = is_failure or absence.is_fault or bool(vehicle)
     if is_failure:
@@ -98,9 +102,12 @@ class _Stream:
     def fields(self) -> dict[str, object]:
         """Return the fields of a line of JSON."""
         fields = asdict(self.address)
-        fields["age"] = self.health.age if self.health else None
-        fields["state"] = self.state.name if self.state else None
-        fields["reason"] = self.state.reason if self.state else "no answer"
+        fields |= {"age": None, "state": None, "reason": "no answer"}
+        if self.health:
+            fields["age"] = self.health.age
+        if self.state:
+            fields["state"] = self.state.name
+            fields["reason"] = self.state.reason
         fields["stored"] = self.is_stored
         return fields
 
@@ -141,7 +148,10 @@ def get(
     fields = parse_fields(field, selection)
     samples = bus.latest(*selection.topics, vehicle=selection.vehicles, instance=selection.instance)
     for sample in samples:
-        write(to_json(sample, fields) if json_output else to_fields(sample, fields))
+        if json_output:
+            write(to_json(sample, fields))
+        else:
+            write(to_fields(sample, fields))
     if all(sample.stored for sample in samples):
         reason = "no publisher answers: these messages are from a storage"
         if not samples:
@@ -172,18 +182,22 @@ def schema(
         definition: Definition[Any] = definition_of(message)
     except KeyError:
         definition = _ask_publisher(open_bus, message)
-    write(json.dumps(definition.schema()["layouts" if layouts else "json_schema"], indent=2))
+    part = "json_schema"
+    if layouts:
+        part = "layouts"
+    write(json.dumps(definition.schema()[part], indent=2))
 
 
 def _ask_publisher(open_bus: Callable[[], Bus], name: str) -> Definition[Any]:
     """Return the definition of a published message, given by the name of its topic or its own."""
     reason = "and no such message or topic is published"
-    is_message_name = name[:1].isupper()
+    topic = ANY
     try:
-        if not is_message_name:
+        if not name[:1].isupper():
+            topic = name
             get_topic(name)  # raises AddressError for "*"
         with open_bus() as bus:
-            for sample in bus.latest(ANY if is_message_name else name):
+            for sample in bus.latest(topic):
                 message: Message = sample.message
                 if name in (message.DEFINITION.name, sample.topic):
                     return message.DEFINITION

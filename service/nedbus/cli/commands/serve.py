@@ -142,7 +142,9 @@ def router(
     )
     routers = tuple(connect or ())
     closing = threading.Event()
-    tls = settings.tls if routers else None
+    tls = None
+    if routers:
+        tls = settings.tls
 
     def run(stop: threading.Event) -> None:
         run_router(

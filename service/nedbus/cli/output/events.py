@@ -41,7 +41,9 @@ def to_csv(event: Event, times: Times) -> str:
     fields = _to_fields(event, times)
     evidence = [f"{cause.kind} {event.time - cause.time:.1f} s" for cause in event.evidence]
     fields["evidence"] = "; ".join(evidence)
-    fields["numbers"] = json.dumps(dict(event.numbers)) if event.numbers else ""
+    fields["numbers"] = ""
+    if event.numbers:
+        fields["numbers"] = json.dumps(dict(event.numbers))
     return csv_line([fields[name] for name in CSV_HEAD])
 
 
@@ -72,7 +74,9 @@ def _story_lines(verdict: Verdict, story: Story, advice: str) -> Iterator[str]:
     for event in story.meanwhile:
         yield _timed(event, times, _words(event))
     if story.end is not None:
-        with_events = " with" if story.after else ""
+        with_events = ""
+        if story.after:
+            with_events = " with"
         yield f"  ended at {times.text(story.end)}{with_events}"
         for event in story.after:
             yield _timed(event, times, _words(event))
@@ -94,7 +98,9 @@ def _timed(event: Event, times: Times, text: str) -> str:
 def _before(event: Event, time: float) -> str:
     """Format an event with its distance from a time, which it may explain."""
     distance = format_duration(abs(time - event.time))
-    side = "before" if event.time <= time else "after"
+    side = "after"
+    if event.time <= time:
+        side = "before"
     return f"{_words(event)} ({distance} {side})"
 
 
@@ -106,7 +112,9 @@ def verdict_json(verdict: Verdict) -> str:
         return [_to_fields(event, times) for event in events]
 
     def fields(event: Event | None) -> dict[str, object] | None:
-        return None if event is None else _to_fields(event, times)
+        if event is None:
+            return None
+        return _to_fields(event, times)
 
     head = {
         "text": verdict.text,

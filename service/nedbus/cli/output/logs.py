@@ -69,7 +69,10 @@ class JsonFormatter(TextFormatter):
         }
         for key, value in asdict(about).items() if about else ():
             if value is not None:
-                fields[key] = to_text(value, limits.LINE_TEXT) if isinstance(value, str) else value
+                if isinstance(value, str):
+                    fields[key] = to_text(value, limits.LINE_TEXT)
+                else:
+                    fields[key] = value
         if record.exc_info:
             fields["exception"] = self.formatException(record.exc_info)
         return json.dumps(fields)
@@ -130,7 +133,9 @@ class RateLimit(logging.Filter):
         now = self._now()
         self.report(lambda bucket: bucket.refill(now))
         about: About | None = getattr(record, "about", None)
-        event = about.event if about else None
+        event = None
+        if about:
+            event = about.event
         if event is not None and not EVENTS[event].limited:
             return True
         kind = record.name, event, str(record.msg)
@@ -219,5 +224,8 @@ def _log_uncaught(
     text = str(error)
     if not issubclass(kind, NedbusError):
         text = f"unexpected {kind.__name__}: {error}"
-    exc_info = None if error is None else (kind, error, traceback)
+    if error is None:
+        exc_info = None
+    else:
+        exc_info = (kind, error, traceback)
     _log.error("%s", text, exc_info=exc_info, extra=about("error"))

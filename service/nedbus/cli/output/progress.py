@@ -76,5 +76,8 @@ def suggested_commands(endpoints: Sequence[str]) -> str:
     program = "nedbus"
     if Path(sys.argv[0]).name == program and shutil.which(program) is None:
         program = sys.argv[0]
-    where = "" if DEFAULT_ENDPOINT in here else f" -c {here[0]}"
+    if DEFAULT_ENDPOINT in here:
+        where = ""
+    else:
+        where = f" -c {here[0]}"
     return _HINT.format(nedbus=program, where=where)

@@ -72,7 +72,9 @@ class Lines:
         if not fields and sample.message.DEFINITION is not DEFAULT:
             # no columns: as much as fits into a line
             line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
-            return line if len(line) <= width else f"{line[: width - 1]}…"
+            if len(line) <= width:
+                return line
+            return f"{line[: width - 1]}…"
         cells = _to_cells(sample, fields)
         self._widths = {
             name: max(len(name), len(cell), self._widths.get(name, 0))
@@ -161,7 +163,9 @@ def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
         head += ", only stored"
     lines = [head]
     for name in fields or sample.message.DEFINITION.types:
-        note = " (not provided)" if name in sample.missing else ""
+        note = ""
+        if name in sample.missing:
+            note = " (not provided)"
         lines.append(f"  {name}: {_to_value(sample, name)}{note}")
     return "\n".join([*lines, "---"])
 
@@ -180,7 +184,10 @@ def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
         values = json.loads(message)
         for name in derived:
             value = derive(sample.message, name)
-            values[name] = value if math.isfinite(value) else "NaN"
+            if math.isfinite(value):
+                values[name] = value
+            else:
+                values[name] = "NaN"
         message = json.dumps(values, separators=(",", ":"))
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 
@@ -241,7 +248,9 @@ def _is_derived(message: Message, name: str) -> bool:
 
 def _digits_of(message: Message, name: str) -> int | None:
     kind = message.DEFINITION.types.get(name)
-    return None if kind is None else _DIGITS.get(kind.base)
+    if kind is None:
+        return None
+    return _DIGITS.get(kind.base)
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
@@ -259,4 +268,6 @@ def _to_number(value: object, digits: int | None) -> str:
         return " ".join(_to_number(element, digits) for element in value)
     if isinstance(value, str):
         return value.replace("\n", "\\n")
-    return str(value) if digits is None else f"{value:.{digits}g}"
+    if digits is None:
+        return str(value)
+    return f"{value:.{digits}g}"

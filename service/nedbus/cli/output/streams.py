@@ -46,7 +46,10 @@ def printable(text: str) -> str:
 def to_text(value: object, limit: int = limits.CELL_TEXT) -> str:
     """Return text from a peer as one printable line, truncated to `limit` characters before they are escaped."""
     text = str(value)
-    short = text if len(text) <= limit else f"{text[: limit - 3]}..."
+    if len(text) <= limit:
+        short = text
+    else:
+        short = f"{text[: limit - 3]}..."
     return printable(short.replace("\n", "\\n"))[: 4 * limit]
 
 

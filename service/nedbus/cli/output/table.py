@@ -52,7 +52,9 @@ def fit_columns(widths: Mapping[str, int], optional: Sequence[str], width: int) 
 
 
 def _width_of(columns: Sequence[str], widths: Mapping[str, int]) -> int:
-    return sum(widths[name] for name in columns) + len(COLUMN_GAP) * (len(columns) - 1)
+    text = sum(widths[name] for name in columns)
+    gaps = len(COLUMN_GAP) * (len(columns) - 1)
+    return text + gaps
 
 
 def to_table(
@@ -83,7 +85,9 @@ def to_table(
         folded.add(first)
     table = Table(box=None, pad_edge=False, padding=(0, len(COLUMN_GAP), 0, 0), header_style="")
     for name in kept:
-        justify: Literal["left", "right"] = "left" if name in (first, last) else "right"
+        justify: Literal["left", "right"] = "right"
+        if name in (first, last):
+            justify = "left"
         table.add_column(name, justify=justify, no_wrap=name not in folded, overflow="fold")
     for row in shown:
         by_name = dict(zip(head, row, strict=True))

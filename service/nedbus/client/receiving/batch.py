@@ -31,15 +31,15 @@ class ReceivedBatch(Batch):
     def sent(self) -> npt.NDArray[np.int64]:
         """Time of sending of each message, ns since the epoch by the publisher's clock; 0 without a timestamp."""
         stamps = (arrival.raw.timestamp for arrival in self._arrivals)
-        return np.array(
-            [stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps], np.int64
-        )
+        times = [stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps]
+        return np.array(times, np.int64)
 
     @cached_property
     def sequence(self) -> npt.NDArray[np.int64]:
         """Publisher's sequence number of each message; -1 without one."""
         infos = (arrival.raw.source_info for arrival in self._arrivals)
-        return np.array([info.source_sn if info else -1 for info in infos], np.int64)
+        numbers = [info.source_sn if info else -1 for info in infos]
+        return np.array(numbers, np.int64)
 
     @cached_property
     def provenances(self) -> list[Provenance]:
@@ -97,4 +97,5 @@ def _decode(
         if sample is not None:
             messages[index] = arrays.to_element(sample.message)
             valid[index] = True
-    return messages[valid], [arrivals[index] for index in np.flatnonzero(valid).tolist()]
+    kept = np.flatnonzero(valid).tolist()
+    return messages[valid], [arrivals[index] for index in kept]

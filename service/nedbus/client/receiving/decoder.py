@@ -77,7 +77,8 @@ class Decoder:
             except (AddressError, DecodeError) as exc:
                 self.reject(key, exc, stream)
             else:
-                if sample := self.decode(arrival, False):
+                sample = self.decode(arrival, False)
+                if sample:
                     sample.retained = True
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     yield sample
@@ -128,10 +129,16 @@ class Decoder:
                 stream,
             )
             return None
-        decode = codec.decode_row if rows else codec.decode
+        if rows:
+            decode = codec.decode_row
+        else:
+            decode = codec.decode
         try:
             try:
-                message = decode(payload, newer=newer) if newer else decode(payload)
+                if newer:
+                    message = decode(payload, newer=newer)
+                else:
+                    message = decode(payload)
             except UnknownLayoutError as exc:  # a newer layout that has the expected size
                 message = decode(payload, newer=self._find_layout(exc, stream, raw))
         except DecodeError as exc:
@@ -156,9 +163,9 @@ class Decoder:
             if len(self._warned) >= limits.LOGGED_KEYS or hash(key) in self._warned:
                 return
             self._warned.add(hash(key))
-            last = (
-                "; further keys are only counted" if len(self._warned) == limits.LOGGED_KEYS else ""
-            )
+            last = ""
+            if len(self._warned) == limits.LOGGED_KEYS:
+                last = "; further keys are only counted"
             reason = str(error)[: limits.PEER_TEXT]
             if stream is not None:
                 self.reasons[stream.address] = reason
@@ -179,11 +186,9 @@ class Decoder:
             return NO_LAYOUTS  # a definition that was looked up has a single layout
         codec = self._find_codec(stream, raw, unknown=f"layout {error.layout}")
         name = stream.codec.definition.name
-        return (
-            {error.layout: codec.definition.names}
-            if codec and codec.definition.name == name
-            else NO_LAYOUTS
-        )
+        if codec and codec.definition.name == name:
+            return {error.layout: codec.definition.names}
+        return NO_LAYOUTS
 
     def _find_codec(
         self,

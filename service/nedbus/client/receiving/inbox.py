@@ -101,7 +101,10 @@ class Inbox:
         limit = limit or (limits.KEYS if self.newest_only else limits.UNREAD_MESSAGES)
         more_keys = f"more keys than the limit of {limit:,} have an unread message, so the oldest messages are dropped"
         self._max_before_recovery = limit // 2
-        self._limited = more_keys if self.newest_only else _SLOW
+        if self.newest_only:
+            self._limited = more_keys
+        else:
+            self._limited = _SLOW
         self._unread = Unread(self._counters, newest_only=self.newest_only, limit=limit)
         # the oldest may go unanswered
         self._ack_requests: deque[AckRequest] = deque(maxlen=limits.ACK_REQUESTS)
@@ -110,7 +113,8 @@ class Inbox:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far, and evicted keys."""
         with self._lock:
-            of, invalid = self._counters, self.decoder.invalid
+            of = self._counters
+            invalid = self.decoder.invalid
             return Counts(of.received, of.lost, of.dropped, invalid, of.discarded, of.forgotten)
 
     @property
@@ -266,7 +270,9 @@ class Inbox:
     @property
     def end_error(self) -> NedbusError:
         """The error of readers after the end."""
-        return ReceiveError(self.name, self._failure) if self._failure else ClosedError()
+        if self._failure:
+            return ReceiveError(self.name, self._failure)
+        return ClosedError()
 
     def wake(self) -> None:
         """Wake one waiting thread, or the next one to wait, and the event loop."""
@@ -354,11 +360,15 @@ class Inbox:
         return arrival
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
-        arrived, stream = self._unread.arrived, self.streams.get(request.key)
+        arrived = self._unread.arrived
+        stream = self.streams.get(request.key)
         if request.read_target is None and self._reorder.is_settled(
             stream, request.publisher, request.number, drained=drained
         ):
-            request.read_target = arrived if request.read else 0
+            if request.read:
+                request.read_target = arrived
+            else:
+                request.read_target = 0
         return self.ended or (
             request.read_target is not None and arrived - self.waiting >= request.read_target
         )
@@ -369,18 +379,22 @@ class Inbox:
         A payload of the expected size is decoded when it is read. Any other size is checked here: an invalid
         sample must neither displace a valid one nor use much memory.
         """
-        key, payload = str(raw.key_expr), raw.payload.to_bytes()
+        key = str(raw.key_expr)
+        payload = raw.payload.to_bytes()
         if not payload and raw.encoding == WAKE_UP:
             return None
         stream = None
         try:
             stream = self.streams.open(key, self._clock())
-            codec, newer = stream.codec, NO_LAYOUTS
+            codec = stream.codec
+            newer = NO_LAYOUTS
             if len(payload) != stream.size:
                 codec, newer = self.decoder.inspect(stream, payload, raw)
         except (AddressError, DecodeError) as exc:
             self.decoder.reject(key, exc, stream)
-            return None if stream is None else Arrival(stream, b"", raw, None, 0, received)
+            if stream is None:
+                return None
+            return Arrival(stream, b"", raw, None, 0, received)
         return Arrival(stream, payload, raw, codec, 0, received, newer)
 
     def _queue(self, arrivals: list[Arrival]) -> None:
@@ -405,12 +419,10 @@ class Inbox:
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            _log.warning(
-                "%s: %s",
-                self.name,
-                text,
-                extra=about("dropped" if "dropped" in text else "incomplete"),
-            )
+            event = "incomplete"
+            if "dropped" in text:
+                event = "dropped"
+            _log.warning("%s: %s", self.name, text, extra=about(event))
 
 
 def _take_losses(arrivals: Iterable[Arrival]) -> Counter[Stream]:

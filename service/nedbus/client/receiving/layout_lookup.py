@@ -65,7 +65,8 @@ class LayoutLookup:
         *,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._find, self._now = find, now
+        self._find = find
+        self._now = now
         self._known: dict[SchemaId, _Known] = {}
         self._full = False
         self._errors = UnexpectedErrors(
@@ -93,7 +94,8 @@ class LayoutLookup:
             self._request(schema_id, sender)
             if wait:
                 self.wait(schema_id)
-        if (known := self._known.get(schema_id)) is None:
+        known = self._known.get(schema_id)
+        if known is None:
             return None
         known.used = self._now()
         return known.codec
@@ -101,16 +103,16 @@ class LayoutLookup:
     def wait(self, schema_id: SchemaId | None = None) -> None:
         """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
         with self._changed:
-            start, longest = time.monotonic(), TIMINGS.definition_timeout
+            start = time.monotonic()
+            longest = TIMINGS.definition_timeout
             budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
-            is_pending = (
-                self._open.__len__
-                if schema_id is None
-                else partial(self._open.__contains__, schema_id)
-            )
-            self._changed.wait_for(
-                lambda: self._closed or not is_pending(), longest if schema_id is None else budget
-            )
+            if schema_id is None:
+                is_pending = self._open.__len__
+                timeout = longest
+            else:
+                is_pending = partial(self._open.__contains__, schema_id)
+                timeout = budget
+            self._changed.wait_for(lambda: self._closed or not is_pending(), timeout)
             if schema_id is not None and schema_id not in self._known:
                 self._budget_time = time.monotonic()
                 self._wait_budget = max(0.0, budget - (self._budget_time - start))
@@ -178,7 +180,8 @@ class LayoutLookup:
                 self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
 
     def _add(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
-        size, reason = len(fields) + _BASE, f"hash {identity}"
+        size = len(fields) + _BASE
+        reason = f"hash {identity}"
         if not self._evict(size):
             if not self._full:
                 text = "%s is not decoded, because too many definitions from publishers are in use"
@@ -259,12 +262,16 @@ def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: st
 
 def _parse(name: str, reply: object) -> Iterator[tuple[SchemaId, dict[str, str]]]:
     """Yield the definitions of a reply by the hash of their fields; the hash that the peer states is untrusted."""
-    layouts = reply.get("layouts") if isinstance(reply, dict) else None
-    for layout in layouts[: limits.REPLY_LAYOUTS] if isinstance(layouts, list) else ():
+    layouts = None
+    if isinstance(reply, dict):
+        layouts = reply.get("layouts")
+    if not isinstance(layouts, list):
+        return
+    for layout in layouts[: limits.REPLY_LAYOUTS]:
+        if not isinstance(layout, dict):
+            continue
         with suppress(ValueError):
-            parsed = _FIELDS.validate_python(
-                layout.get("fields") if isinstance(layout, dict) else None
-            )
+            parsed = _FIELDS.validate_python(layout.get("fields"))
             fields = {field.name: field.type for field in parsed}
             if len(fields) == len(parsed):
                 types = {field: field_type(kind) for field, kind in fields.items()}

@@ -66,14 +66,17 @@ class Receiver:
     def __init__(
         self, session: Session, inbox: Inbox, downsampled: Downsampled | None = None
     ) -> None:
-        self._session, self._inbox = session, inbox
+        self._session = session
+        self._inbox = inbox
         self._errors = UnexpectedErrors(
             _log, "%s: unexpected error, discarded a batch (logged once)", inbox.name
         )
         self._changing = threading.Lock()
         self._closed = False
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
-        last = zenoh.ext.HistoryConfig(max_samples=1) if downsampled is None else None
+        last = None
+        if downsampled is None:
+            last = zenoh.ext.HistoryConfig(max_samples=1)
         self._rings: list[_Ring] = []
         self._undeclares: list[Callable[[], object]] = []
         if downsampled is not None:
@@ -293,11 +296,14 @@ class Receiver:
 
     def _on_ack_request(self, query: zenoh.Query) -> None:
         self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
-        key, get = str(query.key_expr), query.parameters.get
-        publisher, number = get("publisher"), get("number") or ""
+        key = str(query.key_expr)
+        get = query.parameters.get
+        publisher = get("publisher")
+        number = get("number") or ""
         if not (publisher and number.isdecimal() and len(number) <= _DIGITS):
             return  # dropping the query ends it
-        reply, stream_key = partial(_reply, query, key, self._inbox), key.removesuffix(ack_key(""))
+        reply = partial(_reply, query, key, self._inbox)
+        stream_key = key.removesuffix(ack_key(""))
         request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
         self._inbox.acknowledge(request, drained=all(ring.idle for ring in self._rings))
 
@@ -313,7 +319,8 @@ class Receiver:
 
     def _forget_keys(self, keys: Iterable[str]) -> None:
         for key in keys:
-            if (declared := self._declared.pop(key, None)) is not None:
+            declared = self._declared.pop(key, None)
+            if declared is not None:
                 with suppress(zenoh.ZError):  # the session is closed
                     self._session.undeclare(declared)
 

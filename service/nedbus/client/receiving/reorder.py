@@ -52,14 +52,16 @@ class Reorder:
         """
         known = self._streams.get
         new_arrival = tuple.__new__
-        received, now = clock.utc_ns(), self._clock()
+        received = clock.utc_ns()
+        now = self._clock()
         has_runs = len(batch) >= _LONG_RUN
         delivered: list[Arrival] = []
         run: list[Arrival] = []
         writer: WriterProxy | None = None  # of the run
         expected = 0  # number after the run
         for raw in batch:
-            stream, payload = known(str(raw.key_expr)), raw.payload.to_bytes()
+            stream = known(str(raw.key_expr))
+            payload = raw.payload.to_bytes()
             arrival: Arrival | None
             if stream is None or len(payload) != stream.size:
                 arrival = self._admit(raw, received)
@@ -139,7 +141,9 @@ class Reorder:
     ) -> bool:
         """Return True if a message of a publisher has arrived or counts as lost, or none was sent to this reader."""
         writer = stream and stream.writers.get(publisher)
-        return writer.is_settled(number) if writer else drained and not self._settling
+        if writer:
+            return writer.is_settled(number)
+        return drained and not self._settling
 
     @property
     def _settling(self) -> bool:
@@ -153,7 +157,10 @@ class Reorder:
 
         The first sender is known; of a long run, only the last one is compared as well.
         """
-        compared = run[-1:] if len(run) >= _LONG_RUN else run[1:]
+        if len(run) >= _LONG_RUN:
+            compared = run[-1:]
+        else:
+            compared = run[1:]
         if all(writer.is_sender(arrival.raw.source_info) for arrival in compared):
             writer.expected = (writer.expected + len(run)) % NUMBERS
             return run
@@ -164,7 +171,8 @@ class Reorder:
 
     def _accept_one(self, arrival: Arrival, now: float, overflowed: bool) -> list[Arrival]:
         """Accept any message, and return what is in order now."""
-        stream, raw = arrival.stream, arrival.raw
+        stream = arrival.stream
+        raw = arrival.raw
         stream.last_active = now
         writer = stream.writer
         recovers = self._recovers and not overflowed
@@ -173,7 +181,10 @@ class Reorder:
             name = entity_name(info.source_id)
             writer = stream.writers.get(name)
             if writer is None:
-                first = 0 if recovers and self._settling else info.source_sn
+                if recovers and self._settling:
+                    first = 0
+                else:
+                    first = info.source_sn
                 writer = self._add_writer(stream, name, first, history_end=info.source_sn)
             stream.writer = writer
             if writer is not None:
@@ -182,7 +193,9 @@ class Reorder:
                 writer.zid = info.source_id.zid
                 writer.eid = info.source_id.eid
         if info is None or writer is None:
-            return [arrival] if arrival.payload else []
+            if arrival.payload:
+                return [arrival]
+            return []
         return writer.on_sample(info.source_sn, arrival, recovers=recovers, overflowed=overflowed)
 
     def _add_writer(
@@ -208,12 +221,15 @@ class Reorder:
 def _expecting_writer(arrival: Arrival) -> WriterProxy | None:
     """Return the last publisher of a key if it is expected to send this message next, with no gap open."""
     stream = arrival.stream
-    writer, info = stream.writer, arrival.raw.source_info
+    writer = stream.writer
+    info = arrival.raw.source_info
     if writer is None or info is None or info.source_sn != writer.expected:
         return None
     if writer.request is not None or stream.gap or not arrival.payload:
         return None
-    return writer if writer.is_sender(info) else None
+    if writer.is_sender(info):
+        return writer
+    return None
 
 
 def _is_reply(raw: RawSample | DetachedSample) -> bool:

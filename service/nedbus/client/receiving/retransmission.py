@@ -31,7 +31,8 @@ class Retransmission:
     """Send a queue's retransmission requests and collect the answers; a job of the I/O thread."""
 
     def __init__(self, session: Session, inbox: Inbox) -> None:
-        self._session, self._inbox = session, inbox
+        self._session = session
+        self._inbox = inbox
         text = "%s: unexpected error, recovered messages discarded (logged once)"
         self._errors = UnexpectedErrors(_log, text, inbox.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}
@@ -57,7 +58,10 @@ class Retransmission:
             for writer in list(self._inbox.gaps.requesting):  # copied: other threads add to it
                 if self._may_open(writer):
                     self._request(writer, now)
-        pause = _ANSWER_POLL if self._open else _POLL
+        if self._open:
+            pause = _ANSWER_POLL
+        else:
+            pause = _POLL
         return recovered_key, pause
 
     def _poll_heartbeats(self) -> None:

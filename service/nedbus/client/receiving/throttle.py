@@ -85,4 +85,6 @@ class Throttle:
 def _sent(arrival: Arrival) -> float:
     """Return the time of sending [ns]; infinity without a timestamp."""
     stamp = arrival.raw.timestamp
-    return math.inf if stamp is None else stamp.get_time_as_ntp64().as_nanos()
+    if stamp is None:
+        return math.inf
+    return stamp.get_time_as_ntp64().as_nanos()

@@ -35,13 +35,15 @@ class Unread:
 
     def add(self, arrivals: list[Arrival]) -> int:
         """Add messages; drop superseded ones and, above a limit, the oldest; return how many the limits dropped."""
-        every, newest = self._every, self._newest
+        every = self._every
+        newest = self._newest
         self.arrived += len(arrivals)
         self._bytes += sum(map(len, map(_PAYLOAD, arrivals)))
         if self.newest_only:
             for arrival in arrivals:
                 key = arrival.stream.key
-                if (waiting := newest.get(key)) is not None:
+                waiting = newest.get(key)
+                if waiting is not None:
                     self._counters.dropped += 1
                     self._bytes -= len(waiting.payload)
                     newest[key] = arrival._replace(lost=arrival.lost + waiting.lost)
@@ -74,7 +76,8 @@ class Unread:
 
     def pop_batch(self, max_messages: int | None) -> list[Arrival]:
         """Remove and return the messages of the same type as the oldest; the others stay in order."""
-        every, newest = self._every, self._newest
+        every = self._every
+        newest = self._newest
         count = min(
             len(self), max_messages or (len(newest) if self.newest_only else limits.BATCH_MESSAGES)
         )
@@ -102,7 +105,8 @@ class Unread:
             self._drop_oldest()
 
     def _drop_oldest(self) -> None:
-        if arrival := self.pop():
+        arrival = self.pop()
+        if arrival:
             arrival.stream.unreported += arrival.lost
             self._counters.dropped += 1
 

@@ -126,11 +126,17 @@ class WriterProxy:
             return None
         if request.first_available is not None and request.first_available < self.expected:
             request.first_available = request.probe = request.candidate = None
-        last = request.stop - 1 if request.probe is None else request.probe
+        if request.probe is None:
+            last = request.stop - 1
+        else:
+            last = request.probe
         while request.probe is None and last in self.held:
             last -= 1
         if request.deadline is None:
-            request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
+            if self.unresponsive:
+                request.deadline = now
+            else:
+                request.deadline = now + TIMINGS.retransmit_timeout
         request.attempts += 1
         self.gaps.requesting[self] = self.gaps.requesting.pop(self)
         request.requested = range(max(self.expected, last - limits.REPLIES + 1), last + 1)
@@ -149,7 +155,10 @@ class WriterProxy:
         if answers:
             self.unresponsive = False
             lowest = request.first_available
-            request.first_available = min(answers) if lowest is None else min(lowest, *answers)
+            if lowest is None:
+                request.first_available = min(answers)
+            else:
+                request.first_available = min(lowest, *answers)
             request.last_answered |= (
                 request.requested is not None and request.requested[-1] in answers
             )
