@@ -6,6 +6,7 @@ import asyncio
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -51,6 +52,42 @@ def test_flag_overrides_environment_overrides_file(
     monkeypatch.setenv("NEDBUS_LISTEN", "here")
     with pytest.raises(ConfigError, match=r"^NEDBUS_LISTEN: 'here' is not an endpoint"):
         load_settings()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"connect": "tcp/one:1, tls/two:2"},
+        {"connect": ["tcp/one:1", "tcp/two:2"], "prefix": "fleet/a"},
+        {"connect": "", "prefix": "nedbus"},
+    ],
+)
+def test_usual_client_settings_equal_those_of_the_model(values: dict[str, Any]) -> None:
+    """Settings of a usual client, which are checked without Pydantic, are those that the model returns."""
+    settings = load_settings(**values)
+    model = Settings(**values)
+    assert settings.model_dump() == model.model_dump()
+    assert settings.model_fields_set == model.model_fields_set
+    assert settings.left_out == model.left_out
+    assert [settings.set_by(name) for name in values] == [*values]
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"connect": "one"}, "'one' is not an endpoint"),
+        ({"connect": ["tcp/one:1", 2]}, "Input should be a valid string"),
+        ({"connect": 1}, "Input should be a valid tuple"),
+        ({"prefix": "a//b"}, "chunks of A-Z"),
+        ({"prefix": 1}, "Input should be a valid string"),
+    ],
+)
+def test_invalid_client_settings_name_the_reason(values: dict[str, object], reason: str) -> None:
+    """An invalid endpoint or prefix raises ConfigError with its name and the reason."""
+    with pytest.raises(ConfigError, match=reason) as caught:
+        load_settings(**values)
+    assert caught.value.where in values
 
 
 @pytest.mark.parametrize("is_async", [False, True])

@@ -21,9 +21,10 @@ class Pace:
     def publish_at(self, at: float) -> float:
         """Return when to publish the message at a time on the axis [s], as seconds since the first message."""
         step = at - self._last
-        if step > SKIPPED_PAUSE:
-            self.skipped += 1
-        elif step > 0:
-            self._due += step
-        self._last = max(at, self._last)
+        if step > 0:
+            self._last = at
+            if step > SKIPPED_PAUSE:
+                self.skipped += 1
+            else:
+                self._due += step
         return self._due / self._speed

@@ -67,7 +67,7 @@ class ReferenceDetector(ChangeDetector):
     def __init__(self, topic: str, comparison: Comparison, own: Detection | None) -> None:
         reference = REFERENCES[topic]
         if own is None:
-            own = Detection(reference.fields, (), detect_nothing)
+            own = Detection((), (), detect_nothing)
         super().__init__(*own)
         self._name = reference.instrument
         self._read_reference = read_fields(reference.fields, math.nan)
