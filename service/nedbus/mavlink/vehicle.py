@@ -208,11 +208,11 @@ class Vehicle:
         if name not in CONVERSIONS:
             return self._next_text(now, log)
         topic, convert = CONVERSIONS[name]
-        is_redundant = name == "ATTITUDE" and self._has_quaternion(now)
-        if topic not in self._topics or timestamp is None or is_redundant:
-            return None
         address = self._address_of(topic, message)
-        if _is_streamed(address, log):  # usual with `log=`, so it is not converted first
+        is_redundant = name == "ATTITUDE" and self._has_quaternion(now)
+        if _is_streamed(address, log):  # most messages with `log=`, so they are not converted first
+            is_redundant = True
+        if topic not in self._topics or timestamp is None or is_redundant:
             return None
         return self._publish(address, convert(message), timestamp, now, log)
 
