@@ -192,7 +192,10 @@ class _LoggedField(NamedTuple):
     @property
     def size(self) -> int:
         """Its size [bytes]."""
-        return BASIC_TYPES[self.c_type].size * (self.length or 1)
+        of_element = BASIC_TYPES[self.c_type].size
+        if self.length is None:
+            return of_element
+        return of_element * self.length
 
     @property
     def kind(self) -> FieldType:
