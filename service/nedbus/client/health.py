@@ -348,12 +348,12 @@ class StreamHealth:
         """Return the health at time `now` [ns]."""
         now = time.monotonic_ns() if now is None else now
         with self._lock:
-            self._measure_waiting()
+            if self._waiting:
+                self._measure_waiting()
             if self._last is None:
                 self._last = self._at_last_message()
-            if self._received is None:
-                return _later(self._last, None)
-            return _later(self._last, (now - self._received) / 1e9)
+            age = None if self._received is None else (now - self._received) / 1e9
+            return _later(self._last, age)
 
     def _at_last_message(self) -> Health:
         """Return the health when the last message arrived; its dictionaries belong to others."""
