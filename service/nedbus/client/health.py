@@ -356,12 +356,12 @@ class StreamHealth:
         if now is None:
             now = time.monotonic_ns()
         with self._lock:
-            self._measure_waiting()
+            if self._waiting:
+                self._measure_waiting()
             if self._last is None:
                 self._last = self._at_last_message()
-            if self._received is None:
-                return _later(self._last, None)
-            return _later(self._last, (now - self._received) / 1e9)
+            age = None if self._received is None else (now - self._received) / 1e9
+            return _later(self._last, age)
 
     def _at_last_message(self) -> Health:
         """Return the health when the last message arrived; its dictionaries belong to others."""
