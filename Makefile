@@ -49,7 +49,7 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
 	$(BIN)/pytest -q -n 2 -m "quick or not (slow or long or router or process or compose)" --junitxml=build/tests.xml
 
-test: check behaviour  ## run `make check` and all tests of behaviour: twelve minutes on two idle cores
+test: check behaviour  ## run `make check` and all tests of behaviour: nine minutes on two idle cores
 
 behaviour: $(DEV)
 	$(BIN)/pytest -q -n 6 --dist worksteal -m "not (slow or long or compose)" --junitxml=build/tests.xml
