@@ -328,6 +328,7 @@ class Track(Generic[M]):
         place = self.base + self.newest + gap
         self.begin(change.first, place)
         self.last.clear()
+        self._batched.clear()
 
     def _elapsed(self, item: Item[M]) -> int | None:
         """Return the log time that has passed until a message [us]; None if it is unknown, or damaged."""

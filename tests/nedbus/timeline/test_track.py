@@ -69,6 +69,24 @@ def test_message_that_was_sent_twice_keeps_its_place_in_a_later_batch() -> None:
     )
 
 
+def test_later_batch_ends_with_the_boot() -> None:
+    """After a reboot, a damaged timestamp that equals one of a batch before it has the place of the file."""
+    last = 2000 * STEP
+    messages = [Message(n * STEP, UNIX + n * STEP, logged="a") for n in range(1, 2001)]
+    batch = [Message(n * STEP, UNIX + last, logged="b") for n in (1, 1000, 1500)]
+    messages = [*messages[:20], batch[0], *messages[20:], *batch[1:]]
+    for n in range(50, 300):
+        log = UNIX + last + n * STEP
+        messages += [Message(n * STEP, log, logged="a"), Message(n * STEP, log, logged="b")]
+        if n == 200:
+            messages.append(Message(1500 * STEP, log, logged="b"))
+    order = Order[Message]()
+    found = [*order.arrange(messages)]
+    damaged = [message for message in found if message.timestamp == 1500 * STEP][-1]
+    assert damaged is not found[-1]
+    assert order.duration == pytest.approx((last + 299 * STEP - STEP) / 1e6, abs=0.1)
+
+
 @pytest.mark.parametrize("streams", ["ab", "abc"])
 def test_three_streams_that_go_on_together_show_a_pause(streams: str) -> None:
     """The timestamps of two streams may be damaged together; three streams with the same step show a pause."""

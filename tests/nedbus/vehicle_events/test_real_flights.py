@@ -58,7 +58,7 @@ NAMES: Final = [name for name in TABLE if name != "from"]
 # a script counted messages in reset_counter: hundreds of resets, mostly suppressed
 FREQUENT: Final = "ev_refused"
 STEADY: Final = [name for name in NAMES if name != FREQUENT]
-# s of the vehicle's time by which topics arrive apart, of a replay at full speed
+# s of the vehicle's time by which topics of a fast replay arrive apart
 TOPICS_APART: Final = 10.0
 FAST: Final = 2000.0  # messages per second of a fast replay, which a busy reader receives in order
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
