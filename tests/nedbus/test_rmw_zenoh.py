@@ -17,6 +17,7 @@ from nedbus.rmw_zenoh import (
 )
 from nedbus_msgs import DEFAULT, dds_type, hash_of, ros2_type
 from tests.flights.messages import VLP
+from tests.waits import wait_for_router
 
 
 def test_publisher_of_a_program_is_found_by_its_token(bus: nedbus.Bus) -> None:
@@ -30,6 +31,7 @@ def test_publisher_of_a_program_is_found_by_its_token(bus: nedbus.Bus) -> None:
             session.liveliness().declare_token(each)
             for each in (node_token(0, zid, "my_node"), text)
         ]
+        wait_for_router(session)
         (found,) = token_keys(observer, px4_publishers_key_expr(0), timeout=5.0)
         token = PublisherToken.parse(found)
         assert (token.node, token.key, len(gid_of_token(found))) == ("my_node", key, 16)
