@@ -48,8 +48,13 @@ from nedbus_msgs import (
 __all__ = [
     "AddressError", "AddressInUseError", "ArgumentError", "ClosedError", "ConfigError", "ConnectError", "DecodeError",
     "EncodeError", "ForkError", "InvalidMessageError", "LayoutError", "ListenError", "NedbusError", "NoDataError",
-    "OutputError", "PkiError", "ReceiveError", "RefusedError", "SourceError", "UnknownLayoutError",
+    "OutputError", "PkiError", "ReceiveError", "RefusedError", "SourceError", "UnknownLayoutError", "system_reason",
 ]  # fmt: skip
+
+
+def system_reason(error: OSError) -> str:
+    """Return the reason of an error of the operating system as messages name it, such as "no space left on device"."""
+    return (error.strerror or str(error)).lower()
 
 
 class AddressInUseError(NedbusError, ValueError):
@@ -160,9 +165,7 @@ class OutputError(NedbusError, OSError):
         hint = hints.get(
             error.errno or 0, "check that its folder exists and is writable by this user"
         )
-        super().__init__(
-            f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}"
-        )
+        super().__init__(f"{path} cannot be written ({system_reason(error)}): {hint}")
         self.path = path
 
 

@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from nedbus.endpoints import check_endpoints, dial_endpoint, split_http
-from nedbus.errors import ConfigError
+from nedbus.errors import ConfigError, system_reason
 from nedbus.log_event import about
 from nedbus.transport import Tls, router_endpoints
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_name
@@ -371,7 +371,7 @@ def _read_text(path: Path) -> str:
     except UnicodeDecodeError as exc:
         raise ConfigError.in_file(path, "not UTF-8 text") from exc
     except OSError as exc:
-        reason = (exc.strerror or str(exc)).lower()
+        reason = system_reason(exc)
         raise ConfigError.in_file(path, f"cannot be read ({reason})") from exc
 
 

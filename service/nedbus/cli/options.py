@@ -14,7 +14,14 @@ import typer
 
 from nedbus import limits
 from nedbus.endpoints import DEFAULT_ENDPOINT
-from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
+from nedbus.errors import (
+    ArgumentError,
+    ConfigError,
+    ConnectError,
+    LayoutError,
+    NedbusError,
+    system_reason,
+)
 from nedbus.log_event import about
 from nedbus_msgs import (
     ANY,
@@ -167,7 +174,7 @@ def exit_on_errors() -> Iterator[None]:
         where = ""
         if exc.filename:
             where = f"{exc.filename}: "
-        raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
+        raise _exit_with(NedbusError(f"{where}{system_reason(exc)}"), 1) from exc
     except BaseException as exc:
         # Zenoh raises this class, which cannot be imported
         if type(exc).__name__ != "PanicException":

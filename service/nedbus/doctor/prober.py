@@ -9,7 +9,7 @@ from typing import Final
 
 from nedbus import Tls, clock, connect
 from nedbus.endpoints import split_endpoint
-from nedbus.errors import ConfigError, NedbusError
+from nedbus.errors import ConfigError, NedbusError, system_reason
 from nedbus.pki import UNKNOWN_CA, Certificate, check_pem, read_certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
@@ -87,7 +87,7 @@ def reach_endpoint(endpoint: str) -> Finding | None:
         seen = f"no answer within {_CONNECT_TIMEOUT:g} s"
         advice = "check that the host is on, the address is correct, and no firewall drops the port"
     except OSError as exc:
-        seen = f"cannot connect: {(exc.strerror or str(exc)).lower()}"
+        seen = f"cannot connect: {system_reason(exc)}"
         advice = "check the cable, address and route"
     else:
         return None

@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 
 from nedbus import limits
 from nedbus.endpoints import is_loopback, split_http
-from nedbus.errors import ListenError
+from nedbus.errors import ListenError, system_reason
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
@@ -81,7 +81,7 @@ class HttpServer(ThreadingHTTPServer):
         try:
             super().__init__((host, port), _Handler)
         except OSError as exc:
-            reason = (exc.strerror or str(exc)).lower()
+            reason = system_reason(exc)
             hint = "choose another address with --http"
             raise ListenError([f"http://{where}"], reason, hint=hint) from exc
         self.port: int = self.server_address[1]

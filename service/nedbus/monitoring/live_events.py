@@ -21,6 +21,7 @@ _LOSS_KINDS: Final = frozenset({"lost", "dropout"})
 _LOSS_QUERY: Final = 5.0  # s between queries of the services for losses
 _LOSS_TIMEOUT: Final = 1.0  # s
 _LOSS_WINDOW: Final = 60.0  # s; a loss is reported up to 25 s after it began
+_LOSS_MEMORY: Final = 2 * _LOSS_WINDOW  # s; later, no service reports an event again
 
 
 class LiveEvents(AbstractContextManager["LiveEvents"]):
@@ -118,7 +119,7 @@ class LinkLosses:
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self._shown: set[tuple[object, ...]] = set()
+        self._shown: dict[tuple[object, ...], float] = {}  # monotonic time of each event [s]
         self._next_query = 0.0
         self.poll()  # earlier ones are in the history
 
@@ -128,12 +129,15 @@ class LinkLosses:
         if now < self._next_query:
             return []
         self._next_query = now + _LOSS_QUERY
+        self._shown = {
+            key: shown for key, shown in self._shown.items() if now - shown < _LOSS_MEMORY
+        }
         new = list[Event]()
         for report in self._bus.accounts(within=_LOSS_WINDOW, timeout=_LOSS_TIMEOUT):
             for event in report.events:
                 key = (report.service, event.vehicle, *event.identity)
                 if event.kind in _LOSS_KINDS and key not in self._shown:
-                    self._shown.add(key)
+                    self._shown[key] = now
                     new.append(_on_link(event, report.service))
         return sorted(new, key=lambda event: event.time)
 

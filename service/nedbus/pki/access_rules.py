@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from nedbus.atomic_write import atomic_write
-from nedbus.errors import ConfigError
+from nedbus.errors import ConfigError, system_reason
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix
 
 from .certificate import CERTIFICATE_PREFIX, certificate_name
@@ -91,18 +91,14 @@ def write_access_rules(
             temporary.write_text(_BLOCK.sub(fill, text), encoding="utf-8")
             temporary.chmod(file.stat().st_mode)
     except OSError as exc:
-        raise ConfigError.in_file(
-            file, f"cannot be written: {(exc.strerror or str(exc)).lower()}"
-        ) from exc
+        raise ConfigError.in_file(file, f"cannot be written: {system_reason(exc)}") from exc
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
     try:
         blocks = list(_BLOCK.finditer(file.read_text(encoding="utf-8")))
     except OSError as exc:
-        raise ConfigError.in_file(
-            file, f"cannot be read: {(exc.strerror or str(exc)).lower()}"
-        ) from exc
+        raise ConfigError.in_file(file, f"cannot be read: {system_reason(exc)}") from exc
     except UnicodeDecodeError as exc:
         raise ConfigError.in_file(file, "not UTF-8 text") from exc
     if len(blocks) != 3:

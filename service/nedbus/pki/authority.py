@@ -23,7 +23,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from nedbus import clock
 from nedbus.atomic_write import atomic_write
-from nedbus.errors import PkiError
+from nedbus.errors import PkiError, system_reason
 
 from .certificate import DAYS, NAME_LENGTH, Certificate
 
@@ -240,7 +240,7 @@ def _write_files(
         reason = "move it away, or choose another folder or name"
         raise PkiError(f"{exc.filename} exists and is not overwritten: {reason}") from exc
     except OSError as exc:
-        raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
+        raise PkiError(f"{stem} cannot be written: {system_reason(exc)}") from exc
     return list(written)
 
 
@@ -251,7 +251,7 @@ def _read(path: Path) -> bytes:
         hint = "check that this user may read it"
         if path.name == "ca.crt":
             hint = "run 'nedbus pki ca' first"
-        reason = (exc.strerror or str(exc)).lower()
+        reason = system_reason(exc)
         raise PkiError(f"{path} cannot be read ({reason}): {hint}") from exc
 
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from nedbus.atomic_write import atomic_write
 from nedbus.endpoints import check_endpoints
-from nedbus.errors import ConfigError, PkiError
+from nedbus.errors import ConfigError, PkiError, system_reason
 
 from .authority import Authority, new_key, write_new
 from .certificate import certificate_name
@@ -97,7 +97,7 @@ def make_bundle(
                 )
             temporary.rename(output)
     except OSError as exc:
-        raise PkiError(f"cannot create {output}: {(exc.strerror or str(exc)).lower()}") from exc
+        raise PkiError(f"cannot create {output}: {system_reason(exc)}") from exc
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return sorted(path for path in output.rglob("*") if path.is_file())

@@ -12,7 +12,7 @@ from bokeh.models import ColumnDataSource
 from bokeh.plotting import figure
 
 from nedbus import limits
-from nedbus.errors import ConfigError
+from nedbus.errors import ConfigError, system_reason
 from nedbus_msgs.frames import MapProjection
 
 from .style import Style
@@ -59,7 +59,7 @@ class Background:
             else:
                 self.rings = list(_rings(json.loads(path.read_bytes())))
         except OSError as exc:
-            raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
+            raise ConfigError("--map", f"{path}: {system_reason(exc)}") from exc
         except (ValueError, TypeError, LookupError, RecursionError) as exc:
             if isinstance(exc, KeyError):
                 reason = f"{exc} is missing"

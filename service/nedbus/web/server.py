@@ -27,7 +27,7 @@ from tornado.web import HTTPError, RequestHandler
 
 from nedbus import Bus, Sample, clock, limits
 from nedbus.endpoints import is_loopback
-from nedbus.errors import ListenError
+from nedbus.errors import ListenError, system_reason
 from nedbus.health import Times
 from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, why_refused
@@ -184,7 +184,7 @@ class WebServer:
             sockets, port = bind_sockets(options.host, options.port)
         except OSError as exc:
             url = f"http://{options.host}:{options.port}"
-            reason = (exc.strerror or str(exc)).lower()
+            reason = system_reason(exc)
             raise ListenError([url], reason, hint="choose another address with --http") from exc
         handlers = [(path, _TextHandler, {"render": render}) for path, render in pages.items()]
         tornado = _Tornado(

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from contextlib import closing
 
+import pytest
+
 import nedbus
 from nedbus import Address
 from nedbus.client import QueryServer, reply_parts
-from nedbus.monitoring import LinkLosses
+from nedbus.monitoring import LinkLosses, live_events
 from nedbus.transport import Session
 from nedbus.vehicle_events import Event, EventLog, report_of
 from nedbus_msgs import status_key
@@ -17,9 +19,12 @@ from tests.waits import wait_for
 
 
 def test_losses_on_the_link_of_a_vehicle_are_live_events(
-    bus: nedbus.Bus, zenoh_session: Session
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Live `events` shows losses that a service reports, once each: begin, duration, count and the service."""
+    """Live `events` shows losses that a service reports, once each: begin, duration, count and the service.
+
+    It forgets them once no service would report them again.
+    """
     event_log, address = EventLog(), Address("7", VLP)
     server = QueryServer(zenoh_session)
     server.answer_json(
@@ -49,7 +54,12 @@ def test_losses_on_the_link_of_a_vehicle_are_live_events(
 
         wait_for(poll, what="the losses")
         poll()
+        first = [*shown]
+        monkeypatch.setattr(live_events, "_LOSS_MEMORY", 0.0)
+        poll()
+        # the queryable ignores `within`, so both losses come again
+        assert len(shown) == len(first) + 2
     text = f"800 messages lost in 7.0 s ({VLP}), on the link to the service gcs"
-    assert [(event.vehicle, event.text, event.time) for event in shown] == [
+    assert [(event.vehicle, event.text, event.time) for event in first] == [
         ("7", text, 1.7e9 + 150)
     ]

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Final
 
 from nedbus import limits
-from nedbus.errors import NedbusError
+from nedbus.errors import NedbusError, system_reason
 from nedbus.log_event import about
 
 # name of the log handler if the log is read by a program: JSON, or the journal
@@ -88,7 +88,7 @@ def write(line: str) -> None:
         raise
     except OSError as exc:
         discard_stdout()
-        raise NedbusError(f"cannot write to stdout: {(exc.strerror or str(exc)).lower()}") from exc
+        raise NedbusError(f"cannot write to stdout: {system_reason(exc)}") from exc
 
 
 def write_stderr(text: str) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import BinaryIO, Final, NamedTuple
 
-from nedbus.errors import ArgumentError, ConfigError, SourceError
+from nedbus.errors import ArgumentError, ConfigError, SourceError, system_reason
 from nedbus.extras import import_optional
 from nedbus_msgs import DEFAULT, RELEASES
 
@@ -111,7 +111,7 @@ def open_file(path: Path) -> BinaryIO:
             raise SourceError(str(path), problem)
         return path.open("rb")
     except OSError as exc:
-        raise SourceError(str(path.absolute()), (exc.strerror or str(exc)).lower()) from exc
+        raise SourceError(str(path.absolute()), system_reason(exc)) from exc
 
 
 def recording_files(path: Path) -> tuple[list[Path], list[str]]:

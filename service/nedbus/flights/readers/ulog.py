@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from nedbus import limits, ulog
-from nedbus.errors import AddressError, SourceError
+from nedbus.errors import AddressError, SourceError, system_reason
 from nedbus_msgs import ALL, TOPICS, Address, Definition
 
 from .formats import open_file
@@ -134,7 +134,7 @@ class UlogReader(FlightReader):
         except ulog.UlogError as exc:
             raise SourceError(str(self.path), f"not a readable ULog file ({exc})") from exc
         except OSError as exc:
-            raise SourceError(str(self.path), (exc.strerror or str(exc)).lower()) from exc
+            raise SourceError(str(self.path), system_reason(exc)) from exc
         if not self.definitions:
             raise SourceError(str(self.path), "; ".join([self._absence, *self.warnings[:3]]))
 

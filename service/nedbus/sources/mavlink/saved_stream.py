@@ -11,7 +11,7 @@ from uuid import UUID
 
 from nedbus import limits
 from nedbus.atomic_write import atomic_write
-from nedbus.errors import OutputError
+from nedbus.errors import OutputError, system_reason
 from nedbus.log_event import about
 from nedbus.settings import state_folder
 from nedbus.sources.options import MavlinkOptions
@@ -67,7 +67,7 @@ def read_stream(path: Path | None, system: int) -> SavedStream:
     except FileNotFoundError:
         raise ValueError(f"its definitions are not in {path.parent}") from None
     except OSError as exc:
-        reason = (exc.strerror or str(exc)).lower()
+        reason = system_reason(exc)
         raise ValueError(f"{path} cannot be read ({reason})") from exc
     definitions = content[_START:]
     if len(content) < _START or not content.startswith(_MAGIC):

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.errors import ConfigError, SourceError
+from nedbus.errors import ConfigError, SourceError, system_reason
 from nedbus.log_event import about
 from nedbus.mavlink import AUTOPILOT, CONVERSIONS, Chunk, Received, Vehicle
 from nedbus.samples import LogStreamStatus
@@ -76,7 +76,7 @@ class MavlinkSource:
                 with closing(session):
                     yield from session.run()
             except OSError as exc:
-                reason = (exc.strerror or str(exc)).lower()
+                reason = system_reason(exc)
                 raise SourceError(f"mavlink:{self._link}", f"the link broke ({reason})") from exc
 
 

@@ -15,7 +15,14 @@ import zenoh
 
 from nedbus import limits, transport
 from nedbus.endpoints import check_endpoints
-from nedbus.errors import AddressError, ConfigError, ConnectError, DecodeError, SourceError
+from nedbus.errors import (
+    AddressError,
+    ConfigError,
+    ConnectError,
+    DecodeError,
+    SourceError,
+    system_reason,
+)
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Rejection, SourceMessage, UnavailableTopics
@@ -313,7 +320,7 @@ def _read_definitions(paths: str) -> Definitions:
             try:
                 definition, hashes = _define(file)
             except OSError as exc:
-                reason = (exc.strerror or str(exc)).lower()
+                reason = system_reason(exc)
                 raise ConfigError(str(file), reason, key="msg") from None
             except ValueError as exc:  # such as MsgError
                 if file == path:
