@@ -302,9 +302,6 @@ EVENT_DEFINITIONS: Final = 5000
 LATEST_TIME: Final = 2**62
 """Time in a file [us]; a damaged one may be larger than 64 bits with a sign. A later time counts as this one."""
 
-CLOCK_STEPS: Final = 1000
-"""Steps of a recorder's clock that place a vehicle which appears later. Further steps are ignored."""
-
 VEHICLE_STREAMS: Final = 1000
 """Streams of one vehicle whose times and events are followed, because a peer chooses their number. \
 Further streams have none."""

@@ -7,12 +7,10 @@ a synchronized Unix time is set: these begin a new part of the axis, whose place
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, Generic
 
-from nedbus import limits
 from nedbus_msgs import Address
 
 from .axis import Axis
@@ -54,7 +52,6 @@ class Order(Generic[M]):
         self._zero: int | None = None
         self._place_of_last: int | None = None  # of the messages that were yielded
         self._tracks: dict[str, Track[M]] = {}
-        self._recorder = _RecorderClock()
 
     @property
     def remarks(self) -> list[str]:
@@ -80,6 +77,7 @@ class Order(Generic[M]):
         waiting: list[_Waiting[M]] = []
         opening: list[Item[M]] = []
         tracks = self._tracks
+        current: Track[M] | None = None  # of the last message with a place
         has_log_times = self._has_log_times
         for number, message in enumerate(messages):
             stream = message.logged
@@ -107,9 +105,13 @@ class Order(Generic[M]):
                 if has_log_times:
                     track.lag = log - stamp
                 waiting.append((track.base + stamp, number, message))
+                current = track
             else:
-                item = Item(message, stream, stamp, log if has_log_times else None, number)
+                shift = 0 if current is None else current.shift
+                item = Item(message, stream, stamp, log if has_log_times else None, number, shift)
                 waiting += self._place(item, opening)
+                if track.is_open:
+                    current = track
             if len(waiting) >= _BUFFER + _PART:
                 waiting.sort()
                 yield from self._emit(waiting[:_PART])
@@ -130,12 +132,12 @@ class Order(Generic[M]):
         """Return the messages whose places are known now; those of a new vehicle wait in `opening`."""
         track = self._tracks[item.message.address.vehicle]
         if track.is_open:
-            return self._follow_recorder(track.add(item))
+            return _places_of(track.add(item))
         opening.append(item)
         enough = _OPENING if self._zero is None else _OPENING_LATER
         if len(opening) < enough:
             return []
-        waiting = self._follow_recorder(self._begin(opening))
+        waiting = _places_of(self._begin(opening))
         opening.clear()
         return waiting
 
@@ -144,14 +146,7 @@ class Order(Generic[M]):
         placed = self._begin(opening)
         for track in self._tracks.values():
             placed += track.end()
-        return self._follow_recorder(placed)
-
-    def _follow_recorder(self, placed: Sequence[Placed[M]]) -> list[_Waiting[M]]:
-        waiting = []
-        for place, item in placed:
-            self._recorder.follow(place, item)
-            waiting.append((place, item.number, item.message))
-        return waiting
+        return _places_of(placed)
 
     def _emit(self, placed: Iterable[_Waiting[M]]) -> Iterator[M]:
         """Yield sorted messages with their times on the axis; those from before its zero are at 0."""
@@ -183,8 +178,7 @@ class Order(Generic[M]):
     def _begin_track(self, first: Item[M]) -> None:
         time = first.stamp if first.log is None else first.log
         track = self._tracks[first.message.address.vehicle]
-        track.begin(first, time + self._recorder.offset_at(first.number))
-        self._recorder.begin(first.number)
+        track.begin(first, time + first.shift)
 
     def _find_zero(self) -> int:
         """Return the place of the first message, or where the axis of all messages of the file begins."""
@@ -198,38 +192,5 @@ class Order(Generic[M]):
         return first.base + first.newest
 
 
-class _RecorderClock:
-    """The clock of the recorder, which may be set: place minus log time, from the message with a number on."""
-
-    def __init__(self) -> None:
-        self._numbers: list[int] = []  # of the messages at which it was set
-        self._offsets: list[int] = []
-        self._candidate: int | None = None  # offset of the last message, if it differs
-
-    def begin(self, number: int) -> None:
-        """Let the axis begin on this clock, unless it has begun."""
-        if not self._numbers:
-            self._numbers.append(number)
-            self._offsets.append(0)
-
-    def offset_at(self, number: int) -> int:
-        """Return place minus log time at the message with this number."""
-        if not self._numbers:
-            return 0
-        index = bisect_right(self._numbers, number) - 1
-        return self._offsets[max(0, index)]
-
-    def follow(self, place: int, item: Item[M]) -> None:
-        """Follow the clock to the next message: a change holds if the message after it confirms it."""
-        if item.log is None or not item.stamp or not self._numbers:
-            return
-        offset = place - item.log
-        if abs(offset - self._offsets[-1]) <= NEAR:
-            self._candidate = None
-        elif self._candidate is None or abs(offset - self._candidate) > NEAR:
-            self._candidate = offset
-        else:
-            self._candidate = None
-            if len(self._numbers) < limits.CLOCK_STEPS:
-                self._numbers.append(item.number)
-                self._offsets.append(offset)
+def _places_of(placed: Iterable[Placed[M]]) -> list[_Waiting[M]]:
+    return [(place, item.number, item.message) for place, item in placed]

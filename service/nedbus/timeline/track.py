@@ -45,13 +45,17 @@ M = TypeVar("M", bound=Message)
 
 
 class Item(NamedTuple, Generic[M]):
-    """A message: its stream, its timestamp, 0 without one, its log time, None without one, and its number."""
+    """A message: its stream, its timestamp, 0 without one, its log time, None without one, and its number.
+
+    `shift`: of the recorder's clock before this message; see `Track.shift`.
+    """
 
     message: M
     stream: Any
     stamp: int
     log: int | None
     number: int
+    shift: int = 0
 
     @property
     def lag(self) -> int | None:
@@ -116,6 +120,13 @@ class Track(Generic[M]):
         self.is_unix = bool(is_unix_time(first.stamp))
         self._set_newest(first)
         self._on_part(place, first.stamp)
+
+    @property
+    def shift(self) -> int:
+        """Place minus log time of the newest message [us]: how far the recorder's clock has been set back."""
+        if self.log is None:
+            return 0
+        return self.base + self.newest - self.log
 
     def add(self, item: Item[M]) -> list[Placed[M]]:
         """Return the messages whose places are known now; this one may have to wait for others."""

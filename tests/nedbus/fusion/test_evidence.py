@@ -154,6 +154,17 @@ def test_sent_without_an_echo_is_named() -> None:
     assert report.causes == (Cause.NO_ECHO,)
 
 
+def test_messages_that_decide_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more measurements within a second than the limit, only the newest decide: all are fused."""
+    monkeypatch.setattr("nedbus.limits.FUSION_MESSAGES", 10)
+    vehicle = Vehicle()
+    vehicle.fly(0.7, RIGHT | {"height": 1.0})
+    report = vehicle.fly(0.25)[-1]  # ten messages
+    height = next(quantity for quantity in report.quantities if quantity.name == "height")
+    assert height.state == "fused"
+    assert len(vehicle.tracker._echo_times) == 10
+
+
 def test_missing_evidence_is_named_and_flags_are_used() -> None:
     """Without aid topics, the flags of EKF2 show what is fused, and the report names the topics to log."""
     tracker, time = FusionTracker(), 100_000_000
@@ -262,6 +273,7 @@ _FIELDS: Final = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(

@@ -144,6 +144,29 @@ def test_last_message_after_a_pause_is_a_pause(*, has_log_times: bool) -> None:
         assert order.unordered.total() == unordered
 
 
+@pytest.mark.parametrize(
+    ("step", "every"),
+    [(10_000_000, 2000), (-10_000_000, 2000), (86_400_000_000, 2000), (100 - STEP, 1)],
+    ids=["ahead", "back", "a day", "replay at full speed"],
+)
+def test_vehicle_that_appears_later_is_placed_beside_the_others(step: int, every: int) -> None:
+    """A vehicle that appears after steps of the recorder's clock begins where the others are."""
+    host = 1_760_000_000_000_000
+    stamps = [1_000_000 + number * STEP for number in range(10_000)]
+    messages = [
+        Message(stamp, host + number // every * step + stamp) for number, stamp in enumerate(stamps)
+    ]
+    time = messages[-1].time
+    late = [
+        Message(700_000_000 + after, time + after, Address("2", "vehicle_local_position"))
+        for after in range(0, 5_000_000, STEP)
+    ]
+    order = Order[Message]()
+    list(order.arrange([*messages, *late]))
+    expected = (stamps[-1] - stamps[0]) / 1e6
+    assert order.axis.seconds_of("2", 700_000_000) == pytest.approx(expected)
+
+
 def test_pace_alone_shortens_pauses() -> None:
     """A pause of up to a minute is kept; a longer one takes no time, and is counted."""
     pace = Pace(speed=2.0)

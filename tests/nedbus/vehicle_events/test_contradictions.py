@@ -7,6 +7,7 @@ from typing import Any, Final
 import pytest
 
 from nedbus.vehicle_events import Event
+from nedbus.vehicle_events.contradictions import Comparison, ReferenceDetector
 
 from .flight import ARMED, DISARMED, GOOD_GPS, Flight
 
@@ -263,3 +264,19 @@ def test_order_of_topics_does_not_matter() -> None:
                       if event.kind == "height_contradicted"])  # fmt: skip
     assert found[0] == found[1]
     assert [change for _, change, _ in found[0]] == ["begin", "end"]
+
+
+def test_waiting_messages_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic with more measurements than the limit before the next estimate keeps the earliest of them."""
+    monkeypatch.setattr("nedbus.limits.COMPARED_MESSAGES", 5)
+    comparison = Comparison()
+    detector = ReferenceDetector(TRUTH, comparison, None)
+    for number in range(8):
+        stamp = 1_000_000 + number * 1_000_000
+        list(detector.add({"timestamp": stamp, **ORIGIN, "x": 0.0, "y": 0.0}, frozenset()) or ())
+    assert [measurement.stamp for measurement in comparison._waiting] == [
+        1_000_000 + number * 1_000_000 for number in range(5)
+    ]
+    for number in range(8):
+        comparison.add_estimate(10_000 + number, ORIGIN, frozenset())
+    assert len(comparison._estimates) == 5
