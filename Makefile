@@ -49,12 +49,12 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
 	$(BIN)/pytest -q -n 2 -m "quick or not (slow or long or router or process or compose)" --junitxml=build/tests.xml
 
-test: check behaviour  ## run `make check` and all tests of behaviour: nine minutes on two idle cores
+test: check behaviour  ## run `make check` and the tests of behaviour that take less than a second: 150 s on two idle cores
 
 behaviour: $(DEV)
-	$(BIN)/pytest -q -n 6 --dist worksteal -m "not (slow or long or compose)" --junitxml=build/tests.xml
+	$(BIN)/pytest -q -n 3 --dist worksteal -m "not (slow or long or compose)" --junitxml=build/tests.xml
 
-slow: $(DEV)  ## run the slow tests, and the property tests with three times as many examples
+slow: $(DEV)  ## run the tests that take longer than a second, and the property tests with three times as many examples
 	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not (long or compose)" --hypothesis-profile=all --junitxml=build/slow-tests.xml
 
 long: $(DEV)  ## run the tests of complete flights, of much damage, and of programs that other compilers build

@@ -243,12 +243,14 @@ def runner(start: Start, vehicles: str, snippet_folder: Path) -> Runner:
     return Runner(start, vehicles, snippet_folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [each for each in (*SHELLS, *PYTHON) if each.is_run], ids=str)
 def test_snippet_runs(runner: Runner, block: Block) -> None:
     """Every snippet that is not marked `not run` or `run by` ends without an error."""
     runner.run(block)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [each for each in BLOCKS if each.marker == "output"], ids=str)
 def test_shown_output_is_printed(runner: Runner, block: Block) -> None:
     """The snippet above prints each shown line, possibly with other numbers."""
@@ -370,6 +372,7 @@ def test_readme_is_short() -> None:
     assert {"run", "test"} <= set(re.findall(r"\bmake (\w+)", text))
 
 
+@pytest.mark.slow
 def test_speed_in_readme_matches_last_measurement() -> None:
     """The throughput figures in the README equal those in performance.json."""
     measured = json.loads((DOCS / "explanation" / "performance.json").read_text())
@@ -471,6 +474,7 @@ def bare_names(text: str) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 def test_no_text_installs_nedbus_from_pypi() -> None:
     """The name on PyPI is not ours: every install command uses a path or a URL."""
     for refused in ('"nedbus[web]"', "-U nedbus", "nedbus==1"):

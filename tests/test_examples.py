@@ -52,6 +52,7 @@ def test_all_examples_are_tested() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == {*PRINTS, "publish.py", "resets.py"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRINTS)
 def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) -> None:
     """Each example prints its result, and Ctrl-C ends it without an error message."""
@@ -67,6 +68,7 @@ def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) 
     assert process.err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize("name", sorted(PRINTS.keys() - RARE))
 def test_example_ends_quietly_when_its_pipe_is_closed(
@@ -105,6 +107,7 @@ def test_examples_name_the_endpoint_that_does_not_answer(start: Start, tmp_path:
         assert endpoint in line
 
 
+@pytest.mark.slow
 def test_fastest_example_reads_files(start: Start, tmp_path: Path) -> None:
     """The loop of examples/fastest.py over a bus runs on files unchanged; it needs no router."""
     convert_replay("sim:?duration=20", tmp_path / "flight.mcap")
@@ -113,6 +116,7 @@ def test_fastest_example_reads_files(start: Start, tmp_path: Path) -> None:
     assert process.out.splitlines()[-1].startswith("1: ")
 
 
+@pytest.mark.slow
 def test_publish_example_moves_its_vehicle(
     start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
@@ -152,6 +156,7 @@ def test_alarm_example_survives_a_restart(run_nedbus: Start, start: Start, tmp_p
     assert alarm.wait() == 0
 
 
+@pytest.mark.slow
 def test_alarm_example_names_the_flags(
     start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
 ) -> None:

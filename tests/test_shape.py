@@ -55,6 +55,7 @@ def test_packages_are_imported_through_their_interface() -> None:
                     )
 
 
+@pytest.mark.slow
 def test_public_names_come_from_lower_layers() -> None:
     """A package takes a public name from `nedbus` or `nedbus.health` only if a lower layer defines it.
 

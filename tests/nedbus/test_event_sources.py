@@ -195,6 +195,7 @@ def test_samples_received_from_a_bus_have_events(bus: nedbus.Bus, endpoint: str,
     assert "UTC" in nedbus.why(samples)["7"].text
 
 
+@pytest.mark.slow
 def test_live_events_have_their_reason(bus: nedbus.Bus, zenoh_session: Session) -> None:
     """A bus yields the events of the selected vehicle as they happen, in Unix time, with their evidence."""
     fields: dict[str, object] = VALID | {"dead_reckoning": False}
@@ -225,6 +226,7 @@ def test_live_events_have_their_reason(bus: nedbus.Bus, zenoh_session: Session) 
     assert list(events) == []  # closed
 
 
+@pytest.mark.slow
 def test_verdict_of_a_live_vehicle(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path
 ) -> None:
@@ -248,6 +250,7 @@ def test_verdict_of_a_live_vehicle(
     assert asyncio.run(ask()) == (verdict.text, len(bus.history()))
 
 
+@pytest.mark.slow
 def test_documented_alarm_gives_the_reason(
     start: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
 ) -> None:

@@ -10,6 +10,7 @@ from tests.flights.ulogs import write_log
 from tests.peers.processes import Start
 
 
+@pytest.mark.slow
 def test_unused_packages_are_not_imported(start: Start) -> None:
     """Commands import only the packages they use, for a fast start.
 
@@ -51,6 +52,7 @@ for arguments in ["--help"], []:
     assert process.wait() == 0, process.err
 
 
+@pytest.mark.slow
 def test_connecting_imports_no_analysis(start: Start, endpoint: str) -> None:
     """`nedbus.connect` needs neither the analysis of events, nor arrays, nor asyncio, nor OpenSSL.
 
@@ -69,6 +71,7 @@ assert not unused & set(sys.modules), unused & set(sys.modules)
     assert process.wait() == 0, process.err
 
 
+@pytest.mark.slow
 def test_list_loads_only_the_client(start: Start, endpoint: str) -> None:
     """`nedbus list` of an empty host loads neither arrays, nor events, nor asyncio, nor rich's tables and Markdown."""
     program = f"""
@@ -115,6 +118,7 @@ for arguments in ("convert", path, path + ".mcap"), ("plot", path), ("events", p
     assert process.wait() == 0, process.err
 
 
+@pytest.mark.slow
 def test_public_names_need_no_optional_package(start: Start) -> None:
     """Without the extras, each name of `nedbus` exists, for tab completion and `help`; `convert` names the extra."""
     program = """

@@ -438,6 +438,7 @@ def test_plugins_of_a_router_file_are_not_loaded(
             open_router(config_file=Path(__file__).parents[2] / "config" / name)
 
 
+@pytest.mark.slow
 def test_serve_help_lists_every_source() -> None:
     """`nedbus serve --help` lists every kind of source."""
     help_ = run_command("serve", "--help", COLUMNS="300")

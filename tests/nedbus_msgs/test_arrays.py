@@ -49,6 +49,7 @@ def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
         return None
 
 
+@pytest.mark.slow
 @given(st.sampled_from(SIZES), CASES, st.randoms(use_true_random=False))
 def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
     """An array of valid and invalid messages is decoded exactly like each message alone, at any length."""
@@ -163,6 +164,7 @@ def test_incomplete_payload_raises(excess: int) -> None:
         decode_array(bytes(2 * PAYLOAD_SIZE + excess))
 
 
+@pytest.mark.slow
 @given(st.lists(messages(), max_size=5))
 def test_mask_invalid_sets_nan_where_the_flag_is_false(sent: list[VehicleLocalPosition]) -> None:
     """Fields whose flag is false are NaN; all other values, and the original array, are unchanged."""

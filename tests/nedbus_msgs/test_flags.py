@@ -63,6 +63,7 @@ def test_flag_shares_are_described_in_words(shares: dict[str, float], text: str)
     assert describe_flags(shares) == text
 
 
+@pytest.mark.slow
 @given(messages(), st.booleans())
 def test_doubts_of_one_message_have_no_percentage(
     message: VehicleLocalPosition, as_row: bool

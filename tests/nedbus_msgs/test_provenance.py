@@ -22,6 +22,7 @@ from tests.flights.local_position import (
 )
 
 
+@pytest.mark.slow
 @given(
     st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True),
     st.sets(st.sampled_from(list(FIELD_TYPES))),

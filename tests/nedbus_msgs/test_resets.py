@@ -238,6 +238,7 @@ def test_unexplained_jump_at_a_new_origin_restarts_the_track() -> None:
     assert second.x == 500.0
 
 
+@pytest.mark.slow
 def test_track_follows_simulated_ground_truth() -> None:
     """The track follows the ground truth through a GPS outage and the resets of a simulated lap."""
     truth: dict[object, tuple[float, ...]] = {}
@@ -277,6 +278,7 @@ def test_track_is_closer_than_with_deltas_or_steps_alone(thinned: bool) -> None:
         assert sums[unit, "rule"] < min(sums[unit, "delta"], sums[unit, "step"])
 
 
+@pytest.mark.slow
 @pytest.mark.logs
 @pytest.mark.parametrize(
     ("name", "raw", "smooth"),

@@ -93,6 +93,7 @@ def connected(url: str) -> Iterator[Client]:
         yield Client(socket)
 
 
+@pytest.mark.slow
 def test_channels_follow_vehicles_and_carry_every_field(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:
@@ -131,6 +132,7 @@ def test_channels_follow_vehicles_and_carry_every_field(
         client.until(lambda: topic not in client.topics)
 
 
+@pytest.mark.slow
 def test_message_without_nominal_rate_reaches_the_first_subscriber(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:

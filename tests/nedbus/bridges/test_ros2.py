@@ -135,6 +135,7 @@ def as_json(fields: dict[str, object]) -> str:
     return json.dumps(fields, sort_keys=True)
 
 
+@pytest.mark.slow
 def test_message_of_a_ros2_node_is_received(
     run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus
 ) -> None:
@@ -154,6 +155,7 @@ def test_message_of_a_ros2_node_is_received(
         assert subscription.counts.lost == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["1.14", "1.16"])
 def test_ros2_node_receives_messages_and_lists_topics(
     run_bridge: RunBridge, peer: Peer, zenoh_session: Session, bus: nedbus.Bus, layout: str
@@ -206,6 +208,7 @@ def test_bridge_publishes_like_px4(
     assert len(tokens(zenoh_session, "NN")) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.logs
 @pytest.mark.skipif(not TWELVE_MESSAGES.exists(), reason=f"no PX4 log at {TWELVE_MESSAGES}")
 @pytest.mark.parametrize("release", ["1.13", "1.15", "main"])
@@ -482,6 +485,7 @@ def test_bridge_loop_is_ignored(
         assert (listener.messages, listener.rejections) == ([], [])
 
 
+@pytest.mark.slow
 def test_command_bridges_one_instance_for_humble(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session
 ) -> None:
@@ -542,6 +546,7 @@ def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path)
         Ros2Bridge(bus, session, observer=observer).run(threading.Event())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "text"),
     [

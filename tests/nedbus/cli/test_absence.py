@@ -56,6 +56,7 @@ def test_link_of_a_missing_vehicle_explains_its_absence(
     assert cut.exit_code == unknown.exit_code == 1
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_failed_source_of_a_real_service_is_explained(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus

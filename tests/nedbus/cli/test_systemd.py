@@ -100,6 +100,7 @@ def frequent_status(timings: Timings) -> None:
     timings.systemd_status = 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"]
 )
@@ -123,6 +124,7 @@ def test_ready_is_sent_when_router_listens(run_nedbus: Start, systemd: Systemd) 
     assert process.wait() == 0, process.err
 
 
+@pytest.mark.slow
 def test_stopping_is_sent_when_sources_end(run_nedbus: Start, systemd: Systemd) -> None:
     """A service with --until-done sends STOPPING when its sources have ended."""
     arguments = ("--source", "sim:?duration=0.1", "--until-done", "--listen", free_endpoint())
@@ -170,6 +172,7 @@ def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_path: Path) -> None:
     """SIGHUP sends RELOADING with the time, then READY.
 
@@ -341,6 +344,7 @@ print(notify("@nedbus-test", READY=1))
 """
 
 
+@pytest.mark.slow
 def test_notify_returns_false_without_a_file_descriptor(start: Start) -> None:
     """At the limit of open files `notify` does not raise: its thread continues, and sends again."""
     process = start("-c", NO_DESCRIPTORS, coverage=False)

@@ -101,6 +101,7 @@ def test_latency_does_not_include_the_time_until_reading(
     assert sample.latency == (sample.received - (sample.sent or 0)) / 1e9
 
 
+@pytest.mark.slow
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
     """The router knows a publisher before its first message; otherwise one new reader in 300 would miss the message."""
     with nedbus.connect(endpoint) as other:
@@ -241,6 +242,7 @@ def test_truncated_list_of_vehicles_is_incomplete_and_logged(
     assert caplog.text.count("liveliness tokens") == 1
 
 
+@pytest.mark.slow
 def test_list_of_vehicles_is_incomplete_on_timeout(
     endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -67,6 +67,7 @@ def test_connect_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None
     router.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", [lambda subscription: subscription.receive(DEADLINE), next])
 def test_ctrl_c_at_any_step_of_a_read_releases_all_locks(
     endpoint: str, bus: nedbus.Bus, read: Callable[[nedbus.Subscription[Any]], nedbus.Sample[Any]]
@@ -110,6 +111,7 @@ def test_ctrl_c_at_any_step_of_a_read_releases_all_locks(
     assert len(interrupted) > 25
 
 
+@pytest.mark.slow
 def test_cancelled_connect_leaves_no_thread() -> None:
     """After a cancelled `connect_async` the connecting thread ends without an error."""
     errors: list[object] = []
@@ -358,6 +360,7 @@ def test_calls_on_a_closed_bus_raise(client: nedbus.Bus) -> None:
             call()
 
 
+@pytest.mark.slow
 def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
     """A bus closes once neither the bus nor any of its publishers and subscriptions is referenced."""
     unreferenced = nedbus.connect(endpoint)
@@ -380,6 +383,7 @@ def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
     wait_for(lambda: not bus.vehicles(), what="the vehicle to disappear")
 
 
+@pytest.mark.slow
 def test_garbage_collection_closes_on_the_closer_thread() -> None:
     """Garbage collection leaves closing to the closer thread, because it may run on a thread that holds a lock."""
     lock = threading.Lock()
@@ -399,6 +403,7 @@ def test_garbage_collection_closes_on_the_closer_thread() -> None:
     assert closed != [threading.current_thread()]
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_query_without_a_reply(
     start: Start, endpoint: str, zenoh_session: Session
 ) -> None:
@@ -435,6 +440,7 @@ def test_ctrl_c_during_thread_start_is_raised(
     assert not late[0].is_alive()
 
 
+@pytest.mark.slow
 def test_calls_in_a_forked_process_raise(start: Start, endpoint: str) -> None:
     """Zenoh does not survive a fork: in the child every call raises ForkError, and the child can exit."""
     code = """

@@ -69,6 +69,7 @@ def flood(endpoint: str, bus: nedbus.Bus) -> Iterator[str]:
         yield endpoint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_script_without_close_exits(start: Start, flood: str, script: str, mode: str) -> None:
@@ -85,6 +86,7 @@ def test_script_without_close_exits(start: Start, flood: str, script: str, mode:
     assert "FATAL" not in process.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("vehicle", ["1", "silent"])
 @pytest.mark.parametrize("mode", MODES)
@@ -108,6 +110,7 @@ for sample in subscription:
     assert watch.seconds < LIMIT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timeout", [600, None])
 @pytest.mark.parametrize(
     "how",
@@ -128,6 +131,7 @@ def test_signal_ends_a_script_that_waits_for_a_router(
     assert process.wait() == -signal.SIGINT, process.err
 
 
+@pytest.mark.slow
 def test_signal_missed_by_asyncio_ends_the_wait_for_a_router(start: Start) -> None:
     """A signal that does not wake the event loop, for example one delivered to another thread, also ends the wait."""
     code = """
@@ -143,6 +147,7 @@ asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{server.getsockname()[1]}", tim
     assert process.wait() == -signal.SIGINT, process.err
 
 
+@pytest.mark.slow
 def test_vehicle_of_a_killed_script_disappears(
     start: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:

@@ -293,6 +293,7 @@ def test_latency_covers_the_last_second_and_losses_are_totals() -> None:
     assert (health.latency, health.latency_max, health.lost) == (0.2, 0.9, 3)
 
 
+@pytest.mark.slow
 def test_usual_rate_reveals_a_slow_stream() -> None:
     """After a minute at 100 Hz, 5 Hz is far below the usual rate, which a burst of recovered messages hardly raises."""
     times = [index * 0.01 for index in range(6000)]
@@ -368,6 +369,7 @@ def test_latency_of_an_old_message_is_not_a_state() -> None:
     assert str(stream_state(stream.snapshot(4 * SECOND))) == "ok"
 
 
+@pytest.mark.slow
 def test_description_mentions_a_reboot_for_a_minute() -> None:
     """A reboot is in the description for a minute; the count and the time since it remain in the health."""
     stream = stream_at(*(index / 100 for index in range(300)), boot=100.0)

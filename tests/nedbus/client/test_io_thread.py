@@ -69,6 +69,7 @@ def test_wake_at_a_time_survives_earlier_calls() -> None:
     job.end()
 
 
+@pytest.mark.slow
 def test_wakes_from_several_threads_are_not_lost() -> None:
     """While other threads wake a job for a later time, each `wake()` calls it at once."""
     calls, stop = Calls(math.inf), threading.Event()
@@ -144,6 +145,7 @@ def test_exit_in_a_job_does_not_end_the_thread(error: type[BaseException]) -> No
         job.end()
 
 
+@pytest.mark.slow
 def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
     """A job that raises is logged once and called again, and does not delay other jobs."""
     calls: list[float] = []

@@ -91,6 +91,7 @@ def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
     assert monitor.snapshot()[address].rate == pytest.approx(100.0)
 
 
+@pytest.mark.slow
 def test_number_of_monitored_streams_is_bounded() -> None:
     """In a flood of keys, the monitor keeps the 10,000 most recently updated streams, including an active one."""
     monitor, real = Monitor(), sample("real")
@@ -396,6 +397,7 @@ def test_invalid_message_does_not_replace_a_valid_one(bus: nedbus.Bus, client: n
         assert (view[VLP].message.timestamp, view.counts.invalid) == (1, 1)
 
 
+@pytest.mark.slow
 def test_stream_of_another_process_is_gone_with_it(
     client: nedbus.Bus, endpoint: str, start: Start
 ) -> None:
@@ -426,6 +428,7 @@ def test_failed_session_raises_after_the_last_message(endpoint: str) -> None:
         assert not view[VLP].alive or view[VLP].age <= 1.0
 
 
+@pytest.mark.slow
 def test_link_that_is_lost_ends_aliveness(timings: Timings) -> None:
     """Without a link to the router no stream is alive, whatever its topic."""
     endpoint = free_endpoint()
@@ -441,6 +444,7 @@ def test_link_that_is_lost_ends_aliveness(timings: Timings) -> None:
     bus.close()
 
 
+@pytest.mark.slow
 def test_view_that_is_not_referenced_closes(bus: nedbus.Bus) -> None:
     """A view without references ends its subscription, like a Subscription."""
     view = bus.newest("*")

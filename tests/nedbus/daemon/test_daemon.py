@@ -80,6 +80,7 @@ def real_logs() -> list[Path]:
     return sorted(LOGS.glob("*.ulg")) or pytest.skip(f"no real logs in {LOGS}")
 
 
+@pytest.mark.slow
 @pytest.mark.logs
 def test_plain_zenoh_reader_receives_every_message(run_nedbus: Start, endpoint: str) -> None:
     """A reader in any language, with Zenoh, msgpack and the documented keys, receives each message as an array."""
@@ -149,6 +150,7 @@ def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serv
     assert service.wait() == 0
 
 
+@pytest.mark.slow
 def test_replay_keeps_order_and_speed(tmp_path: Path, serve: Serve) -> None:
     """At speed=10 a flight of 4 s takes 0.36 s or more, and with wait=1 it starts with the first subscriber."""
     path = write_log(tmp_path / "a.ulg", range(0, 4_000_001, 100_000))
@@ -162,6 +164,7 @@ def test_replay_keeps_order_and_speed(tmp_path: Path, serve: Serve) -> None:
     assert service.wait() == 0
 
 
+@pytest.mark.slow
 def test_replayed_messages_to_a_vehicle_have_their_own_source(serve: Serve) -> None:
     """Readers of a replayed bag see `mcap-input` as the source of /fmu/in/..., and `mcap` for all other topics."""
     path = Path(__file__).parents[2] / "data" / "fmu_in_topics.mcap"
@@ -171,6 +174,7 @@ def test_replayed_messages_to_a_vehicle_have_their_own_source(serve: Serve) -> N
         assert positions.receive(DEADLINE).source == "mcap"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("locale", ["C.UTF-8", "C"])
 def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: str) -> None:
     """File names with ?, % or invalid UTF-8 are replayed and appear in the status, even in the C locale."""
@@ -198,6 +202,7 @@ def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: st
         assert status.source.startswith(f"ulog:{tmp_path}/")
 
 
+@pytest.mark.slow
 def test_ended_replay_loops_or_retains_its_last_message(tmp_path: Path, serve: Serve) -> None:
     """With loop=1 a replay starts again; without it, the service keeps replying with the last message of the replay."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 10_000))
@@ -213,6 +218,7 @@ def test_ended_replay_loops_or_retains_its_last_message(tmp_path: Path, serve: S
         ]
 
 
+@pytest.mark.slow
 def test_invalid_message_is_rejected_counted_and_reported(
     tmp_path: Path, run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus
 ) -> None:
@@ -239,6 +245,7 @@ def test_invalid_message_is_rejected_counted_and_reported(
     assert "1/vehicle_local_position rejected: z: must be finite" in service.err
 
 
+@pytest.mark.slow
 def test_failing_source_does_not_affect_others(tmp_path: Path, serve: Serve) -> None:
     """A failed source is retried until it is readable, with its error in the status; other sources stay published."""
     missing = tmp_path / "later.ulg"
@@ -251,6 +258,7 @@ def test_failing_source_does_not_affect_others(tmp_path: Path, serve: Serve) -> 
     assert service.popen.poll() is None
 
 
+@pytest.mark.slow
 def test_until_done_exits_with_1_after_a_failure(tmp_path: Path, run_nedbus: Start) -> None:
     """With --until-done an unreadable source causes exit code 1, after all other finite sources have ended."""
     good = f"ulog:{write_log(tmp_path / 'a.ulg', [0, 1000])}?speed=max"
@@ -261,6 +269,7 @@ def test_until_done_exits_with_1_after_a_failure(tmp_path: Path, run_nedbus: Sta
     assert "2 published" in service.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_signal_stops_the_service(
     tmp_path: Path, serve: Serve, number: signal.Signals, code: int
@@ -282,6 +291,7 @@ def test_signal_stops_the_service(
     assert "lost" not in service.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_own_router", [True, False])
 def test_stopped_service_delivers_what_it_has_published(
     tmp_path: Path, run_nedbus: Start, serve: Serve, endpoint: str, has_own_router: bool
@@ -317,6 +327,7 @@ def test_stopped_service_delivers_what_it_has_published(
         assert subscription.counts.lost == 0
 
 
+@pytest.mark.slow
 def test_signal_stops_a_replay_blocked_by_a_stuck_reader(tmp_path: Path, serve: Serve) -> None:
     """A stuck reader blocks a replay at full speed for up to ten minutes, but not the exit of the service."""
     path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000))
@@ -363,6 +374,7 @@ def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -
     assert service.wait() == 0
 
 
+@pytest.mark.slow
 def test_client_service_logs_the_origin_of_connect(
     run_nedbus: Start, endpoint: str, tmp_path: Path
 ) -> None:
@@ -463,6 +475,7 @@ def test_unreachable_router_on_a_shared_port_is_reported(caplog: pytest.LogCaptu
     router.close()
 
 
+@pytest.mark.slow
 def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -> None:
     """If the port is in use, the error states the endpoint, the reason and two remedies."""
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:")
@@ -515,6 +528,7 @@ def test_invalid_option_is_a_usage_error(arguments: str, text: str) -> None:
     assert len(service.err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_service_reads_its_settings_file(tmp_path: Path, run_nedbus: Start) -> None:
     """Sources, endpoint and prefix come from the file; flags override the environment, which overrides the file."""
     endpoint = free_endpoint()
@@ -529,6 +543,7 @@ def test_service_reads_its_settings_file(tmp_path: Path, run_nedbus: Start) -> N
         wait_for(lambda: list(bus.vehicles()) == ["9"], what="vehicle 9")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["serve -s sim: --router-config", "router"])
 def test_router_accepts_a_zenohd_file(tmp_path: Path, run_nedbus: Start, command: str) -> None:
     """A router reads a configuration file of zenohd, and its flags override the endpoints of the file, as in zenohd."""
@@ -559,6 +574,7 @@ def query_json(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
     return [json.loads(reply.ok.payload.to_bytes()) for reply in zenoh_session.get(key) if reply.ok]
 
 
+@pytest.mark.slow
 def test_plain_zenoh_can_query_status_and_messages(
     run_nedbus: Start, zenoh_session: Session, endpoint: str
 ) -> None:

@@ -48,6 +48,7 @@ def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path: Path) -> None:
     """A subscriber receives the complete stream; `info`, /metrics and the saved log agree on the totals."""
@@ -109,6 +110,7 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
         }
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_refused_log_stream_is_reported(run_nedbus: Start) -> None:
     """If another client has the stream, `info`, `doctor` and the log report it; positions come from MAVLink instead."""

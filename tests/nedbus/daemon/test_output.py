@@ -132,6 +132,7 @@ def test_oldest_stale_address_goes_first(monkeypatch: pytest.MonkeyPatch) -> Non
     assert fake.output.stale == [second]
 
 
+@pytest.mark.slow
 def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     """While 1,000 addresses are published, messages on any other address are rejected, counted, and logged once."""
     fake = FakeOutput()
@@ -149,6 +150,7 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     assert present[0] not in fake.output.stale
 
 
+@pytest.mark.slow
 def test_addresses_of_a_replay_are_limited() -> None:
     """Messages of a replay beyond 10,000 addresses are rejected, counted, and logged once."""
     fake = FakeOutput()

@@ -33,6 +33,7 @@ def reload(service: Process, count: int) -> str:
     return [line for line in service.err.splitlines() if "reloaded" in line][-1]
 
 
+@pytest.mark.slow
 def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path: Path) -> None:
     """Ten vehicles lose no message during ten reloads that add and remove an eleventh."""
     endpoint, file, vehicles = (
@@ -74,6 +75,7 @@ def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path
     assert "retrying" not in service.err
 
 
+@pytest.mark.slow
 def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> None:
     """A file with an invalid source or a changed prefix is rejected, and none of its changes are applied."""
     endpoint, file = free_endpoint(), tmp_path / "nedbus.toml"
@@ -96,6 +98,7 @@ def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> N
         wait_for(lambda: list(bus.vehicles()) == ["2"], what="the other vehicle")
 
 
+@pytest.mark.slow
 def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_path: Path) -> None:
     """A removed source, even a replay at full speed, releases its addresses before a new source claims them.
 
@@ -114,6 +117,7 @@ def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_pat
     assert "this process already publishes" not in service.err
 
 
+@pytest.mark.slow
 def test_reload_keeps_sources_given_by_flags(run_nedbus: Start) -> None:
     """Sources given by flags override the file, so a reload changes nothing and logs this result."""
     service = run_nedbus("serve", "--listen", free_endpoint(), "-s", "sim:", "-s", "sim:?vehicle=2")

@@ -178,6 +178,7 @@ def test_doctor_names_key_certificate_and_rule_of_a_denial(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_doctor_notices_a_router_with_other_rules(pki: Path, secure: tuple[str, Path]) -> None:
     """Rules that were changed since the router started are named, because it reads them only at startup."""

@@ -164,6 +164,7 @@ def test_unexpected_error_in_check_is_a_finding(
     assert f"unexpected error in check endpoint {endpoint}\nTraceback" in caplog.text
 
 
+@pytest.mark.slow
 def test_server_that_is_not_a_router_is_reported(timings: Timings) -> None:
     """An HTTP server and a server that never answers are reported as speaking neither Zenoh nor TLS."""
     timings.doctor_open = timings.handshake = 0.2
@@ -186,6 +187,7 @@ def test_server_that_is_not_a_router_is_reported(timings: Timings) -> None:
             find(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
 
 
+@pytest.mark.slow
 def test_healthy_network_has_no_faults(
     bus: nedbus.Bus, endpoint: str, zenoh_session: Session
 ) -> None:
@@ -246,6 +248,7 @@ def test_publishers_of_one_address_are_named(
     find(findings, "vehicle", "wrong", f"{address}: 2 publishers of this address: {text}")
 
 
+@pytest.mark.slow
 def test_two_publishers_of_one_address_are_reported(bus: nedbus.Bus, endpoint: str) -> None:
     """Two publishers of one address share a token, but the source info of messages or heartbeats tells them apart."""
     with nedbus.connect(endpoint) as other:
@@ -468,6 +471,7 @@ def test_invalid_event_report_is_ignored(
     assert not [each for each in findings if "evil" in each.seen or "check failed" in each.seen]
 
 
+@pytest.mark.slow
 def test_doctor_reports_bad_vehicle_from_event_report(run_nedbus: Start, tmp_path: Path) -> None:
     """The doctor reports a bad vehicle from the event report of a service that replays a log in another process."""
     endpoint = free_endpoint()
@@ -517,6 +521,7 @@ def test_other_prefixes_and_ros2_topics_are_warnings(zenoh_session: Session, end
     token.undeclare()
 
 
+@pytest.mark.slow
 def test_doctor_reports_failing_source_of_real_service(run_nedbus: Start) -> None:
     """A failing source of a service in another process is reported as text and as JSON, with exit code 1."""
     endpoint = free_endpoint()
@@ -536,6 +541,7 @@ def test_doctor_reports_failing_source_of_real_service(run_nedbus: Start) -> Non
     assert set(report["findings"][0]) == {"check", "subject", "state", "seen", "advice"}
 
 
+@pytest.mark.slow
 def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
     bus: nedbus.Bus, endpoint: str, zenoh_session: Session, run_nedbus: Start
 ) -> None:
@@ -644,6 +650,7 @@ def test_invalid_certificate_is_reported_with_reason(
     assert any("the router presents" in each.seen for each in findings)
 
 
+@pytest.mark.slow
 def test_wrong_protocol_and_wrong_tls_files_are_reported(
     run_router: Run, pki: Path, endpoint: str, timings: Timings
 ) -> None:
@@ -665,6 +672,7 @@ def test_wrong_protocol_and_wrong_tls_files_are_reported(
         find(diagnose(secure, tls=files), "certificate", "wrong", reason)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("client", "vehicle", "published", "check", "state", "text"),
     [
@@ -737,6 +745,7 @@ def test_read_and_write_permissions_are_reported(
         assert has_no_faults(findings) == (state != "wrong"), findings
 
 
+@pytest.mark.slow
 def test_certificates_are_verified_but_not_read_without_cryptography(
     run_router: Run, pki: Path, start: Start
 ) -> None:
@@ -839,6 +848,7 @@ def check_round_trip(delay: float) -> list[Finding]:
                     return findings
 
 
+@pytest.mark.slow
 def test_mavlink_traffic_produces_findings() -> None:
     """Packets, messages, positions, ULog stream, ignored senders and a port in use produce findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(
@@ -910,6 +920,7 @@ def test_mavlink_traffic_produces_findings() -> None:
     find(findings, "mavlink", "warning", r"address already in use")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
@@ -960,6 +971,7 @@ def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch
     find(findings, "settings", "wrong", "unknown option 'nonsense'")
 
 
+@pytest.mark.slow
 def test_missing_extra_is_reported(start: Start) -> None:
     """A package missing for a source or for --mavlink is reported with the extra to install."""
     program = """

@@ -36,6 +36,7 @@ def test_conversion_reports_what_it_did(tmp_path: Path) -> None:
     assert all(0 < read <= total for read, total in progress)
 
 
+@pytest.mark.slow
 def test_conversion_of_invalid_arguments_leaves_no_file(tmp_path: Path) -> None:
     """An unknown topic, an invalid vehicle, another suffix or an existing file is refused."""
     log, output = write_log(tmp_path / "flight.ulg", TIMES), tmp_path / "flight.mcap"

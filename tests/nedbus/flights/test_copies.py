@@ -55,6 +55,7 @@ def start_recording(folder: Path, out: BytesIO) -> tuple[Writer, int]:
     return writer, writer.register_channel(channel.topic, "cdr", number, {})
 
 
+@pytest.mark.slow
 def test_copy_without_metadata_has_all_streams(tmp_path: Path) -> None:
     """The names of nedbus's own channels, with an instance at the end, are parsed as such."""
     original, copy = tmp_path / "a.mcap", tmp_path / "b.mcap"
@@ -68,6 +69,7 @@ def test_copy_without_metadata_has_all_streams(tmp_path: Path) -> None:
     assert run_command("events", str(copy)).exit_code == 0
 
 
+@pytest.mark.slow
 def test_skipped_stream_counts_as_damage(tmp_path: Path) -> None:
     """A stream that is skipped whole is reported in one short line, and fails a conversion."""
     original, copy = tmp_path / "a.mcap", tmp_path / "b.mcap"
@@ -177,6 +179,7 @@ def test_equal_messages_of_two_subscriptions_are_one(tmp_path: Path) -> None:
     assert nedbus.read(path)["x"].tolist() == [float(index) for index in range(20)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begin", [1, 1000, 1999])
 def test_second_subscription_in_a_log_repeats_no_message(tmp_path: Path, begin: int) -> None:
     """A second subscription may begin anywhere in a log: all messages are read once, in order."""

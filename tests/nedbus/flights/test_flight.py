@@ -118,6 +118,7 @@ def test_file_is_opened_twice_at_most(tmp_path: Path, monkeypatch: pytest.Monkey
     assert opened == [path, path]
 
 
+@pytest.mark.slow
 def test_samples_end_with_their_flight(tmp_path: Path) -> None:
     """After the `with` block, samples raise ClosedError, and no file stays open."""
     path = write_log(tmp_path / "a.ulg", steps(1_000_000, 20_000))
@@ -130,6 +131,7 @@ def test_samples_end_with_their_flight(tmp_path: Path) -> None:
     assert path not in [link.readlink() for link in links]
 
 
+@pytest.mark.slow
 def test_dropped_flight_closes_its_file(tmp_path: Path) -> None:
     """A script that opens many files without `with` does not run out of file descriptors."""
     path = write_log(tmp_path / "a.ulg", steps(1_000_000, 20_000))
@@ -182,6 +184,7 @@ def test_several_files_are_chronological_whatever_pauses_they_have(tmp_path: Pat
     assert sorted(time for each in arrays.values() for time in each["timestamp"].tolist()) == times
 
 
+@pytest.mark.slow
 def test_events_of_several_files_are_chronological(tmp_path: Path) -> None:
     """A pause in one file does not shift its later events against those of the other one."""
     stamps = [*steps(BOOT, 2000), *steps(BOOT + PAUSE, 200)]
@@ -215,6 +218,7 @@ _SOUND: Final = {
 }
 
 
+@pytest.mark.slow
 @given(_PARTS)
 # the third boot reaches the time of the second
 @example([("reboot", 20, 199), ("reboot", 20, 558)])

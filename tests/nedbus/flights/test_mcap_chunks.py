@@ -116,6 +116,7 @@ FILES: Final[dict[str, tuple[Callable[[], bytes], str]]] = {
 """Contents of a file at or just beyond a limit, and what is reported."""
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize("kind", FILES)
 def test_file_at_a_limit_is_read_in_bounded_memory(start: Start, tmp_path: Path, kind: str) -> None:

@@ -231,6 +231,7 @@ SLOW_FORMS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [None, CompressionType.ZSTD, *SLOW_FORMS])
 def test_all_variants_of_mcap_are_read_completely(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: CompressionType | None

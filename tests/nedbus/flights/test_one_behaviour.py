@@ -147,6 +147,7 @@ def test_period_selects_by_seconds_and_by_utc(tmp_path: Path, suffix: str) -> No
     assert by_seconds == by_utc == [1000.0 + index for index in range(10, 21)]
 
 
+@pytest.mark.slow
 def test_files_of_all_formats_are_merged_by_utc(tmp_path: Path) -> None:
     """A log, a recording and a .tlog become one flight in the order of UTC, with a name for each file's vehicle."""
     paths = [

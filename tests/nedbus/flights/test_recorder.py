@@ -137,6 +137,7 @@ def test_channels_of_a_vehicle_are_limited(
     assert caplog.text.count("not recording some messages of vehicle 7, which has more than 2") == 1
 
 
+@pytest.mark.slow
 def test_replay_of_a_recording_is_bit_exact(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
@@ -221,6 +222,7 @@ def test_kill_loses_about_the_last_second(run_nedbus: Start, endpoint: str, tmp_
     assert costs[-1] < 1_500_000
 
 
+@pytest.mark.slow
 def test_file_is_valid_and_synced_after_every_flush(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +249,7 @@ def test_file_is_valid_and_synced_after_every_flush(
     assert summary.statistics.message_count == 5
 
 
+@pytest.mark.slow
 def test_messages_between_flushes_do_not_fill_the_memory(tmp_path: Path) -> None:
     """A recording that is not flushed buffers at most 16 MiB of data in memory; the rest is on the disk."""
     path, blob = (
@@ -423,6 +426,7 @@ def run_limited(
         return exit_code, output.read()
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_full_disk_raises_and_keeps_flushed_messages(
     fork_server: ForkServer, tmp_path: Path
@@ -438,6 +442,7 @@ def test_full_disk_raises_and_keeps_flushed_messages(
     assert len(read_independently(path)) == flushed
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("size", "arguments", "reason"),
@@ -468,6 +473,7 @@ def test_full_disk_leaves_no_partial_file(
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
 
 
+@pytest.mark.slow
 def test_ctrl_c_finishes_the_recording(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
@@ -490,6 +496,7 @@ def test_ctrl_c_finishes_the_recording(
     assert f"{len(found)} messages" in recorder.err
 
 
+@pytest.mark.slow
 def test_deleting_the_recording_exits_with_an_error(
     run_nedbus: Start, endpoint: str, tmp_path: Path
 ) -> None:
@@ -660,6 +667,7 @@ def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
         nedbus.read(folder)
 
 
+@pytest.mark.slow
 def test_private_and_unknown_records_are_skipped(tmp_path: Path) -> None:
     """Application-specific records and records of later MCAP versions are not reported as damage."""
     path, extended = tmp_path / "a.mcap", tmp_path / "b.mcap"

@@ -101,6 +101,7 @@ def test_files_of_one_name_have_distinct_vehicles(tmp_path: Path) -> None:
     assert seconds == {f"a/{VLP}": 60, f"a_2/{VLP}": 61, f"a_3/{VLP}": 62}
 
 
+@pytest.mark.slow
 def test_plot_of_one_vehicle_among_several_files(swarm: list[str], tmp_path: Path) -> None:
     """A vehicle that several files have is plotted by the name that the warnings and `read` give it."""
     flight, addresses = read_plotted(

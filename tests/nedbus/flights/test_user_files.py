@@ -79,6 +79,7 @@ def test_value_matches_independent_tools(
     assert value(name) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "clock"),
     [

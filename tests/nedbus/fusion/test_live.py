@@ -44,6 +44,7 @@ def until_fused(bus: nedbus.Bus) -> Fusion:
     raise AssertionError("never fused")
 
 
+@pytest.mark.slow
 def test_fusion_of_a_vehicle(endpoint: str) -> None:
     """`bus.fusion` reports the state of each quantity and its evidence; AsyncBus returns the same."""
     with nedbus.connect(endpoint, timeout=20) as bus:

@@ -72,6 +72,7 @@ def test_large_variances_are_fused_but_not_used() -> None:
     assert all(report.used and Cause.VARIANCES in report.remarks for report in after)
 
 
+@pytest.mark.slow
 def test_right_input_is_fused_within_1_s() -> None:
     """One second after the first message, all quantities are fused."""
     for begin in (3.31, 35.2):  # at the start, and after 2.5 s without vision
@@ -80,6 +81,7 @@ def test_right_input_is_fused_within_1_s() -> None:
         assert report.used
 
 
+@pytest.mark.slow
 def test_jump_with_reset_counter_is_no_rejection() -> None:
     """A jump of 2.2 m with a new reset_counter leaves position fused; back without it, it is rejected for 1 s."""
     states = [(time, report.quantities[0]) for time, report in reports("ev_right.ulg")]
@@ -107,6 +109,7 @@ def test_end_of_vision_is_seen() -> None:
     assert last.causes == (Cause.STOPPED,)
 
 
+@pytest.mark.slow
 def test_command_reports_a_log() -> None:
     """`nedbus fusion FILE` prints one report per change, with times since boot."""
     out = run_command("fusion", str(RIGHT)).out

@@ -159,6 +159,7 @@ def test_malformed_host_header_is_refused(servers: list[Server], host: str) -> N
                 assert not is_accepted(server, path, f"Host: {host}"), (server, path)
 
 
+@pytest.mark.slow
 def test_allowed_name_opens_every_path_of_the_page(servers: list[Server]) -> None:
     """Every path of the page accepts the names of --origin as Host and as Origin, with exactly this port."""
     for server in filter(lambda each: each.is_page, servers):

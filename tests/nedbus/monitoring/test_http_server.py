@@ -130,6 +130,7 @@ def threads_since(before: set[threading.Thread]) -> int:
     return len({*threading.enumerate()} - before)
 
 
+@pytest.mark.slow
 @STALLED
 def test_stalled_clients_delay_no_others(timings: Timings, sent: bytes, each_second: bytes) -> None:
     """While more clients than threads stall in sending or reading, others are served before any of those times out."""
@@ -160,6 +161,7 @@ def test_slow_clients_time_out(
             assert ended.acquire(timeout=DEADLINE)
 
 
+@pytest.mark.slow
 def test_close_does_not_wait_for_clients(timings: Timings) -> None:
     """The server closes at once while pages for 16 clients are made, and another client is queued."""
     timings.http_client = 10_000.0  # far beyond the deadline of this test
@@ -183,6 +185,7 @@ def test_close_does_not_wait_for_clients(timings: Timings) -> None:
         go.set()
 
 
+@pytest.mark.slow
 def test_close_disconnects_stalled_clients(timings: Timings) -> None:
     """When the server closes, clients that do not read their responses are disconnected, and their threads end."""
     timings.http_client = 10_000.0  # far beyond the deadline of this test

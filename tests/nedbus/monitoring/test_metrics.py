@@ -87,6 +87,7 @@ def exporting(bus: nedbus.Bus) -> Iterator[HttpClient]:
         reading.result(DEADLINE)
 
 
+@pytest.mark.slow
 def test_service_serves_metrics_health_and_status(serve: Serve, pages: HttpClient) -> None:
     """/metrics has series by vehicle, topic and source; /status returns JSON; /readyz and /healthz return one line."""
     serve("sim:?vehicle=7")
@@ -147,6 +148,7 @@ def test_exporter_measures_loss_latency_and_invalid_payloads(
     assert "Traceback" not in caplog.text
 
 
+@pytest.mark.slow
 def test_healthy_vehicle_is_ok_on_vehicles_page(
     serve: Serve, pages: HttpClient, tmp_path: Path
 ) -> None:
@@ -163,6 +165,7 @@ def test_healthy_vehicle_is_ok_on_vehicles_page(
     assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
 
 
+@pytest.mark.slow
 def test_bad_vehicle_returns_503_only_on_vehicles_page(
     serve: Serve, pages: HttpClient, tmp_path: Path
 ) -> None:
@@ -267,6 +270,7 @@ def test_flapping_flag_stays_a_condition(every: int) -> None:
     assert event_log.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
+@pytest.mark.slow
 def test_metrics_pass_promtool_check(
     serve: Serve, pages: HttpClient, start: Start, tmp_path: Path
 ) -> None:
@@ -278,6 +282,7 @@ def test_metrics_pass_promtool_check(
     assert (promtool.wait(), promtool.out, promtool.err) == (0, "", "")
 
 
+@pytest.mark.slow
 def test_rejections_are_counted_by_rule(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """Rejections are counted by violated rule, and the counts add up to the total of the source."""
     log = tmp_path / "flight.ulg"
@@ -309,6 +314,7 @@ def test_rejections_are_counted_by_rule(serve: Serve, pages: HttpClient, tmp_pat
     assert pages.values("nedbus_messages_published_total") == [1]
 
 
+@pytest.mark.slow
 def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: HttpClient) -> None:
     """A source configured twice does not duplicate series, which Prometheus would reject."""
     serve("sim:", "sim:")
@@ -319,6 +325,7 @@ def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: HttpCli
     assert len(pages.values("nedbus_source_state", source="sim: (2)")) == 6
 
 
+@pytest.mark.slow
 def test_failed_or_silent_source_is_not_ready(
     serve: Serve, pages: HttpClient, tmp_path: Path
 ) -> None:
@@ -338,6 +345,7 @@ def test_failed_or_silent_source_is_not_ready(
     assert pages.values("nedbus_source_state", state="waiting") == [0, 1, 1]
 
 
+@pytest.mark.slow
 def test_service_and_exporter_without_router_are_not_ready(
     serve: Serve, run_nedbus: Start, pages: HttpClient
 ) -> None:
@@ -364,6 +372,7 @@ def test_service_and_exporter_without_router_are_not_ready(
     )
 
 
+@pytest.mark.slow
 def test_missing_prometheus_client_returns_501_with_install_hint(
     start: Start, pages: HttpClient, endpoint: str
 ) -> None:

@@ -120,6 +120,7 @@ def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others
         publisher.close()
 
 
+@pytest.mark.slow
 def test_bundle_publishes_only_its_vehicle(
     run_router: RunRouter, run_nedbus: Start, tmp_path: Path, *, file: Path, pki: Path, join: Join
 ) -> None:
@@ -251,6 +252,7 @@ def test_bundle_is_created_completely_or_not_at_all(pki: Path, tmp_path: Path) -
     assert "vehicle-7.crt exists and is not overwritten" in again.err
 
 
+@pytest.mark.slow
 def test_old_and_renewed_certificate_are_both_valid(run_router: RunRouter, file: Path, pki: Path, join: Join) -> None:
     """A renewal keeps name and key. Open links with the old certificate persist, and both certificates can connect."""
     write_access_rules(file, SAMPLE)
@@ -453,6 +455,7 @@ def test_rules_command_sets_adds_and_removes_vehicles(file: Path, pki: Path, tmp
             write_access_rules(path, ["1"])
 
 
+@pytest.mark.slow
 def test_rules_of_200_vehicles_are_enforced(run_router: RunRouter, file: Path, join: Join) -> None:
     """Each of 200 vehicles may publish only its own keys, and a removed vehicle may publish nothing."""
     write_access_rules(file, FLEET)
@@ -489,6 +492,7 @@ def test_running_zenohd_rejects_new_rules(start: Start, file: Path, pki: Path, j
     assert_writes_only(join("vehicle-1"), join("reader"), "1", ["99"])
 
 
+@pytest.mark.slow
 def test_rolling_restart_of_two_routers_loses_no_message(run_router: RunRouter, file: Path, join: Join) -> None:
     """Clients of two routers fail over while each router restarts with new rules; mode `every` loses no message."""
     first, second = endpoint_of(file), secure_endpoint()

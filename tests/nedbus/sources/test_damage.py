@@ -121,6 +121,7 @@ def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], McapReader]
     ), reader
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120 + 3 * TRIES)
 @each_tier
 def test_damaged_recording_yields_only_original_messages(tmp_path: Path, tries: int) -> None:
@@ -239,6 +240,7 @@ def is_truncation(damaged: bytes, data: bytes) -> bool:
     return len(damaged) < len(data) and data.startswith(damaged)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120 + 3 * TRIES)
 @each_tier
 def test_damaged_log_loses_only_damaged_messages(tmp_path: Path, tries: int) -> None:
@@ -388,6 +390,7 @@ def test_number_of_damage_warnings_is_limited(tmp_path: Path) -> None:
 CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged; its messages are skipped"
 
 
+@pytest.mark.slow
 def test_commands_read_undamaged_part_and_exit_1(tmp_path: Path) -> None:
     """With one flipped bit, convert, plot and serve --until-done use the readable part, and report the loss."""
     path = write_recording(tmp_path / "a.mcap", finish=True)
@@ -413,6 +416,7 @@ def test_commands_read_undamaged_part_and_exit_1(tmp_path: Path) -> None:
         assert sum(reader.counts.values()) == total - lost
 
 
+@pytest.mark.slow
 def test_damaged_chunk_of_converted_flight_is_small(tmp_path: Path) -> None:
     """`convert` writes small chunks, so one damaged chunk loses less than a fifth of a flight of 30 s."""
     path = tmp_path / "a.mcap"

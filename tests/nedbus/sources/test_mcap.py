@@ -28,6 +28,7 @@ def write_recording(path: Path, stamps: list[float], logged: list[float]) -> Pat
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "after"),
     [(-0.5, 500), (-3.0, 300), (-5.0, 700), (20.0, 500), (3600.0, 10), (1e10, 999), (-1e9, 1)],
@@ -74,6 +75,7 @@ def test_reboot_begins_a_new_part(tmp_path: Path) -> None:
         assert flight.duration == pytest.approx(39.9)
 
 
+@pytest.mark.slow
 def test_replay_is_ordered_across_batches_of_streams(tmp_path: Path) -> None:
     """Up to 8,192 messages that a recorder wrote stream by stream are replayed in the order of their log times."""
     # of two streams, alternately

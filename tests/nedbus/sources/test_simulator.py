@@ -97,6 +97,7 @@ def test_same_seed_yields_identical_flight() -> None:
     assert one != other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "topic", ["vehicle_local_position", "estimator_local_position", "vehicle_attitude", "*"]
 )
@@ -111,6 +112,7 @@ def test_selection_without_simulated_topic_raises() -> None:
         simulate("?duration=1&topics=timesync_status")
 
 
+@pytest.mark.slow
 def test_rates_are_nominal(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """Each stream has the nominal rate of its topic, without jitter."""
     assert set(streams) == {
@@ -139,6 +141,7 @@ def test_messages_are_in_time_order_and_counted(options: str) -> None:
     assert {each.address for each in messages} == set(run.addresses)
 
 
+@pytest.mark.slow
 def test_gps_outage_causes_dead_reckoning(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """Without GPS dead_reckoning is set, error and sigma grow, and xy becomes invalid after 10 s."""
     outage = [message for message in streams[VLP] if message.dead_reckoning]
@@ -152,6 +155,7 @@ def test_gps_outage_causes_dead_reckoning(streams: dict[str, list[VehicleLocalPo
     assert not any(message.dead_reckoning for message in streams["external_ins_local_position"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quantity", "fields", "motion", "count"),
     [
@@ -191,6 +195,7 @@ def test_reset_delta_equals_the_jump(
     assert resets == count
 
 
+@pytest.mark.slow
 def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """With GPS estimates stay within a few sigma of the groundtruth, whose velocity matches its positions."""
     truth = {
@@ -247,6 +252,7 @@ def test_vehicles_with_different_seeds_fly_apart() -> None:
     assert abs(ends[0].x - ends[1].x) + abs(ends[0].y - ends[1].y) > 5
 
 
+@pytest.mark.slow
 def test_attitude_is_consistent_with_estimate(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
@@ -274,6 +280,7 @@ def test_attitude_is_consistent_with_estimate(
             assert thrust * math.sin(roll) == pytest.approx(across, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_global_position_matches_local_position(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
@@ -295,6 +302,7 @@ def test_global_position_matches_local_position(
         assert message.lat_lon_valid == estimate.xy_valid
 
 
+@pytest.mark.slow
 def test_status_and_gps_are_consistent_with_outage(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
@@ -326,6 +334,7 @@ def test_status_and_gps_are_consistent_with_outage(
             )
 
 
+@pytest.mark.slow
 def test_battery_home_and_land_detection_are_consistent(others: dict[str, list[Any]]) -> None:
     """The battery discharges, home_position is sent at the start and with the origin; the vehicle takes off once."""
     batteries = others["battery_status/0"]

@@ -121,6 +121,7 @@ def test_vehicle_comes_from_option_log_or_default(tmp_path: Path) -> None:
         assert address.vehicle == expected
 
 
+@pytest.mark.slow
 def test_no_message_is_lost_between_chunks(tmp_path: Path) -> None:
     run = open_log(write_log(tmp_path / "a.ulg", range(0, 2_500_000, 1000)))
     assert [read.x for _, read in read_all(run)] == list(range(2500))
@@ -345,6 +346,7 @@ def test_field_of_another_type_is_converted(tmp_path: Path) -> None:
         assert "cell_count" not in nedbus.missing_of(battery)
 
 
+@pytest.mark.slow
 def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
     """A field whose value does not fit is left out of its message, and logged once; the rest is read."""
     path = write_old_log(tmp_path / "a.ulg", [6, -1, 256, 7], temperature=0.1)

@@ -416,6 +416,7 @@ def test_single_wild_timestamp_does_not_extend_a_table(wild: int, index: int) ->
     assert 40 <= len(nedbus.align({VLP: positions}, on=10.0)) <= 41
 
 
+@pytest.mark.slow
 def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     """Values before the first message are null, arrays have a column per element, and `utc` has a time zone."""
     pytest.importorskip("pandas")
@@ -444,6 +445,7 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
 
 
+@pytest.mark.slow
 def test_fields_that_a_message_lacks_are_null_in_a_table(tmp_path: Path) -> None:
     """In a table of streams, a field is null in the rows whose message lacks it, as in the data frame of a stream."""
     pytest.importorskip("polars")

@@ -141,6 +141,7 @@ def different_filters(path: Path, folder: Path, columns: dict[str, tuple[float, 
     return differences
 
 
+@pytest.mark.slow
 def test_duckdb_selects_the_rows_of_numpy(special: Path, tmp_path: Path) -> None:
     """Each filter of the page finds the rows that NumPy finds, with a limit that float32 rounds and an infinite one."""
     assert different_filters(special, tmp_path, {"vxy_max": (0.1, math.inf)}) == []
@@ -174,6 +175,7 @@ def test_page_has_the_filters_that_are_tested() -> None:
     assert listed == [*COMPARISONS, *TESTS]
 
 
+@pytest.mark.slow
 def test_duckdb_snippet_of_the_page_runs(special: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The snippets of the page run, and the file that they write has the messages of the flight."""
     duckdb: Any = pytest.importorskip("duckdb")

@@ -98,6 +98,7 @@ def bars_of(axes: Any) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "others", [[], [flight_of(vehicle="8")]], ids=["one vehicle", "two vehicles"]
 )
@@ -127,6 +128,7 @@ def test_invalid_estimate_is_drawn_thin_without_affecting_axis_limits(
         assert np.array_equal(np.isfinite(np.asarray(thick.get_ydata())), array["xy_valid"]), name
 
 
+@pytest.mark.slow
 def test_never_valid_estimate_sets_axis_limits() -> None:
     """If no message is valid, the invalid messages determine the axis limits."""
     address, array = flight_of()
@@ -138,6 +140,7 @@ def test_never_valid_estimate_sets_axis_limits() -> None:
     assert parts["speed"].get_ylim()[0] < 1.0 < parts["speed"].get_ylim()[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("events", [[], [event_of("few_satellites", "begin", "watch", 5.0)]])
 def test_flight_without_flags_is_drawn(events: list[Event]) -> None:
     """LOCAL_POSITION_NED without ESTIMATOR_STATUS has no flags: the plot has no rows for them."""
@@ -152,6 +155,7 @@ def test_flight_without_flags_is_drawn(events: list[Event]) -> None:
     assert axes.keys() == {"track", "altitude", "speed"} | ({"events"} if events else set())
 
 
+@pytest.mark.slow
 def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
     """The altitude plot has lines for resets of z and vz; the rows below show all resets."""
     address, array = flight_of()
@@ -217,6 +221,7 @@ def test_events_are_marked_by_severity() -> None:
     assert not marks_of(others["track"], "x")
 
 
+@pytest.mark.slow
 def test_event_far_from_all_positions_is_not_on_the_track() -> None:
     """An event in a pause of the positions has no place on the track, only on the time axes."""
     address, array = flight_of()
@@ -228,6 +233,7 @@ def test_event_far_from_all_positions_is_not_on_the_track() -> None:
     assert (east, north) == pytest.approx((0.0, 4.9))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("offsets", "ticks", "label"),
     [
@@ -256,6 +262,7 @@ def test_time_axis_names_its_clock(offsets: dict[str, float], ticks: list[str], 
     assert times.find(shown[nearest], event) - event.time == pytest.approx(nearest - place)
 
 
+@pytest.mark.slow
 def test_time_axis_of_vehicles_with_different_boots_is_since_boot() -> None:
     """Vehicles whose UTC offsets differ are plotted over seconds since boot."""
     parts = drawn(
@@ -264,6 +271,7 @@ def test_time_axis_of_vehicles_with_different_boots_is_since_boot() -> None:
     assert parts["speed"].get_xlabel() == "time [s since boot]"
 
 
+@pytest.mark.slow
 def test_bar_ends_with_the_last_of_several_flags() -> None:
     """Two flags that begin together have one mark, and one bar until the last of them ends."""
     events = [
@@ -274,6 +282,7 @@ def test_bar_ends_with_the_last_of_several_flags() -> None:
     assert bars_of(drawn([flight_of()], events)["events"]) == {"failsafe flag": [(2.0, 6.0)]}
 
 
+@pytest.mark.slow
 def test_events_of_each_vehicle_have_their_own_rows() -> None:
     """With two vehicles each row names its vehicle, and shows times on that vehicle's clock."""
     events = [
@@ -285,6 +294,7 @@ def test_events_of_each_vehicle_have_their_own_rows() -> None:
     assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 3.0), (0.0, 5.0)])
 
 
+@pytest.mark.slow
 def test_fields_are_drawn_by_name() -> None:
     """Fields and derived quantities have one panel each, on one time axis with the events; invalid values are gaps."""
     plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)

@@ -51,6 +51,7 @@ def flight(recorded: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(recorded, tmp_path))
 
 
+@pytest.mark.slow
 def test_recording_is_read_as_an_array(flight: Path) -> None:
     """The array has every message in order, with PX4's field types."""
     array = nedbus.read(flight)
@@ -69,6 +70,7 @@ def test_recording_is_read_as_an_array(flight: Path) -> None:
     assert nedbus.read(flight, vehicle=1).tobytes() == array.tobytes()
 
 
+@pytest.mark.slow
 def test_data_frames_have_all_columns(flight: Path) -> None:
     """Data frames of pandas and polars have all columns, with the values and types of the array."""
     pd, pl = pytest.importorskip("pandas"), pytest.importorskip("polars")
@@ -130,6 +132,7 @@ def test_ambiguous_selection_names_the_missing_argument(tmp_path: Path) -> None:
         nedbus.read(path, vehicle="99")
 
 
+@pytest.mark.slow
 def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
     """Reading one stream needs memory for that stream, not for the whole file."""
     path = tmp_path / "large.mcap"
@@ -237,6 +240,7 @@ def texts_of(
     return re.findall(r"<text[^>]*>([^<]*)</text>", path.read_text())
 
 
+@pytest.mark.slow
 def test_track_has_every_valid_position(tmp_path: Path) -> None:
     """The track has every valid position, east to the right, north up; flags and resets have rows."""
     angles = np.linspace(0, 5, 60)
@@ -290,6 +294,7 @@ def test_track_has_every_valid_position(tmp_path: Path) -> None:
     assert second == pytest.approx(first * 0.24 / 0.2, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_plot_names_missing_flags(tmp_path: Path) -> None:
     """Flags and resets that a log lacks have no row; a note in the plot lists them."""
     path = tmp_path / "a.ulg"
@@ -304,6 +309,7 @@ def test_plot_names_missing_flags(tmp_path: Path) -> None:
     assert f"not in 1/{VLP}: dead_reckoning, heading_reset_counter" in texts
 
 
+@pytest.mark.slow
 def test_plot_of_invalid_messages_has_explanatory_titles(tmp_path: Path) -> None:
     """Invalid messages are plotted with explanatory titles; a file name is not interpreted as math text."""
     array = to_array([message(each + 1) for each in range(20)])
@@ -364,6 +370,7 @@ def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
     assert in_polars["eph"].to_list() == [1.0, None]
 
 
+@pytest.mark.slow
 def test_names_in_the_docs_exist_and_scripts_run(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -415,6 +422,7 @@ def test_time_differences_in_data_frames_may_be_negative(
     assert nedbus.read(path)["timestamp"].dtype == np.uint64
 
 
+@pytest.mark.slow
 @pytest.mark.logs
 def test_addresses_of_lists_messages_that_only_the_file_defines() -> None:
     """`addresses_of` lists the streams that `read(path, ["*"])` returns."""
@@ -459,6 +467,7 @@ def test_message_id_of_a_log_can_be_reused(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_reading_several_topics_reads_the_file_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -523,6 +532,7 @@ def test_ground_truth_recipe_measures_the_error(
     assert scope["rms"] == pytest.approx(5.0, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "reason"),
     [

@@ -114,6 +114,7 @@ def test_reader_receives_all_data_of_a_vehicle(join: Join) -> None:
     assert publisher.flush()
 
 
+@pytest.mark.slow
 def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
     """Vehicles may query the acknowledgements of readers, so a lossless publisher waits for a slow reader."""
     publisher = join("vehicle-1").publisher(VLP, vehicle="1", lossless=True)
@@ -380,6 +381,7 @@ def test_commands_accept_certificates_as_flags_or_variables(
     wait_for(is_refused, what="the service to learn and report the refusal, under its own vehicle")
 
 
+@pytest.mark.slow
 def test_px4_without_tls_is_bridged_to_the_secure_router(
     join: Join, open_as: Open, secure: str, pki: Path, run_nedbus: Start
 ) -> None:
@@ -457,6 +459,7 @@ def test_pki_commands_never_overwrite_keys(tmp_path: Path) -> None:
     assert run_command("pki", "cert", str(folder), "../evil").exit_code == 1
 
 
+@pytest.mark.slow
 def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Path) -> None:
     """A router without its certificates exits with an error that names the missing file."""
     file = tmp_path / "secure.json5"
@@ -472,6 +475,7 @@ def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Pa
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "environment"),
     [
@@ -685,6 +689,7 @@ def test_probes_continue_after_a_panic(
     permission.close()
 
 
+@pytest.mark.slow
 def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timings: Timings) -> None:
     """The permissions of a service with an embedded router depend on the certificate of its uplink."""
     timings.probe = 0.5
@@ -696,6 +701,7 @@ def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timing
         wait_for(lambda: check(permission) == {"1": False, "2": True}, what="the denied vehicle")
 
 
+@pytest.mark.slow
 def test_unreachable_or_open_router_is_not_reported_as_refusing(
     configured: tuple[Path, str],
     pki: Path,

@@ -46,6 +46,7 @@ def declare(session: Session, vehicle: str, number: int) -> list[zenoh.Livelines
     return [session.liveliness().declare_token(key) for key in keys]
 
 
+@pytest.mark.slow
 def test_vehicle_with_too_many_tokens_does_not_hide_others(
     endpoint: str, zenoh_session: Session, limits: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:

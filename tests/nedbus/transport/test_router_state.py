@@ -311,6 +311,7 @@ def test_exporter_metrics_have_sessions_and_limits_of_routers(
         wait_for(lambda: not shows(f"sessions{label}"), what="no router")
 
 
+@pytest.mark.slow
 def test_exporter_retries_while_the_router_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
@@ -349,6 +350,7 @@ def test_exporter_stops_during_an_unanswered_query(limited: str, timings: Timing
         assert time.monotonic() - begin < DEADLINE
 
 
+@pytest.mark.slow
 def test_connect_error_names_the_session_limit_of_a_full_router(tmp_path: Path) -> None:
     """ConnectError and the doctor name the session limit; a client can connect once another session closes."""
     endpoint = free_endpoint()
@@ -425,6 +427,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_router_accepts_more_sessions_than_the_soft_limit(start: Start) -> None:
     """With `ulimit -S -n 64` a router accepts 100 sessions, each with an open file."""
     where, hard = free_endpoint(), resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -436,6 +439,7 @@ def test_router_accepts_more_sessions_than_the_soft_limit(start: Start) -> None:
     assert "open files" not in router.err
 
 
+@pytest.mark.slow
 def test_router_warns_if_the_hard_limit_is_too_low(start: Start) -> None:
     """With a hard limit of 300 open files a router starts, and logs the number of sessions that fit."""
     router = start("-c", LIMITED, "300", "300", "router", "--listen", free_endpoint())

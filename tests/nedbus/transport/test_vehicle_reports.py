@@ -148,6 +148,7 @@ def service_of(bus: nedbus.Bus, vehicle: str) -> str | None:
     return next((each.service for each in statuses), None)
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_health_of_a_vehicle_depends_on_its_own_certificate(fleet: Fleet) -> None:
     """`health --expect 2 --valid xy` fails while xy of vehicle 2 is invalid, whatever vehicle 1 reports about it."""
@@ -166,6 +167,7 @@ def test_health_of_a_vehicle_depends_on_its_own_certificate(fleet: Fleet) -> Non
         assert "vehicle 2 is missing" in result.err
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_claimed_refusal_lets_no_vehicle_report_about_another(fleet: Fleet) -> None:
     """A service of vehicle 1 that reports vehicle 2 as refused measures no stream of vehicle 2: it is stale in `list`.
@@ -187,6 +189,7 @@ def test_claimed_refusal_lets_no_vehicle_report_about_another(fleet: Fleet) -> N
             assert "ULog stream of vehicle 2" not in fleet.run("info").out
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_events_and_verdicts_of_a_vehicle_are_its_own(fleet: Fleet, run_nedbus: Start) -> None:
     """`why -v 2`, `events` and the page show what the service of vehicle 2 reports, and nothing of vehicle 1."""
@@ -241,6 +244,7 @@ def test_refusal_cannot_be_hidden_by_another_vehicle(fleet: Fleet, run_nedbus: S
         assert "vehicles refused by the router: 3" in fleet.run("info").out
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
     """A service whose status key names no vehicle is named by health, info, list, why and the doctor.
@@ -275,6 +279,7 @@ def test_older_service_is_named_but_not_believed(fleet: Fleet) -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_vehicle_without_reports_is_named_beside_others(fleet: Fleet, run_nedbus: Start) -> None:
     """`why` names a vehicle that only an older service reports, after the verdicts on all others; many in one line."""
@@ -387,6 +392,7 @@ def test_only_the_refusal_of_another_vehicle_is_believed(fleet: Fleet) -> None:
         assert [(report.vehicles, report.events) for report in reports] == [({}, ())]
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_service_of_several_vehicles_has_a_certificate_that_says_so(
     pki: Path, tmp_path: Path, start: Start, run_nedbus: Start

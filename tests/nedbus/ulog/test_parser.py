@@ -276,6 +276,7 @@ def test_held_data_is_bounded(verify: bool, limit: int, size: int) -> None:
     assert limit // 4 < held < limit
 
 
+@pytest.mark.slow
 def test_subscriptions_hold_constant_memory() -> None:
     """Neither subscriptions that end, nor those to unknown topics, grow a table."""
     writer = UlogWriter()

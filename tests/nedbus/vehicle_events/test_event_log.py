@@ -781,6 +781,7 @@ def test_state_lists_the_worst_condition_first(flight: Flight) -> None:
     assert flight.event_log.state("nobody", flight.now).severity == "info"
 
 
+@pytest.mark.slow
 def test_number_of_vehicles_streams_and_events_is_bounded() -> None:
     """An event log keeps the latest 2,000 events, 1,000 vehicles, and 1,000 streams per vehicle."""
     flight = Flight()

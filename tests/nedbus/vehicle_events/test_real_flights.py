@@ -145,6 +145,7 @@ def sizes_of(event: Event) -> Mapping[str, float]:
     return {**event.numbers, **(down if event.kind == "reset" else {})}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STEADY)
 def test_events_equal_the_independent_table(name: str) -> None:
     """Events and table rows are the same: kind, change, time within a millisecond, flags and sizes.
@@ -174,6 +175,7 @@ def test_events_equal_the_independent_table(name: str) -> None:
     assert [(time_of(event), event.kind, event.text) for event in left] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thinned", [False, True])
 @pytest.mark.parametrize("name", STEADY)
 def test_events_and_track_agree_in_every_reset(name: str, thinned: bool) -> None:
@@ -208,6 +210,7 @@ def test_events_and_track_agree_in_every_reset(name: str, thinned: bool) -> None
             )
 
 
+@pytest.mark.slow
 def test_table_is_generated_by_its_script() -> None:
     """The table file equals the output of its script, and covers every log."""
     logs = {path.stem: path for path in LOGS.parent.glob("*/*.ulg")}
@@ -216,6 +219,7 @@ def test_table_is_generated_by_its_script() -> None:
     assert events_table.to_json(made) == events_table.TABLE.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_event_numbers_are_finite(name: str) -> None:
     """All numbers in events are finite, because JSON has no NaN."""
@@ -450,6 +454,7 @@ def verdict(path: Path) -> Verdict:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "begin", "end", "cause", "quoted"),
     [
@@ -481,6 +486,7 @@ def test_verdict_names_cause_and_times(
     assert ("Not in the data: vehicle_gps_position" in found.text) == (name == "gps_loss")
 
 
+@pytest.mark.slow
 def test_verdict_names_contradicted_height() -> None:
     """Despite valid flags the verdict is the contradicted height, with PX4's text as first evidence."""
     found = verdict(path_of("nxp_v0_ekf_failure"))
@@ -508,6 +514,7 @@ def test_vehicle_with_vision_is_usable_without_gps() -> None:
     assert found.text == f"no faults in 62 s; throughout: {usual}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_state_and_verdict_name_the_same_cause(name: str) -> None:
     """After each event of a flight, the live verdict names the same fault as the state."""
@@ -544,6 +551,7 @@ def test_verdict_has_at_most_three_lines(path: Path) -> None:
     assert not is_healthy or re.fullmatch(r"no faults in \d+ s", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ALL, ids=lambda path: path.stem)
 def test_every_fault_event_is_in_a_story(path: Path) -> None:
     """Of the events of severity bad and watch, only texts of PX4 are in no story; `--all` lists those separately."""
@@ -583,6 +591,7 @@ DECISIVE: Final = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIRST_SENTENCES)
 def test_verdict_begins_with_what_a_pilot_must_know(name: str) -> None:
     """The first sentence is the worst fault in flight; the causes precede it, the decisive ones are quoted, uncut."""
@@ -754,6 +763,7 @@ def test_replay_and_its_recording_have_the_same_events(
     assert faults[0] == faults[1]
 
 
+@pytest.mark.slow
 def test_conversion_of_a_failed_estimate_has_the_same_contradictions(tmp_path: Path) -> None:
     """The contradicted height of 2 s is in the log and in its conversion."""
     path = path_of("nxp_v0_ekf_failure")

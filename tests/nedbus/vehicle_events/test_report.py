@@ -127,6 +127,7 @@ def test_topics_of_a_vehicle_are_limited_to_those_of_a_verdict() -> None:
     assert story.lacking == ("estimator_status_flags", "failsafe_flags")
 
 
+@pytest.mark.slow
 def test_large_report_is_sent_in_parts() -> None:
     """A report of 1,000 vehicles is split into parts below the size limit, which join to the same report."""
     flight = Flight()

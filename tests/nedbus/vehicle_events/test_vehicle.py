@@ -284,6 +284,7 @@ def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
     assert story_of(Event("1", "jump", "once", "watch", "", 9.0), events) is None
 
 
+@pytest.mark.slow
 def test_noisy_vehicle_does_not_displace_events_of_others() -> None:
     """A full event log keeps the events of a vehicle after thousands of events of another one."""
     event_log = EventLog(keep=300)
@@ -456,6 +457,7 @@ def test_number_of_topics_of_a_vehicle_is_limited(vehicle: SimpleVehicle) -> Non
     assert len(vehicle.event_log.vehicles["1"].topics) == 1000
 
 
+@pytest.mark.slow
 def test_number_of_initial_conditions_is_limited() -> None:
     """A vehicle that is rebooted and armed again and again without a fix has at most 100 initial conditions."""
     flight = Flight()

@@ -401,6 +401,7 @@ def test_histories_have_ten_points_and_one_point_per_second(sim: SimulatedFleet)
     assert 64 <= long.written <= 74
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [50, 250])
 def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(
     sim: SimulatedFleet, rate: int
@@ -419,6 +420,7 @@ def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(
     assert not [north for north in column(sim.stream(GROUND_TRUTH), "north") if math.isnan(north)]
 
 
+@pytest.mark.slow
 def test_position_at_a_time_comes_from_both_histories(sim: SimulatedFleet) -> None:
     """The position at a time is the last valid point before it in either history; None if there is no such point."""
     begin = sim.time

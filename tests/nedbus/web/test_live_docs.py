@@ -53,6 +53,7 @@ def test_hash_table_matches_the_layouts() -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", SERVES)
 def test_serve_command_publishes_the_vehicle(
     run_nedbus: Start, endpoint: str, port: int, fly: Fly, command: str
@@ -78,6 +79,7 @@ def test_serve_command_publishes_the_vehicle(
     assert echo.out.startswith(f"1/{VLP} ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ROS2)
 def test_ros2_command_reaches_a_node(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, peer: Peer, command: str

@@ -112,6 +112,7 @@ def test_recording_plays_at_the_selected_speed(
     ], "after a reset"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [5.0, 61.0, 100.0, 155.0, 179.9])
 def test_seek_equals_playing_to_that_time(
     recording: Recording, clock: SimpleNamespace, target: float
@@ -167,6 +168,7 @@ def open_page(recording: Recording, query: str = "") -> Page:
     return Page(recording, player, query=query)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clock")
 def test_selecting_an_event_seeks_to_it(recording: Recording) -> None:
     """A mark on the slider, an event on the timeline, and the keys n and p seek to the time of an event.
@@ -210,6 +212,7 @@ def test_selecting_an_event_seeks_to_it(recording: Recording) -> None:
     assert page.plotted["time"][-1] == pytest.approx(179_500, abs=500), "the whole flight"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clock")
 def test_recording_page_lists_verdict_and_faults(recording: Recording) -> None:
     """Below the vehicles are the verdict on the recording and its faults; a click on a fault seeks to it.
@@ -238,6 +241,7 @@ def test_recording_page_lists_verdict_and_faults(recording: Recording) -> None:
         assert page.player.time == pytest.approx(90, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clock")
 def test_url_of_a_recording_restores_the_moment(recording: Recording) -> None:
     """The URL of a recording's page restores vehicle, view and moment."""
@@ -290,6 +294,7 @@ def test_malformed_actions_leave_the_recording_playable(recording: Recording) ->
     assert page.vehicles == ["wing"]
 
 
+@pytest.mark.slow
 def test_only_timestamps_of_other_topics_are_kept(tmp_path: Path, clock: SimpleNamespace) -> None:
     """Only the timestamps of topics other than position and status are kept, for their rate and age."""
     file = write_flight(tmp_path, {VLP: lambda _: {}, "vehicle_attitude": lambda _: {}}, seconds=20)

@@ -94,6 +94,7 @@ def test_pages_of_other_origins_get_no_websocket(url: str) -> None:
     assert is_answered(url, "http://ground.example:8420")
 
 
+@pytest.mark.slow
 def test_page_has_the_viewport_of_a_phone(endpoint: str) -> None:
     """Without a viewport, a phone lays the page out as on a desktop instead of in a single column."""
     with serving_live(endpoint) as url, urllib.request.urlopen(url, timeout=DEADLINE) as page:  # noqa: S310 - our own
@@ -262,6 +263,7 @@ def test_disconnect_during_a_message_logs_no_traceback(
     assert not caplog.records
 
 
+@pytest.mark.slow
 def test_listening_on_all_interfaces_warns(run_nedbus: Start, endpoint: str) -> None:
     """With --http 0.0.0.0 the command warns about missing authentication; --origin allows a name; Ctrl-C stops it."""
     port = free_port()

@@ -206,6 +206,7 @@ def sources(page: RenderedPage) -> list[ColumnDataSource]:
     return models_of(page.document, ColumnDataSource)
 
 
+@pytest.mark.slow
 def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
     """A line describes the ULog stream of the selected vehicle; its text comes from a peer and is escaped."""
     page = Page(sim)
@@ -223,6 +224,7 @@ def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
     assert "refused, &lt;b&gt;another client has it" in page.text
 
 
+@pytest.mark.slow
 def test_use_of_an_external_position_is_shown_escaped(sim: SimulatedFleet) -> None:
     """A line tells whether the selected vehicle uses a position that it receives; it is amber if a cause is known."""
     page = Page(sim)
@@ -248,6 +250,7 @@ def test_use_of_an_external_position_is_shown_escaped(sim: SimulatedFleet) -> No
     )
 
 
+@pytest.mark.slow
 def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:
     """Counts, title, rows, badges and markers agree; before the first message the header shows "waiting"."""
     page = Page(sim)
@@ -280,6 +283,7 @@ def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:
     assert {mark["shape"] for mark in page.marks.values()} == {"square"}
 
 
+@pytest.mark.slow
 def test_bad_secondary_estimates_do_not_mark_the_vehicle_bad(sim: SimulatedFleet) -> None:
     """An invalid second EKF or ground truth appears in the table of streams, but not in list, header, title or map."""
     sim.fly(1, WING, SECOND_EKF, GROUND_TRUTH)
@@ -296,6 +300,7 @@ def test_bad_secondary_estimates_do_not_mark_the_vehicle_bad(sim: SimulatedFleet
     assert page.panel("more").count("xy invalid, dead reckoning") == 2
 
 
+@pytest.mark.slow
 def test_overloaded_page_is_reported_in_the_header(sim: SimulatedFleet) -> None:
     """If the page falls behind, the header reports it, and no vehicle changes its state."""
     sim.fly(3, WING, QUAD)
@@ -310,6 +315,7 @@ def test_overloaded_page_is_reported_in_the_header(sim: SimulatedFleet) -> None:
     assert page.document.title == "nedbus"
 
 
+@pytest.mark.slow
 def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet) -> None:
     """The table shows rates and states of streams without a position; a vehicle without a position has no marker."""
     attitude, battery = Address("wing", "vehicle_attitude"), Address("far", "battery_status", 0)
@@ -330,6 +336,7 @@ def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet)
     assert len(page.plotted["speed"]) > 20
 
 
+@pytest.mark.slow
 def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
     """The row shows mode, battery and GPS; the tiles also show the arming state."""
     sim.fly(2, x=-0.01, heading=-0.001)
@@ -343,6 +350,7 @@ def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
         assert f"<span>{name}</span><b>{text}</b>" in page.panel("nums")
 
 
+@pytest.mark.slow
 def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
     """The tiles show the last values of a silent stream or a gone vehicle with their age; the row shows "-"."""
     status, battery = Address("wing", "vehicle_status"), Address("wing", "battery_status", 0)
@@ -396,6 +404,7 @@ def test_attitude_is_shown_as_angles_in_degrees(sim: SimulatedFleet) -> None:
     assert "yaw -, 10.0 s ago</div>" in Page(sim).panel("nums")
 
 
+@pytest.mark.slow
 def test_rates_of_a_slow_stream_are_shown_below_the_numbers(sim: SimulatedFleet) -> None:
     """If positions arrive at less than half the usual rate, both rates are shown below the numbers."""
     sim.fly(20, rate=20)
@@ -413,6 +422,7 @@ def test_rates_of_a_slow_stream_are_shown_below_the_numbers(sim: SimulatedFleet)
     assert page.grades == {"wing": "ok"}
 
 
+@pytest.mark.slow
 def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
     """With several active conditions, the story explains the one shown in badge and list, whichever began first."""
     gps = Address("wing", "sensor_gps", 0)
@@ -428,6 +438,7 @@ def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
     )
 
 
+@pytest.mark.slow
 def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> None:
     """The marker of a silent or invalid vehicle is open, has the shape of its state, and stays in place."""
     sim.fly(3, WING, QUAD, x=4.0, y=2.0)
@@ -450,6 +461,7 @@ def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> No
         assert mark["edge"] == DARK.colours["bad"]
 
 
+@pytest.mark.slow
 def test_selection_survives_reordering(sim: SimulatedFleet) -> None:
     """By default the worst vehicle is selected; a selection by the user survives a change of the order.
 
@@ -475,6 +487,7 @@ def test_selection_survives_reordering(sim: SimulatedFleet) -> None:
         assert page.chosen == name
 
 
+@pytest.mark.slow
 def test_search_filters_by_name_and_state(sim: SimulatedFleet) -> None:
     """The list shows the vehicles whose name or state contains the search text; counts and map show all vehicles."""
     sim.fly(3, WING, Address("wind", VLP), QUAD)
@@ -493,6 +506,7 @@ def test_search_filters_by_name_and_state(sim: SimulatedFleet) -> None:
     assert HOSTILE not in page.text
 
 
+@pytest.mark.slow
 def test_text_from_peers_is_escaped(sim: SimulatedFleet) -> None:
     """Rejection reasons, link faults, titles and URL arguments are escaped wherever they are shown."""
     sim.fly(3)
@@ -518,6 +532,7 @@ def test_text_from_peers_is_escaped(sim: SimulatedFleet) -> None:
             Address(name, VLP)
 
 
+@pytest.mark.slow
 def test_plots_are_added_one_by_one(sim: SimulatedFleet) -> None:
     """Plots do not delay map and list: each is added only after the browser has drawn an update."""
     sim.fly(3, WING, Address("far", "vehicle_status"))
@@ -533,6 +548,7 @@ def test_plots_are_added_one_by_one(sim: SimulatedFleet) -> None:
         assert len(other._grid.children) == count
 
 
+@pytest.mark.slow
 def test_legend_does_not_cover_the_lines(sim: SimulatedFleet) -> None:
     """A plot with several lines names them above its frame, not inside, where the lines are."""
     sim.fly(3, WING)
@@ -544,6 +560,7 @@ def test_legend_does_not_cover_the_lines(sim: SimulatedFleet) -> None:
     assert all(legend in plot.above and legend not in plot.center for plot, legend in legends)
 
 
+@pytest.mark.slow
 def test_px4_texts_are_quoted_and_escaped(sim: SimulatedFleet) -> None:
     """PX4's texts appear quoted and escaped on the timeline and in the story, and do not change the state."""
     sim.fly(2)
@@ -561,6 +578,7 @@ def test_px4_texts_are_quoted_and_escaped(sim: SimulatedFleet) -> None:
     assert "<img" not in page.text
 
 
+@pytest.mark.slow
 def test_viewers_share_no_model(sim: SimulatedFleet) -> None:
     """Each viewer has its own Bokeh models."""
     sim.fly(3)
@@ -568,6 +586,7 @@ def test_viewers_share_no_model(sim: SimulatedFleet) -> None:
     assert not set(map(id, first)) & set(map(id, second))
 
 
+@pytest.mark.slow
 def test_update_without_changes_sends_nothing(sim: SimulatedFleet) -> None:
     """Without new messages an update sends no data."""
     sim.fly(3, WING, heading=None)
@@ -587,6 +606,7 @@ def frame_of(page: Page) -> tuple[list[float], list[float]]:
     return list(frame.data["east"]), list(frame.data["north"])
 
 
+@pytest.mark.slow
 def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
     """The map shows all vehicles with trails, or the selected one centred, or its whole trail, and at least 20 m."""
     sim.fly(3, WING)
@@ -612,6 +632,7 @@ def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
     assert page.url_query == "?vehicle=wing&view=vehicle"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["340x330", "560x430", "1100x700"])
 def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
     """With 50 vehicles close together only labels that fit are shown, selected and bad vehicles first."""
@@ -652,6 +673,7 @@ def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
             )
 
 
+@pytest.mark.slow
 def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFleet) -> None:
     """The action "trail" shows 15 minutes on map and plots, then a minute again."""
     for _ in range(20):
@@ -673,6 +695,7 @@ def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFlee
 # Timeline
 
 
+@pytest.mark.slow
 def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
     """The selected vehicle and those with faults come first; with 50 vehicles, the last row counts the hidden ones."""
     addresses = [Address(f"uav-{number}", VLP) for number in range(1, 51)]
@@ -688,6 +711,7 @@ def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
     assert cast("Any", timeline).y_range.start < min(labels)
 
 
+@pytest.mark.slow
 def test_timeline_has_a_legend(sim: SimulatedFleet) -> None:
     """The title of the timeline explains each symbol."""
     figure = cast("Any", Page(sim).viewer._timeline_plot.figure)
@@ -695,6 +719,7 @@ def test_timeline_has_a_legend(sim: SimulatedFleet) -> None:
         assert words in figure.title.text
 
 
+@pytest.mark.slow
 def test_timeline_begins_with_the_first_event(sim: SimulatedFleet) -> None:
     """The live timeline begins with the first event, but covers at least one minute and at most ten."""
     sim.fly(3)
@@ -741,6 +766,7 @@ def event_of(sim: SimulatedFleet, text: str) -> float:
     return next(event.time for event in sim.timeline.events if event.text.startswith(text))
 
 
+@pytest.mark.slow
 def test_tapped_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """A tapped event pins plots and story to its time until "back to now"; list and map stay current."""
     page = Page(faulty_fleet, query="?vehicle=quad")
@@ -765,6 +791,7 @@ def test_tapped_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> No
     assert page.plot_range == pytest.approx((faulty_fleet.time - 60, faulty_fleet.time), abs=0.01)
 
 
+@pytest.mark.slow
 def test_tapped_map_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """An event is marked on the map at the vehicle's position at that time; the mark can be tapped repeatedly."""
     page = Page(faulty_fleet, query="?vehicle=wing")
@@ -780,6 +807,7 @@ def test_tapped_map_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -
         page.send("now")
 
 
+@pytest.mark.slow
 def test_keys_step_through_events(faulty_fleet: SimulatedFleet) -> None:
     """The key p shows the previous event of the selected vehicle, n the next one, and Escape the current time."""
     page = Page(faulty_fleet, query="?vehicle=wing")
@@ -796,6 +824,7 @@ def test_keys_step_through_events(faulty_fleet: SimulatedFleet) -> None:
     assert page.pinned is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("event", ["xy not valid", "reset", None])
 def test_url_restores_the_page(faulty_fleet: SimulatedFleet, event: str | None) -> None:
     """A page opened with another page's URL shows the same vehicle, view, theme, moment and verdict."""
@@ -896,6 +925,7 @@ def test_malformed_input_from_the_browser_is_ignored(faulty_fleet: SimulatedFlee
     assert page.panel("list").count("<div") == 4
 
 
+@pytest.mark.slow
 def test_updates_pause_while_the_browser_does_not_draw(sim: SimulatedFleet) -> None:
     """At most two updates are sent ahead of the last one that the browser has drawn."""
     sim.fly(3)
@@ -994,6 +1024,7 @@ def test_past_loss_of_a_link_is_on_the_page_once(
     assert sorted(event.text for event in only) == ["no link", "takeoff of wing"]
 
 
+@pytest.mark.slow
 def test_page_follows_published_vehicles(
     endpoint: str, bus: nedbus.Bus, zenoh_session: Session
 ) -> None:
@@ -1023,6 +1054,7 @@ def test_page_follows_published_vehicles(
         )
 
 
+@pytest.mark.slow
 def test_page_survives_a_router_restart() -> None:
     """While the router is down, the header shows an alarm, markers are hollow, and states do not change."""
     where = free_endpoint()

@@ -64,6 +64,7 @@ def test_ros_2_payload_round_trip(layout: str, vector: Mapping[str, Any]) -> Non
     assert encode_cdr(vector["fields"], layout=layout) == encode_cdr(fields, layout=layout)
 
 
+@pytest.mark.slow
 @given(messages())
 def test_payload_matches_rosbags(message: VehicleLocalPosition) -> None:
     """Any message in any layout encodes to the same bytes as with rosbags, and decodes to the same fields."""

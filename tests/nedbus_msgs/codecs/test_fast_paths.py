@@ -167,6 +167,7 @@ def test_invalid_message_error_names_field_rule_and_value(
     assert str(pickle.loads(pickle.dumps(info.value))) == str(info.value)
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=3)), min_size=1, max_size=5
@@ -201,6 +202,7 @@ def test_payloads_are_validated_like_the_model(
     assert encode_array(array) == b"".join(payloads)
 
 
+@pytest.mark.slow
 @given(st.lists(messages(), max_size=4))
 def test_array_round_trip(many: list[VehicleLocalPosition]) -> None:
     """Messages survive the round trip through an array and its payloads; the array's CDR is that of messages."""

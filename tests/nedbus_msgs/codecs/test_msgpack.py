@@ -76,6 +76,7 @@ def test_other_msgpack_encodings_are_decoded(
     assert encode_row(decode_row(payload)) == encode(message)
 
 
+@pytest.mark.slow
 @given(messages())
 def test_layout_0_is_decoded(message: VehicleLocalPosition) -> None:
     """A payload of layout 0 has 52 fields, and a single hagl_max for hagl_max_z and hagl_max_xy."""
@@ -138,6 +139,7 @@ def test_payload_that_breaks_a_rule_is_rejected() -> None:
         decode(bytes(payload))
 
 
+@pytest.mark.slow
 def test_flipped_bit_has_the_same_effect_in_model_row_and_array() -> None:
     """A payload with one flipped bit is decoded, or rejected, identically as a model, as a row and in an array."""
     number = int.from_bytes(REAL[0], "big")
@@ -187,6 +189,7 @@ msgpack_values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.sampled_from(FLIGHTS), st.integers(0, 53), msgpack_values)
 @MANY_EXAMPLES
 def test_random_value_is_decoded_unchanged_or_rejected(

@@ -92,6 +92,7 @@ def expected(encode: Callable[[], Encoded]) -> Encoded | None:
         return None
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_record_is_encoded_as_its_fields(data: st.DataObject) -> None:
     """A record of any layout of any built-in message yields the payload of its fields, or is left to the model."""
@@ -194,6 +195,7 @@ def test_field_reader_reads_all_forms_of_a_message() -> None:
     assert {FieldReader(names[:3])(each) for each in forms} == {(0.0, (0.0, 0.0), False)}
 
 
+@pytest.mark.slow
 def test_field_reader_forgets_types_of_messages() -> None:
     """A reader that meets ever new definitions does not keep all of them alive."""
     read = FieldReader(("timestamp", "value"))

@@ -391,6 +391,7 @@ def write_wheels(path: Path, count: int) -> Path:
     return log.write(path)
 
 
+@pytest.mark.slow
 def test_new_message_needs_only_its_file(tmp_path: Path, start: Start, endpoint: str) -> None:
     """With one file in `messages/`, a message is read from a log, published over a router, and received as an array."""
     shutil.copytree(SCHEMAS / "nedbus_msgs", tmp_path / "nedbus_msgs")

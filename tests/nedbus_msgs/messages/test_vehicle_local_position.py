@@ -111,6 +111,7 @@ def test_copy_with_updates_is_validated() -> None:
         message.model_copy(update={"x": 1e39})
 
 
+@pytest.mark.slow
 @given(messages())
 def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
     """JSON contains NaN and infinities as strings, and is parsed to a bit-identical message."""
@@ -208,6 +209,7 @@ def test_array_element_is_accepted() -> None:
     )
 
 
+@pytest.mark.slow
 @given(fields=fields(), names=st.sets(st.sampled_from(sorted(FIELD_TYPES))))
 def test_omitted_fields_are_the_same_on_the_fast_path(
     fields: dict[str, object], names: set[str]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import weakref
 
+import pytest
+
 from nedbus_msgs import (
     Definition,
     Message,
@@ -35,6 +37,7 @@ def use_all_codecs(name: str) -> Definition[Message]:
     return definition
 
 
+@pytest.mark.slow
 def test_unused_definition_is_freed_with_its_codecs() -> None:
     """No cache keeps a definition alive; the codecs of a definition in use are cached."""
     used = use_all_codecs("Used")

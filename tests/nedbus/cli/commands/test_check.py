@@ -229,6 +229,7 @@ def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
     assert passes("check", settings)
 
 
+@pytest.mark.slow
 def test_missing_cryptography_package_is_a_warning(start: Start, tmp_path: Path) -> None:
     """Without `cryptography` the check warns that it cannot verify expiry dates, but reports no mistake."""
     make_authority(tmp_path / "pki")

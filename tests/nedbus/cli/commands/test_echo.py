@@ -101,6 +101,7 @@ def pause_echo(
     return pause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["--topic", VLP], [VLP], ["/" + VLP], ["1/" + VLP], []])
 def test_echo_prints_one_line_per_message(simulation: str, arguments: list[str]) -> None:
     """The topic is an option or an argument, by default vehicle_local_position; --count limits the lines."""
@@ -138,6 +139,7 @@ def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
     assert len({row["topic"] for row in rows}) > 1
 
 
+@pytest.mark.slow
 def test_echo_and_record_select_several_vehicles_and_topics(
     bus: nedbus.Bus, endpoint: str, tmp_path: Path
 ) -> None:
@@ -178,6 +180,7 @@ def test_echo_full_prints_every_field(simulation: str) -> None:
     assert names == list(VehicleLocalPosition.model_fields)
 
 
+@pytest.mark.slow
 def test_interrupt_exits_with_130(run_nedbus: Start, simulation: str) -> None:
     """Ctrl-C ends `nedbus echo` at once, without a traceback."""
     process = run_nedbus("echo", "-c", simulation, coverage=False)
@@ -187,6 +190,7 @@ def test_interrupt_exits_with_130(run_nedbus: Start, simulation: str) -> None:
     assert "Traceback" not in process.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_echo_prints_received_messages_before_a_signal_ends_it(
     bus: nedbus.Bus,
@@ -209,6 +213,7 @@ def test_echo_prints_received_messages_before_a_signal_ends_it(
     assert printed == [*range(1, 51)]
 
 
+@pytest.mark.slow
 def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> None:
     """`nedbus echo | head` ends without an error message."""
     read_end, write_end = os.pipe()
@@ -222,6 +227,7 @@ def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> N
     assert Path("err").read_text() == ""
 
 
+@pytest.mark.slow
 def test_echo_prints_counts_at_exit(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session
 ) -> None:
@@ -274,6 +280,7 @@ def test_blocked_echo_does_not_delay_a_replay(
         assert service.wait() == 0, service.err
 
 
+@pytest.mark.slow
 def test_echo_every_prints_all_messages(run_nedbus: Start, endpoint: str) -> None:
     """--every prints all messages of a replay in order, at any speed; its help warns that the replay waits."""
     assert "a replay at speed=max waits" in run_command("echo", "--help", COLUMNS="300").out
@@ -349,6 +356,7 @@ def test_echo_field_selects_fields(simulation: str) -> None:
         assert out.count("vehicle_local_position") == 1
 
 
+@pytest.mark.slow
 def test_notice_of_silence_is_written_once(endpoint: str, timings: Timings) -> None:
     """`echo` says once that it waits, however long it does."""
     timings.first_sample = 0.1

@@ -321,6 +321,7 @@ def test_error_is_one_line(
     assert len(result.err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_why_without_router_or_service_fails(endpoint: str) -> None:
     """Without a router, or without a service with a history, `why` names what is missing."""
     closed = free_endpoint()
@@ -349,6 +350,7 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
     wait_for(has_ended, what="the end of the flights")
 
 
+@pytest.mark.slow
 def test_why_live_uses_service_history(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path
 ) -> None:
@@ -390,6 +392,7 @@ def test_why_live_uses_service_history(
     )
 
 
+@pytest.mark.slow
 def test_why_live_reports_initial_faults(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path
 ) -> None:
@@ -404,6 +407,7 @@ def test_why_live_reports_initial_faults(
     assert run_command("why", "-c", endpoint).out.startswith(begin)
 
 
+@pytest.mark.slow
 def test_events_within_shows_the_history(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path
 ) -> None:
@@ -419,6 +423,7 @@ def test_events_within_shows_the_history(
     assert [each["kind"] for each in events[1]["evidence"]] == ["dead_reckoning"]
 
 
+@pytest.mark.slow
 def test_history_contains_px4_texts(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path
 ) -> None:
@@ -478,6 +483,7 @@ def test_events_live_are_printed_as_they_happen(
     assert lines[0][1].startswith("BAD    xy not valid")
 
 
+@pytest.mark.slow
 def test_events_live_filter_by_vehicle_and_severity(
     run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
 ) -> None:
@@ -515,6 +521,7 @@ BASH = re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
 DOCUMENTED = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", DOCUMENTED)
 def test_documented_command_works(
     command: str, run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path

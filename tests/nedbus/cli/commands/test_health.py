@@ -85,6 +85,7 @@ def test_finished_replay_is_not_healthy(
         assert health("--max-age", "3600").exit_code == 0
 
 
+@pytest.mark.slow
 def test_frozen_service_is_not_healthy(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, health: Health
 ) -> None:
@@ -205,6 +206,7 @@ def test_valid_and_within_options_report_faults(
         assert health("--max-age", "600", "--expect", "1", "--within", "0").exit_code == 0
 
 
+@pytest.mark.slow
 def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
     """Every silent vehicle is a fault; --expect and --vehicle restrict the check to the vehicles they name."""
     with serving(endpoint, "sim:") as daemon:
@@ -221,6 +223,7 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
         assert health("--vehicle", "1").exit_code == 0
 
 
+@pytest.mark.slow
 def test_faults_of_a_vehicle_do_not_hide_those_of_a_vehicle_with_a_shorter_name(
     endpoint: str, health: Health
 ) -> None:
@@ -259,6 +262,7 @@ def test_invalid_option_value_exits_with_2(
     assert len(result.err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_ended_replay_causes_no_silence_event(endpoint: str, bus: nedbus.Bus) -> None:
     """`nedbus events` shows nothing for the last message of a replay that ended long ago."""
     with serving(endpoint, "sim:?duration=0.1"):

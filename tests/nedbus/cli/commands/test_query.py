@@ -63,6 +63,7 @@ def test_command_starts(run_nedbus: Start, command: str, *, fresh: bool) -> None
     assert f" nedbus {command} [OPTIONS]" in result.out
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_list_shows_published_streams(simulation: str) -> None:
     """`list` prints a row per stream with the age and state of its last message."""
@@ -129,6 +130,7 @@ def test_list_is_not_reported_as_empty_before_the_router_replies(
     assert "is published" not in listed.err
 
 
+@pytest.mark.slow
 def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
     """`hz` prints rate, jitter, latency and loss per stream, as table, JSON or CSV; positions arrive at 100 Hz."""
     table, csv_form = (
@@ -171,6 +173,7 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -
     assert float(rows[0]["time"]) < float(rows[-1]["time"])
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_get_shows_the_last_message(simulation: str) -> None:
     """`get` prints the last message, by default vehicle_local_position; if nothing is published, it exits with 1."""
@@ -216,6 +219,7 @@ def test_schema_needs_no_network() -> None:
     ] == list(LAYOUTS)
 
 
+@pytest.mark.slow
 def test_absence_of_vehicles_is_reported(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
@@ -264,6 +268,7 @@ def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.Mo
     assert len(ended.err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_wait_option_waits_for_a_router(run_nedbus: Start) -> None:
     """--wait makes a command wait until a router is started."""
     where = free_endpoint()
@@ -366,6 +371,7 @@ def test_version_and_help_are_printed(run_nedbus: Start) -> None:
     assert all(f" {command.split()[0]} " in overview.out for command in COMMANDS)
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_full_disk_is_a_one_line_error(
     endpoint: str, bus: nedbus.Bus, fork_server: ForkServer

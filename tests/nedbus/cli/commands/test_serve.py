@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from nedbus.cli.output.progress import suggested_commands
 from nedbus.endpoints import DEFAULT_ENDPOINT
 from tests.peers.command_line import run_command
@@ -29,6 +31,7 @@ def wait_for_message(endpoint: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_suggested_commands_for_wildcard_address_use_loopback(run_nedbus: Start) -> None:
     """For a service that listens on a wildcard address, the suggested commands name a loopback address, and work."""
     port = free_port()

@@ -119,6 +119,7 @@ def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_log_calls_use_exactly_the_documented_events() -> None:
     """Every log call above DEBUG uses an event from the table EVENTS, and every event in the table is used."""
     used: set[str] = set()
@@ -197,6 +198,7 @@ def test_journal_lines_have_syslog_priorities() -> None:
     assert all(line.startswith("<4>") for line in lines)
 
 
+@pytest.mark.slow
 def test_service_logs_json(start: Start) -> None:
     """Each line of a service is a JSON object with an event, and with the source if a source logged it.
 
@@ -221,6 +223,7 @@ def test_service_logs_json(start: Start) -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["info", "debug"])
 def test_error_of_a_command_is_a_json_object(run_nedbus: Start, level: str) -> None:
     """The error that ends a command is one JSON object, with a traceback at level debug."""
@@ -232,6 +235,7 @@ def test_error_of_a_command_is_a_json_object(run_nedbus: Start, level: str) -> N
     assert ("exception" in fields) == (level == "debug")
 
 
+@pytest.mark.slow
 def test_log_level_selects_lines(endpoint: str) -> None:
     """--log-level warning hides lines of normal operation; --debug overrides it; an unknown level is a usage error."""
     quiet = run_command(
@@ -249,6 +253,7 @@ def test_log_level_selects_lines(endpoint: str) -> None:
     assert "NEDBUS_LOG_LEVEL" in wrong.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [0, 1], ids=["journal", "another file"])
 def test_journal_is_detected(start: Start, endpoint: str, other: int) -> None:
     """Lines have priorities instead of dates only if JOURNAL_STREAM identifies stderr."""
@@ -333,6 +338,7 @@ def test_suppressed_lines_are_reported_after_a_flood() -> None:
     assert limited.lines[-1].startswith("suppressed 5 more lines")
 
 
+@pytest.mark.slow
 def test_log_lines_of_other_packages_are_rate_limited() -> None:
     """Lines without an event are limited per text; beyond the maximum number of texts, all others share one limit."""
     limited = Limited()
@@ -377,6 +383,7 @@ def count_lines(text: str, elapsed: float) -> Counter[str]:
     return total
 
 
+@pytest.mark.slow
 def test_flood_of_invalid_payloads_is_rate_limited(
     run_nedbus: Start, endpoint: str, zenoh_session: Session
 ) -> None:
@@ -395,6 +402,7 @@ def test_flood_of_invalid_payloads_is_rate_limited(
     assert total["invalid"] == 100  # limit of logged keys; further keys are only counted
 
 
+@pytest.mark.slow
 def test_log_of_flapping_vehicles_is_rate_limited(
     start: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus
 ) -> None:

@@ -224,6 +224,7 @@ def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus) -> None:
     """At 80 columns a message is one line below a header, with complete addresses in one column."""
@@ -244,6 +245,7 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
             assert line.index("  ok") + 2 == state
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_info_lists_gone_streams(
     on_terminal: OnTerminal, endpoint: str, zenoh_session: Session
@@ -266,6 +268,7 @@ def test_info_lists_gone_streams(
     del service
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_hz_redraws_in_place(
@@ -315,6 +318,7 @@ def test_signal_during_table_setup_restores_the_cursor(
     assert shown == [False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["echo", "hz"])
 def test_lost_link_is_reported(run_nedbus: Start, command: str) -> None:
     """`echo` and `hz` log when the link to the router is lost and up again; `hz` marks each stream as disconnected."""
@@ -339,6 +343,7 @@ def states(lines: str) -> list[str]:
     return [json.loads(line)["state"] for line in lines.splitlines() if line.endswith("}")]
 
 
+@pytest.mark.slow
 def test_streams_of_killed_service_are_gone(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:
@@ -360,6 +365,7 @@ def test_streams_of_killed_service_are_gone(
     assert states(hz.out).count("gone") == 1
 
 
+@pytest.mark.slow
 def test_ended_replay_is_stale(
     start: Start, run_nedbus: Start, endpoint: str, timings: Timings
 ) -> None:
@@ -426,6 +432,7 @@ def test_malicious_status_is_escaped(endpoint: str, zenoh_session: Session) -> N
     del hostile
 
 
+@pytest.mark.slow
 def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> None:
     """Escape sequences in keys and tokens reach neither the output nor the log."""
     tokens = [
@@ -451,6 +458,7 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
     assert len(tokens) == 3
 
 
+@pytest.mark.slow
 def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
     """For 100 vehicles `hz` prints 50 rows per second, and the number of omitted vehicles."""
     with publishing(bus, *(f"flood-{number}" for number in range(100))):
@@ -573,6 +581,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_interrupt_inside_a_destructor_is_repeated(start: Start) -> None:
     """Ctrl-C ends a command even if it arrives inside a destructor or callback, where Python ignores it."""
     health = start("-c", IGNORED, "health", coverage=False)
@@ -621,6 +630,7 @@ make_app()(["serve", "-s", "sim:", "-l", sys.argv[1]])
 """
 
 
+@pytest.mark.slow
 def test_interrupt_during_a_slow_start_exits_with_130(start: Start) -> None:
     """Ctrl-C during a slow router start exits with 130, even if the start takes longer than the close timeout."""
     service = start("-c", SLOW, free_endpoint(), coverage=False)
@@ -647,6 +657,7 @@ run.run_until_stopped(work, closing=closing)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
 @pytest.mark.parametrize(
     ("limit", "reason"),
@@ -666,6 +677,7 @@ def test_hanging_command_is_terminated_after_timeout(
     assert reason in endless.err
 
 
+@pytest.mark.slow
 def test_hangup_stops_a_router(run_nedbus: Start) -> None:
     """SIGHUP stops a command without settings to reload; the log names the signal."""
     where = free_endpoint()
@@ -698,6 +710,7 @@ def on_controlling_terminal(
         process.kill()
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize(
     "command", ["serve -s sim:", "record -o flight.mcap", "web --http 127.0.0.1:PORT"]
@@ -751,6 +764,7 @@ def _make_run(folder: Path) -> list[str]:
     return ["make", "-C", str(ROOT), "run", f"VENV={folder}/venv", f"ARGS={options}"]
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_kill_of_make_run_ends_the_service(tmp_path: Path) -> None:
     """`make run & kill $!` ends the service, too, which frees its port."""

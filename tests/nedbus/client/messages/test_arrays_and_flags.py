@@ -313,6 +313,7 @@ with nedbus.connect(sys.argv[1]) as bus, bus.publisher("wheel_speeds", vehicle=1
 """
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_custom_class_is_received(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """A message of a custom class is received as that class; readers without the class receive the same fields."""

@@ -321,6 +321,7 @@ def test_recording_has_a_schema_per_firmware(
         assert len(read) == (1 if vehicle == "C" else 2 if distinct else 4)
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_replay_uses_the_definition_of_each_message(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
@@ -368,6 +369,7 @@ with nedbus.connect(sys.argv[1]) as bus:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_service_with_several_firmware_builds_replies_with_each_definition(
     tmp_path: Path, run_nedbus: Start, start: Start, endpoint: str

@@ -25,6 +25,7 @@ from tests.waits import DEADLINE, wait_for, wait_for_matching
 COUNT = 500
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize("form", ["models", "rows", "batches"])
 def test_message_with_queried_definition_is_read_completely(
@@ -137,6 +138,7 @@ def read_once(endpoint: str, topic: str, form: str) -> int:
             return int(subscription.receive_batch(DEADLINE).messages["timestamp"][0])
 
 
+@pytest.mark.slow
 def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
     """Closing a bus frees the definitions that it looked up for `latest`, models or batches."""
     definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
@@ -175,6 +177,7 @@ def test_encoding_without_name_and_hash_is_invalid(
     assert "the encoding 'text/plain' has no message name and hash" in caplog.text
 
 
+@pytest.mark.slow
 def test_definitions_of_many_topics_are_queried_together(
     client: nedbus.Bus, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:

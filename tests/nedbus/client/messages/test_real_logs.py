@@ -109,6 +109,7 @@ def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArra
 TEXTS = "log_message"
 
 
+@pytest.mark.slow
 @each_flight
 def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
     """`nedbus.read` returns all topics of a log bit for bit."""
@@ -194,6 +195,7 @@ def test_utc_is_derived_from_a_log(flight: Path) -> None:
     assert found is None or found.spread_us < 1_000_000
 
 
+@pytest.mark.slow
 @each_flight
 def test_aligned_table_has_all_topics(flight: Path) -> None:
     """Each row of an aligned table has the latest values of all topics at the time of a position."""
@@ -221,6 +223,7 @@ def test_aligned_table_has_all_topics(flight: Path) -> None:
     assert compared > len(raw)
 
 
+@pytest.mark.slow
 def test_plot_of_topic_without_track_fails(tmp_path: Path) -> None:
     """`nedbus plot` of a topic other than a position is a usage error that names the topic."""
     plot = run_command(

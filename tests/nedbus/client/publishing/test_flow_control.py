@@ -48,6 +48,7 @@ def test_publisher_without_readers_never_waits(
     assert session.now == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_publisher_sends_no_requests_until_its_key_has_a_subscriber(
     session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
@@ -93,6 +94,7 @@ def test_fast_reader_does_not_delay_the_publisher(
     assert {(each["publisher"], each["read"]) for each in session.requests} == {("p:1", "1")}
 
 
+@pytest.mark.slow
 def test_stuck_reader_gets_a_window_and_a_trickle(
     session: FakeSession, control: FlowControl
 ) -> None:
@@ -169,6 +171,7 @@ def test_request_dropped_by_a_full_queue_is_repeated(
     assert session.longest_pause() < pause
 
 
+@pytest.mark.slow
 def test_reader_that_resumes_gets_all_messages(session: FakeSession, control: FlowControl) -> None:
     """A reader that resumes after eight minutes gets all messages, and no longer delays the publisher."""
     reader = Reader("stuck", rate=0.0)

@@ -247,6 +247,7 @@ def test_closing_hands_over_what_is_held_back(
         assert receive_timestamps(subscription, 30) == list(range(1, 31))
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_zenoh_repeats_no_message(
     bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:

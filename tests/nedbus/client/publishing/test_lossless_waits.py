@@ -70,6 +70,7 @@ async def waiting_publishers(
             await task
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stuck")
 def test_waiting_publishers_do_not_delay_queries(endpoint: str) -> None:
     """`latest` and a subscription work while 40 publishers wait for a reader, more than there are threads for queries.
@@ -195,6 +196,7 @@ def test_ctrl_c_during_close_ends_the_wait(
         assert (publisher.closed, bus.closed) == (True, whole_bus)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stuck")
 def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """One Ctrl-C ends a script in which six publishers wait for a reader."""
@@ -253,6 +255,7 @@ def test_exception_skips_the_wait_for_readers(
     assert bool(flushed) is not fails
 
 
+@pytest.mark.slow
 def test_lossless_publisher_loses_nothing_during_a_router_restart() -> None:
     """Without a router, a lossless publisher sends no more than its history cache holds; no message is lost."""
     endpoint, count = free_endpoint(), CACHE + 1000

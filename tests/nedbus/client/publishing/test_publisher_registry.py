@@ -49,6 +49,7 @@ def come_and_go(registry: PublisherRegistry, vehicle: str) -> list[weakref.ref[o
     return [weakref.ref(each) for each in used]
 
 
+@pytest.mark.slow
 def test_departed_vehicle_leaves_no_objects(registry: PublisherRegistry) -> None:
     """After the last publisher of a vehicle has closed, the registry keeps the definitions of its messages only."""
     references = [each for number in range(5) for each in come_and_go(registry, f"v{number}")]
@@ -67,6 +68,7 @@ def test_departed_vehicle_leaves_no_objects(registry: PublisherRegistry) -> None
     assert len(registry._definitions) == len(TOPICS)
 
 
+@pytest.mark.slow
 def test_departed_vehicle_leaves_no_keys_in_router(registry: PublisherRegistry) -> None:
     """An embedded router without links frees all keys of a vehicle, also those of its liveliness subscription.
 

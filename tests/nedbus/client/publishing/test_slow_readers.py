@@ -77,6 +77,7 @@ def publish_all(
     return publisher, thread
 
 
+@pytest.mark.slow
 def test_stuck_reader_slows_down_a_replay_without_losses(
     stuck: nedbus.Subscription[Any], reader: nedbus.Subscription[Any], bus: nedbus.Bus
 ) -> None:
@@ -182,6 +183,7 @@ def test_messages_of_publishers_started_during_an_outage_are_recovered(
     router.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_replay_continues_after_a_reader_is_killed(
     start: Start,

@@ -89,6 +89,7 @@ def test_requests_of_publishers_are_independent(reader: AcknowledgingReader) -> 
     assert reader.put(raw(0, key=OTHER_KEY), raw(1, key=OTHER_KEY)) == ["b"]
 
 
+@pytest.mark.slow
 def test_number_of_open_requests_is_bounded(reader: AcknowledgingReader) -> None:
     """Beyond the limit, the oldest acknowledgement requests are discarded; publishers repeat them."""
     reader.put(raw(0))

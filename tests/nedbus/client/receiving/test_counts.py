@@ -79,6 +79,7 @@ def test_mode_latest_keeps_samples_of_quiet_vehicles(
     assert (counts.received, counts.invalid) == (3, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", BOTH)
 def test_unread_subscription_does_not_delay_other_readers(
     client: nedbus.Bus,
@@ -133,6 +134,7 @@ def test_missing_messages_are_counted_exactly(
         assert lost + counts.dropped == missing == total - received > 0
 
 
+@pytest.mark.slow
 def test_two_publishers_of_one_key_lose_nothing(
     client: nedbus.Bus, bus: nedbus.Bus, endpoint: str
 ) -> None:
@@ -196,6 +198,7 @@ def test_invalid_samples_do_not_end_an_iteration(
     assert any("garbage" in text or "not a single msgpack value" in text for text in warned)
 
 
+@pytest.mark.slow
 def test_long_invalid_keys_are_not_kept(
     bus: nedbus.Bus,
     zenoh_session: Session,

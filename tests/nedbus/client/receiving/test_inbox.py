@@ -305,6 +305,7 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(
     assert len(caplog.messages) == 2
 
 
+@pytest.mark.slow
 def test_number_of_tracked_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader keeps the state of at most 10,000 keys, here 10; messages on additional keys still arrive."""
     monkeypatch.setattr("nedbus.limits.KEYS", 10)
@@ -378,6 +379,7 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
     assert len(inbox.gaps.requesting) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
     """While 2,000 vehicles come and go, eight at a time, only the state of those of the last ten minutes is kept.

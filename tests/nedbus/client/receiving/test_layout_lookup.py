@@ -32,6 +32,7 @@ def only(known: Schemas, _: Collection[SchemaId]) -> Schemas:
     return known
 
 
+@pytest.mark.slow
 def test_failed_lookups_back_off() -> None:
     """A failed lookup of a definition is repeated after growing intervals, because its publisher may start later."""
     now, queried = 0.0, list[tuple[float, SchemaId]]()
@@ -184,6 +185,7 @@ def test_wait_for_an_unanswered_lookup_uses_up_the_budget(timings: Timings) -> N
     lookup.close()
 
 
+@pytest.mark.slow
 def test_memory_for_definitions_is_bounded(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -133,6 +133,7 @@ def downsampled_streams(zenoh_session: Session) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 def test_downsampled_streams_are_declared_only_while_they_have_readers(
     bus: nedbus.Bus, zenoh_session: Session, clock: Clock
 ) -> None:
@@ -232,6 +233,7 @@ def publish_across_outage(
     return taken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "seconds"), [("every", 10), ("every", 40), ("latest", 10)])
 def test_losses_in_an_outage_of_up_to_20_s_are_recovered(
     endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, seconds: int
@@ -262,6 +264,7 @@ def test_losses_in_an_outage_of_up_to_20_s_are_recovered(
         assert lost == 0 if seconds == 10 else lost > 0
 
 
+@pytest.mark.slow
 def test_lossless_publisher_does_not_wait_for_downsampling_reader(
     endpoint: str, bus: nedbus.Bus
 ) -> None:
@@ -308,6 +311,7 @@ def test_slow_link_carries_only_the_requested_rate(
             assert subscription.counts == nedbus.Counts(received=1 + 50)
 
 
+@pytest.mark.slow
 def test_stream_that_is_not_downsampled_is_logged_once(
     endpoint: str,
     bus: nedbus.Bus,
@@ -379,6 +383,7 @@ def test_vehicle_with_too_many_tokens_hides_no_stream_without_downsampling(
     assert f"no downsampled messages of nedbus/8/{VLP} arrive" in caplog.text
 
 
+@pytest.mark.slow
 def test_echo_prints_downsampled_messages(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock
 ) -> None:

@@ -792,6 +792,7 @@ class TestRecordedSessions:
         ("streaming", None),
     ]
 
+    @pytest.mark.slow
     def test_acknowledgements_match_recorded_client(self) -> None:
         """The acknowledgements equal the recording's, in order, including late topics and messages after STOP."""
         replay = Replay("flight1", 0, 90, (245, 190))
@@ -800,12 +801,14 @@ class TestRecordedSessions:
         assert replay.states[1:] == [*self.STARTED, ("ended", "stopped_elsewhere")]
         assert replay.client.header_seconds == pytest.approx(1.1, abs=0.01)
 
+    @pytest.mark.slow
     def test_second_start_is_rejected_and_foreign_stop_is_detected(self) -> None:
         """A second START and one by another client are rejected; then the other client sends STOP."""
         replay = Replay("session", 4.0, 15.0, (245, 190))
         assert replay.states[1:] == [*self.STARTED, ("ended", "stopped_elsewhere")]
         assert replay.acknowledged == replay.recorded
 
+    @pytest.mark.slow
     def test_stream_continues_after_client_pauses_reading(self) -> None:
         """Reading pauses of 5 s and 12 s lose 615 and 3,433 messages, and the stream continues."""
         replay = Replay("session", 26.2, 52.0, (245, 190))
@@ -819,11 +822,13 @@ class TestRecordedSessions:
         assert replay.states[1:] == [("starting", None), ("header", None), ("ended", "stalled")]
         assert replay.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
+    @pytest.mark.slow
     def test_unacknowledged_late_topic_ends_stream_in_flight(self) -> None:
         """The recorded client stopped acknowledging: the stream ends silently, and does not restart in flight."""
         replay = Replay("session", 70.0, 82.9, (247, 190))
         assert replay.states[1:] == [*self.STARTED, ("ended", "silent")]
 
+    @pytest.mark.slow
     def test_restarted_vehicle_begins_new_stream(self) -> None:
         """After the vehicle restarts, time_boot_ms is near 0 again, and a new header follows START."""
         replay = Replay("session", 95.0, 110.5, (247, 190))

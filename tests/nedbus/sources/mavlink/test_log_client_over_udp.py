@@ -143,6 +143,7 @@ class Link:
         return []
 
 
+@pytest.mark.slow
 def test_recorded_stream_arrives_completely() -> None:
     """At full speed all bytes of the recording arrive; only the 11 messages missing in the recording count as lost."""
     with Link("armed").play("default_topics", speed=None) as link:
@@ -174,12 +175,14 @@ def test_loss_count_equals_dropped_and_late_messages(impairment: dict[str, float
     assert link.peer.dropped + link.peer.late > 0
 
 
+@pytest.mark.slow
 def test_denied_start_is_reported() -> None:
     """A START that PX4 denies because the link is too slow is reported as a lack of bandwidth."""
     with Link().play("default_topics", refusal=dialect.MAV_RESULT_DENIED) as link:
         link.expect_states(("starting", None), ("refused", "bandwidth"))
 
 
+@pytest.mark.slow
 def test_stream_of_another_client_is_rejected() -> None:
     """Another client's data is rejected even if it arrives on the same link."""
     with Link().play("default_topics", owner=OTHERS, is_owner_on_link=True) as link:

@@ -390,6 +390,7 @@ class TestRecordings:
 
     pytestmark = needs_recordings
 
+    @pytest.mark.slow
     def test_stream_equals_log_of_vehicle(
         self, name: str, messages: int, lost: int, common: int
     ) -> None:
@@ -414,6 +415,7 @@ class TestImpairedLink:
 
     pytestmark = needs_recordings
 
+    @pytest.mark.slow
     def test_every_complete_record_is_delivered(
         self, loss: float, burst: int, reorder: float
     ) -> None:

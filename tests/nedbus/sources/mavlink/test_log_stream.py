@@ -152,6 +152,7 @@ def sent_messages() -> list[tuple[str, str]]:
     ]
 
 
+@pytest.mark.slow
 def test_stream_is_published_in_full() -> None:
     """All messages of all topics that a real PX4 (SITL) sent are published in order, with all of their fields."""
     received, sent = Received("log=1"), sent_messages()
@@ -166,6 +167,7 @@ def test_stream_is_published_in_full() -> None:
     assert status.header_time is not None
 
 
+@pytest.mark.slow
 def test_losses_of_link_are_reported_with_stream() -> None:
     """MAVLink messages that are lost while all topics come from the stream are reported with its messages."""
     recording, camera = read_recording(SHORT), dialect.MAVLink(None, 1, dialect.MAV_COMP_ID_CAMERA)
@@ -183,6 +185,7 @@ def test_losses_of_link_are_reported_with_stream() -> None:
     assert sum(each.lost for each in received.messages) == len(middle)
 
 
+@pytest.mark.slow
 def test_failing_sensor_does_not_end_stream() -> None:
     """A sensor that repeats the time of its last sample is not taken for a reboot, which would end the stream."""
     recording, mav = read_recording(SHORT), dialect.MAVLink(None, 1, 1)
@@ -398,6 +401,7 @@ def test_rate_is_measured_since_the_last_window(tmp_path: Path) -> None:
     assert found == [(10_000, 10_000.0), (20_000, 10_000.0), (25_000, 7_500.0), (25_000, 0.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("peer", "reason"), [
     ({"refusal": 1}, "another client already receives it"), ({"refusal": 2}, "5000 B/s"),
 ])  # fmt: skip
@@ -409,6 +413,7 @@ def test_rejected_stream_reports_reason(peer: dict[str, Any], reason: str) -> No
     assert any(reason in each for each in received.reasons), received.reasons
 
 
+@pytest.mark.slow
 def test_unreadable_stream_is_stopped_with_reason() -> None:
     """A stream with an unknown incompatible flag is stopped once; the status names the flag."""
     recording = read_recording(SHORT)
@@ -489,6 +494,7 @@ HOSTILE: Final = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_hostile_vehicle_does_not_affect_others() -> None:
     """A vehicle that sends invalid streams is rejected and reported; the stream of another vehicle is complete."""
     rng, mav, sent = random.Random(5), dialect.MAVLink(None, 66, 1), Counter[str]()

@@ -96,6 +96,7 @@ def position(ms: int) -> Any:
     return dialect.MAVLink_local_position_ned_message(ms, *range(6))
 
 
+@pytest.mark.slow
 def test_reads_that_end_within_a_message_lose_nothing(autopilot: Autopilot) -> None:
     """If no read of a stream ends with a message, all messages arrive, and the parsed ones are freed."""
     file_part = dialect.MAVLink_file_transfer_protocol_message(0, 245, 191, [1] * 251)
@@ -119,6 +120,7 @@ def test_reads_that_end_within_a_message_lose_nothing(autopilot: Autopilot) -> N
     assert peak < len(data) / 2
 
 
+@pytest.mark.slow
 def test_source_that_was_blocked_continues_with_the_newest_messages(
     monkeypatch: pytest.MonkeyPatch, autopilot: Autopilot
 ) -> None:
@@ -234,6 +236,7 @@ def test_peer_is_replaced_when_it_is_silent_or_outnumbered() -> None:
     assert outnumbered.peer == "vehicle"
 
 
+@pytest.mark.slow
 def test_stranger_with_the_id_of_a_vehicle_changes_nothing_but_a_remark() -> None:
     """Requests go on to the vehicle, the stranger's heartbeat does not arm it, and `info` names the second address."""
     port = free_port()
@@ -288,6 +291,7 @@ class UdpAutopilot:
         self._socket.close()
 
 
+@pytest.mark.slow
 def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopilot) -> None:
     """After messages that arrived late, the vehicle has rebooted if its times are a second below the newest one.
 

@@ -152,6 +152,7 @@ def test_gps_time_comes_from_system_time() -> None:
     assert max(origins) - min(origins) < 2_000_000  # simulated time drifts from the host's clock
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}"
 )

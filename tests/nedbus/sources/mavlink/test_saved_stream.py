@@ -96,6 +96,7 @@ def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
     assert not saved.file_corruption
 
 
+@pytest.mark.slow
 def test_full_disk_leaves_complete_records(start: Start, tmp_path: Path) -> None:
     """A write of which only a part fits on the disk raises, and its part is removed."""
     log, expected = small_log(), LogFile(tmp_path / "expected", "1")
@@ -357,6 +358,7 @@ class TestFilesOfStream:
         assert "was deleted" in caplog.text
 
 
+@pytest.mark.slow
 def test_topics_of_repeated_headers_are_not_kept(tmp_path: Path) -> None:
     """The addresses of a stream are bounded by its subscriptions; a new header discards those of the last one."""
     stream, *_ = stream_with_files(tmp_path)

@@ -129,6 +129,7 @@ def estimates(number: int) -> list[dict[str, float]]:
     ]
 
 
+@pytest.mark.slow
 def test_validity_without_estimator_status_is_unknown(
     run_nedbus: Start, bus: nedbus.Bus, port: int, endpoint: str
 ) -> None:
@@ -180,6 +181,7 @@ def test_validity_without_estimator_status_is_unknown(
         sending.result(DEADLINE)
 
 
+@pytest.mark.slow
 def test_positions_of_flight_reach_readers(
     run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int
 ) -> None:
@@ -330,6 +332,7 @@ HIGH_LATENCY = dialect.MAVLink_high_latency2_message(
 )
 
 
+@pytest.mark.slow
 def test_nothing_is_sent_over_a_satellite_link(timings: Timings, port: int) -> None:
     """To a vehicle that sends only HIGH_LATENCY2 nothing is sent, with log=1 as well; its kind of link is a remark."""
     timings.source_tick = 0.01

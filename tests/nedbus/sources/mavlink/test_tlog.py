@@ -206,6 +206,7 @@ def write_messages(path: Path, messages: Iterable[tuple[int, Any]]) -> None:
             sender.seq = (sender.seq + 1) % 256
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("is_wrapped", [False, True])
 def test_flight_over_the_antimeridian_has_no_event(

@@ -782,6 +782,7 @@ def test_statustext_chunks_are_joined() -> None:
     assert [text for *_, text in texts_of([(0.0, chunk(b"c" * 50, 3))])] == ["c" * 50 + "..."]
 
 
+@pytest.mark.slow
 def test_flood_of_statustexts_is_limited() -> None:
     """If 10,000 texts arrive within a second, 100 are published and the rest are rejected."""
     vehicle = new_vehicle("log_message")

@@ -197,6 +197,7 @@ def test_number_of_keys_is_limited(
     streams.on_message(str(key(domain=3)), 0.0)
 
 
+@pytest.mark.slow
 def test_silent_keys_without_publisher_are_removed(streams: StreamRegistry) -> None:
     """A key without a publisher is removed after a minute of silence, so vehicles that left use no memory."""
     token = px4("a")

@@ -146,6 +146,7 @@ def times(messages: Iterable[SourceMessage]) -> list[object]:
     return [each.fields["timestamp"] for each in messages]
 
 
+@pytest.mark.slow
 def test_message_of_px4_reaches_readers(
     serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription
 ) -> None:
@@ -264,6 +265,7 @@ def test_key_without_type_hash_needs_layout(listen: Listen, zenoh_session: Sessi
     assert times(second.receive()) == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("type_hash_of_key", [type_hash("1.16"), NO_HASH])
 @pytest.mark.parametrize("trailer", [b"", 8 * b"\xa5"])
 def test_payloads_of_another_layout_are_explained(
@@ -295,6 +297,7 @@ def test_payloads_of_another_layout_are_explained(
 WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuint8 COUNT = 2\n"
 
 
+@pytest.mark.slow
 def test_user_definition_adds_a_message(
     run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
@@ -503,6 +506,7 @@ def test_invalid_input_is_rejected_and_counted(listener: Listener, zenoh_session
     assert any("update nedbus" in each.reason for each in listener.rejections)
 
 
+@pytest.mark.slow
 def test_invalid_values_are_reported(
     serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription[Any]
 ) -> None:
@@ -534,6 +538,7 @@ def test_two_publishers_of_one_key_are_not_mixed(
     assert times(listener.receive(10)) == list(range(10))
 
 
+@pytest.mark.slow
 def test_long_keys_do_not_break_the_status(
     serve: Callable[[], Process], zenoh_session: Session, bus: nedbus.Bus
 ) -> None:
@@ -591,6 +596,7 @@ def test_ended_source_undeclares_its_subscriber(zenoh_session: Session, endpoint
         wait_for(lambda: not is_read(probe), what="the subscriber to be undeclared")
 
 
+@pytest.mark.slow
 def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
     """If the service is the router, its source uses the router's session, with or without an explicit endpoint."""
     own = free_endpoint()
@@ -610,6 +616,7 @@ def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
         assert len(json.loads(reply.ok.payload.to_bytes())["sessions"]) == 2
 
 
+@pytest.mark.slow
 def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: Path) -> None:
     """The source uses the service's router even with a configuration file, or connected to a router that is down."""
     own, down = free_endpoint(), free_endpoint()
@@ -628,6 +635,7 @@ def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: P
         service.kill()
 
 
+@pytest.mark.slow
 def test_unreachable_router_is_retried(run_nedbus: Start) -> None:
     """A router that does not answer is logged and retried, while other sources continue."""
     endpoint, other = free_endpoint(), free_endpoint()
@@ -669,6 +677,7 @@ def test_stale_vehicle_is_not_listed(
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
 
 
+@pytest.mark.slow
 def test_restarted_ros_2_publisher_is_received_at_once(listener: Listener, peer: Peer) -> None:
     """A node of zenoh-ros2-sdk that is killed and restarted has a new gid: no rejection, and one reboot."""
     messages = flight()
@@ -687,6 +696,7 @@ def test_restarted_ros_2_publisher_is_received_at_once(listener: Listener, peer:
     assert (sum(each.lost for each in received), listener.rejections) == (0, [])
 
 
+@pytest.mark.slow
 def test_ros_2_lists_source_as_subscriber(
     listener: Listener, peer: Peer, zenoh_session: Session
 ) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 import nedbus
 from tests.peers.processes import Start
 from tests.waits import wait_for
@@ -14,6 +16,7 @@ from .test_position_sender import Setup
 EXAMPLE = Path(__file__).parents[5] / "examples" / "mocap.py"
 
 
+@pytest.mark.slow
 def test_positions_of_the_example_are_fused(start: Start) -> None:
     """PX4 fuses position, height and yaw of examples/mocap.py, which has no velocity."""
     setup = Setup(start)

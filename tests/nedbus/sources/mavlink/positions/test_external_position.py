@@ -224,6 +224,7 @@ def test_rate_is_at_most_50_per_second() -> None:
     assert core.sent + core.left_out["rate"] == 400
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(-0.004, 0.004), min_size=100, max_size=100))
 def test_jitter_costs_no_message(jitter: list[float]) -> None:
     """At 50 Hz all positions are sent, although they arrive up to 4 ms early or late."""

@@ -38,6 +38,7 @@ def put_positions(session: Session, quality: int, count: int = 1) -> None:
         session.put(KEY, ENCODE(position), congestion_control=zenoh.CongestionControl.BLOCK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_router", [True, False], ids=["own router", "client of a router"])
 def test_only_the_named_sender_may_send_a_position(
     start: Start, pki: Path, tmp_path: Path, is_router: bool

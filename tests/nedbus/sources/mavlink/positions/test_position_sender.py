@@ -111,6 +111,7 @@ def bus(setup: Setup) -> Iterator[nedbus.Bus]:
         yield bus
 
 
+@pytest.mark.slow
 def test_position_of_a_script_is_fused(setup: Setup, bus: nedbus.Bus) -> None:
     """PX4 fuses all quantities of the positions of a script, from component 197 of the vehicle, each counted."""
     with Px4OnLink(setup.port) as px4, Script(bus) as script:
@@ -132,6 +133,7 @@ def test_position_of_a_script_is_fused(setup: Setup, bus: nedbus.Bus) -> None:
     assert px4.count() <= len(script.sent)
 
 
+@pytest.mark.slow
 def test_start_of_the_service_names_what_is_sent(setup: Setup) -> None:
     """The start says in one line which positions are sent, over which link, and whose clock stamps them."""
     line = f"udpin:127.0.0.1:{setup.port}: positions of mocap/{TOPIC} are sent into the vehicle; PX4 stamps them"
@@ -139,6 +141,7 @@ def test_start_of_the_service_names_what_is_sent(setup: Setup) -> None:
     assert setup.service.err.count("are sent into the vehicle") == 1
 
 
+@pytest.mark.slow
 def test_without_the_option_nothing_is_sent(start: Start) -> None:
     """By default a source only reads: a position on the bus is not sent."""
     setup = Setup.__new__(Setup)
@@ -157,6 +160,7 @@ def test_without_the_option_nothing_is_sent(start: Start) -> None:
         assert source_status(bus).positions == ()
 
 
+@pytest.mark.slow
 def test_timesync_is_answered_on_request(start: Start) -> None:
     """With position_clock=timesync PX4 uses time_usec after 500 answers, and fuses the positions as before."""
     setup = Setup(start, position_clock="timesync")
@@ -207,6 +211,7 @@ def test_timesync_over_dds_is_no_clock_of_the_link(protocol: int, is_warned: boo
     assert bool(sender.status().warnings) == is_warned
 
 
+@pytest.mark.slow
 def test_wrong_positions_are_counted_and_not_sent(setup: Setup, bus: nedbus.Bus) -> None:
     """Each wrong position is refused with its reason, and the right ones among them are sent."""
 
@@ -223,6 +228,7 @@ def test_wrong_positions_are_counted_and_not_sent(setup: Setup, bus: nedbus.Bus)
         assert reason.startswith("pose_frame is 0: set it to POSE_FRAME_NED")
 
 
+@pytest.mark.slow
 def test_undecodable_position_is_counted_and_not_sent(setup: Setup, bus: nedbus.Bus) -> None:
     """A payload that is no position is left out as invalid, with the reason, and the positions around it are sent."""
     key = Address("mocap", TOPIC).key()
@@ -245,6 +251,7 @@ def test_undecodable_position_is_counted_and_not_sent(setup: Setup, bus: nedbus.
         wait_for(lambda: px4.count() > before, what="further positions")
 
 
+@pytest.mark.slow
 def test_second_script_is_refused(setup: Setup, bus: nedbus.Bus) -> None:
     """While a script sends, another session with the same address is refused with the name of the first."""
     with (
@@ -262,6 +269,7 @@ def test_second_script_is_refused(setup: Setup, bus: nedbus.Bus) -> None:
         assert {message.quality for _, message in px4.messages} == {1}
 
 
+@pytest.mark.slow
 def test_end_of_the_script_ends_sending(setup: Setup, bus: nedbus.Bus) -> None:
     """Nothing is sent after the last position of a script, and a new script continues with its own counter."""
     with Px4OnLink(setup.port) as px4:
@@ -278,6 +286,7 @@ def test_end_of_the_script_ends_sending(setup: Setup, bus: nedbus.Bus) -> None:
         assert px4.messages[-1][1].reset_counter == 8
 
 
+@pytest.mark.slow
 def test_restart_of_the_service_continues(setup: Setup, bus: nedbus.Bus) -> None:
     """A restarted service sends again, with the reset counter of the script."""
     with Px4OnLink(setup.port) as px4, Script(bus):
@@ -299,6 +308,7 @@ def test_several_vehicles_on_a_link_get_none() -> None:
     )
 
 
+@pytest.mark.slow
 def test_own_name_of_the_vehicle_is_refused(start: Start) -> None:
     """Under the vehicle's own name, its echo would be sent back."""
     setup = Setup(start, vehicles="1:mocap")

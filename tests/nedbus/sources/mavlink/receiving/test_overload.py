@@ -93,6 +93,7 @@ class Px4:
                         sequence, start = 1, time.monotonic()
 
 
+@pytest.mark.slow
 def test_delay_includes_the_time_that_messages_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +148,7 @@ def test_delay_includes_the_time_that_messages_wait(
     assert least - tolerance <= delay <= most + tolerance
 
 
+@pytest.mark.slow
 def test_datagrams_that_the_system_drops_are_counted() -> None:
     """Datagrams that do not fit into the receive buffer are counted, and others have their time of arrival."""
     port = free_port()

@@ -132,6 +132,7 @@ def test_autopilot_is_used_before_its_first_heartbeat() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_router_with_component_1_is_not_requested() -> None:
     """A router that sends a companion's heartbeat with component 1 is no vehicle, and receives no request."""
     port = free_port()
