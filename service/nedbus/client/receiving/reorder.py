@@ -56,9 +56,9 @@ class Reorder:
         now = self._clock()
         has_runs = len(batch) >= _LONG_RUN
         delivered: list[Arrival] = []
-        run: list[Arrival] = []
-        writer: WriterProxy | None = None  # of the run
-        expected = 0  # number after the run
+        writer: WriterProxy | None = None  # of the last message, if that was the expected one
+        expected = 0  # the next number of this writer
+        run: list[Arrival] = []  # messages after the last one, with the next numbers
         for raw in batch:
             stream = known(str(raw.key_expr))
             payload = raw.payload.to_bytes()
@@ -76,7 +76,9 @@ class Reorder:
                         expected = (expected + 1) % NUMBERS
                         continue
             if writer is not None:
-                delivered += self._end_run(writer, run, now, overflowed)
+                if run:
+                    delivered += self._end_run(writer, run, now, overflowed)
+                    run = []
                 writer = None
             if arrival is None:
                 continue
@@ -86,13 +88,11 @@ class Reorder:
                 continue
             arrival.stream.last_active = now
             expected = (expecting.expected + 1) % NUMBERS
+            expecting.expected = expected
+            delivered.append(arrival)
             if has_runs:
                 writer = expecting
-                run = [arrival]
-            else:
-                expecting.expected = expected
-                delivered.append(arrival)
-        if writer is not None:
+        if run and writer is not None:
             delivered += self._end_run(writer, run, now, overflowed)
         if self.gaps.held > limits.HELD_MESSAGES:
             delivered += self.give_up(limits.HELD_MESSAGES)
@@ -155,12 +155,12 @@ class Reorder:
     ) -> list[Arrival]:
         """Return the messages of a run; if the sender of one differs, accept them one by one.
 
-        The first sender is known; of a long run, only the last one is compared as well.
+        The sender of the message before them is known; of a long run, only the last one is compared as well.
         """
         if len(run) >= _LONG_RUN:
             compared = run[-1:]
         else:
-            compared = run[1:]
+            compared = run
         if all(writer.is_sender(arrival.raw.source_info) for arrival in compared):
             writer.expected = (writer.expected + len(run)) % NUMBERS
             return run

@@ -116,6 +116,37 @@ def test_number_from_another_publisher_does_not_continue_a_sequence(
     assert requested == {**missed_by_a, name_of("b"): range(1, stop)}
 
 
+def test_messages_of_several_keys_in_a_batch_keep_their_order() -> None:
+    """Consecutive messages of one key among those of others are read once each, in order of arrival."""
+    inbox = make_queue("every")
+    inbox.put([raw(0), raw(0, key=OTHER_KEY, publisher="b")])
+    drain(inbox)
+    batch = [
+        *(raw(number, timestamp=number) for number in (1, 2, 3)),
+        raw(1, key=OTHER_KEY, publisher="b", timestamp=11),
+        *(raw(number, timestamp=number) for number in (4, 5)),
+        *(raw(number, key=OTHER_KEY, publisher="b", timestamp=10 + number) for number in (2, 3, 4)),
+        raw(6, timestamp=6),
+    ]
+    inbox.put(batch)
+    assert timestamps(inbox) == [1, 2, 3, 11, 4, 5, 12, 13, 14, 6]
+    inbox.put([raw(7, timestamp=7), raw(5, key=OTHER_KEY, publisher="b", timestamp=15)])
+    assert timestamps(inbox) == [7, 15]
+    assert inbox.counts == Counts(received=14)
+
+
+def test_number_from_another_publisher_among_other_keys_does_not_continue_a_sequence() -> None:
+    """A message of publisher c between two of publisher a leaves the gap of a open, also beside those of other keys."""
+    inbox = make_queue("every")
+    inbox.put([raw(0), raw(0, publisher="c"), raw(0, key=OTHER_KEY, publisher="b"), raw(1)])
+    others = [raw(number, key=OTHER_KEY, publisher="b") for number in range(1, 8)]
+    inbox.put([raw(2), raw(3, publisher="c"), *others, raw(4)])
+    requested = {
+        writer.name: inbox.next_request(writer, 0.0) for writer in [*inbox.gaps.requesting]
+    }
+    assert requested == {name_of("a"): range(3, 4), name_of("c"): range(1, 3)}
+
+
 def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the limit of messages held back, here 10, the gap with the most messages behind it counts as lost."""
     monkeypatch.setattr("nedbus.limits.HELD_MESSAGES", 10)
