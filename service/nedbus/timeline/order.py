@@ -77,7 +77,8 @@ class Order(Generic[M]):
         waiting: list[_Waiting[M]] = []
         opening: list[Item[M]] = []
         tracks = self._tracks
-        current: Track[M] | None = None  # of the last message with a place
+        usual: Track[M] | None = None  # of the last message, if that was usual
+        shift = 0  # of the recorder's clock, as of the last usual message
         has_log_times = self._has_log_times
         for number, message in enumerate(messages):
             stream = message.logged
@@ -105,13 +106,15 @@ class Order(Generic[M]):
                 if has_log_times:
                     track.lag = log - stamp
                 waiting.append((track.base + stamp, number, message))
-                current = track
+                usual = track
             else:
-                shift = 0 if current is None else current.shift
+                if usual is not None:
+                    shift = usual.shift
+                    usual = (
+                        None  # a log time that has changed counts once the next message confirms it
+                    )
                 item = Item(message, stream, stamp, log if has_log_times else None, number, shift)
                 waiting += self._place(item, opening)
-                if track.is_open:
-                    current = track
             if len(waiting) >= _BUFFER + _PART:
                 waiting.sort()
                 yield from self._emit(waiting[:_PART])

@@ -167,6 +167,22 @@ def test_vehicle_that_appears_later_is_placed_beside_the_others(step: int, every
     assert order.axis.seconds_of("2", 700_000_000) == pytest.approx(expected)
 
 
+def test_damaged_log_time_does_not_place_another_vehicle() -> None:
+    """A single message with a wild log time, just before a vehicle appears, is no step of the recorder's clock."""
+    host = 1_760_000_000_000_000
+    stamps = [1_000_000 + number * STEP for number in range(2000)]
+    messages = [Message(stamp, host + stamp) for stamp in stamps]
+    messages[-1].time += 86_400_000_000
+    late = [
+        Message(stamp, host + stamps[-1] + stamp, Address("2", "vehicle_local_position"))
+        for stamp in range(STEP, 5_000_000, STEP)
+    ]
+    order = Order[Message]()
+    list(order.arrange([*messages, *late]))
+    expected = (stamps[-1] + STEP - stamps[0]) / 1e6
+    assert order.axis.seconds_of("2", STEP) == pytest.approx(expected)
+
+
 def test_pace_alone_shortens_pauses() -> None:
     """A pause of up to a minute is kept; a longer one takes no time, and is counted."""
     pace = Pace(speed=2.0)
