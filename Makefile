@@ -46,7 +46,7 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from other hosts
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## run the tests without routers or processes: under a minute on two idle cores
+quick: $(DEV)  ## run the tests without routers or processes: a minute and a half on two idle cores
 	$(BIN)/pytest -q -n 2 -m "quick or not (slow or long or router or process or compose)" --junitxml=build/tests.xml
 
 test: check behaviour  ## run `make check` and the tests of behaviour that take less than a second: 150 s on two idle cores

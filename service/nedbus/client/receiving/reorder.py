@@ -14,7 +14,7 @@ from .arrival import NO_LAYOUTS, Arrival, DetachedSample, Stream, detach
 from .streams import Streams
 from .writer_proxy import NUMBERS, Gaps, LossCounters, WriterProxy
 
-# messages in order on one key, of which only the first and the last sender are compared
+# messages in order on one key, of which only the last sender is compared
 _LONG_RUN: Final = 8
 # s after a link change; a new publisher may have sent messages during the outage
 _SETTLING: Final = 10.0
