@@ -43,7 +43,7 @@ class AsyncSubscription(SubscriptionBase[M_co]):
 
     async def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it; `timeout` and errors as in `Subscription.receive`."""
-        return await self._next(self._inbox.pop, timeout)
+        return await self._next(self._pop_sample, timeout)
 
     async def receive_batch(
         self, timeout: float | None = None, *, max_messages: int | None = None
@@ -79,7 +79,7 @@ class AsyncSubscription(SubscriptionBase[M_co]):
 
     async def __anext__(self) -> Sample[M_co]:
         try:
-            return await self._next(self._inbox.pop)
+            return await self._next(self._pop_sample)
         except ClosedError:
             raise StopAsyncIteration from None
 

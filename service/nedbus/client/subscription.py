@@ -33,7 +33,9 @@ class SubscriptionBase(Generic[M_co]):
     def __init__(self, inbox: Inbox) -> None:
         self.name = inbox.name
         self._inbox = inbox
-        self._pop_row = partial(inbox.pop, rows=True)
+        # By position: a partial with keywords takes 0.3 us more for each message.
+        self._pop_sample = partial(inbox.pop, False)
+        self._pop_row = partial(inbox.pop, True)
 
     @property
     def closed(self) -> bool:
@@ -52,7 +54,7 @@ class SubscriptionBase(Generic[M_co]):
 
     def _pop_batch(self, max_messages: int | None) -> Pop[Batch]:
         check_count("max_messages", max_messages)
-        return partial(self._inbox.pop_batch, max_messages=max_messages)
+        return partial(self._inbox.pop_batch, max_messages)
 
 
 class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[M_co]"]):
@@ -74,7 +76,7 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
         Raises NoDataError if none arrives within `timeout` seconds, ClosedError if the subscription is closed,
         ReceiveError if it has failed.
         """
-        return self._next(self._inbox.pop, timeout)
+        return self._next(self._pop_sample, timeout)
 
     def receive_batch(
         self, timeout: float | None = None, *, max_messages: int | None = None
@@ -113,7 +115,7 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
 
     def __next__(self) -> Sample[M_co]:
         try:
-            return self._next(self._inbox.pop)
+            return self._next(self._pop_sample)
         except ClosedError:
             raise StopIteration from None
 

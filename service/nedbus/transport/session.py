@@ -36,23 +36,6 @@ COMMON_SETTINGS: Final = {
     "transport/shared_memory/enabled": False,
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
-    # Channels for heartbeats (4 bytes) and rejection reports count messages, not bytes: larger ones are not received.
-    "low_pass_filter": [
-        {
-            "id": "heartbeat-size",
-            "flows": ["ingress"],
-            "messages": ["put", "delete"],
-            "key_exprs": ["**/@adv/**"],
-            "size_limit": 64,
-        },
-        {
-            "id": "report-size",
-            "flows": ["ingress"],
-            "messages": ["put", "delete"],
-            "key_exprs": ["**/@rejected/**"],
-            "size_limit": 16384,
-        },
-    ],
 }
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # backoff between the first attempts to connect [s]

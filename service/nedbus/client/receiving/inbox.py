@@ -292,7 +292,7 @@ class Inbox:
             self.wake()  # pass it on: `put` wakes a single thread per batch
         return True
 
-    def pop(self, arrival: Arrival | None = None, *, rows: bool = False) -> Sample[Any] | None:
+    def pop(self, rows: bool = False, arrival: Arrival | None = None) -> Sample[Any] | None:
         """Return the next sample, None if there is none; invalid ones are counted and skipped.
 
         `arrival`: the message that `take` returned, which is read before the queue.
@@ -319,7 +319,7 @@ class Inbox:
             arrival = None
 
     def pop_batch(
-        self, arrival: Arrival | None = None, *, max_messages: int | None = None
+        self, max_messages: int | None = None, arrival: Arrival | None = None
     ) -> Batch | None:
         """Return unread messages of one type, up to `max_messages`; None if there are none. `arrival`: as in `pop`."""
         while True:
