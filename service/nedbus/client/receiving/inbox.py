@@ -11,7 +11,7 @@ import logging
 import queue
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -326,7 +326,7 @@ class Inbox:
             counted = 0
             if arrival is not None:
                 taken = [arrival]
-                losses = Counter({arrival.stream: arrival.lost})
+                losses = {arrival.stream: arrival.lost}
                 counted = 0 if arrival.codec is None else 1  # by `_start_reading`
             else:
                 with self._lock:
@@ -336,7 +336,7 @@ class Inbox:
                     self.acknowledge(drained=False)
                 if not taken:
                     return None
-            batch = _batch_maker()(taken, self.decoder, lost=losses.total())
+            batch = _batch_maker()(taken, self.decoder, lost=sum(losses.values()))
             with self._lock:
                 self._counters.received += len(batch) - counted
                 if len(batch):
@@ -425,12 +425,15 @@ class Inbox:
             _log.warning("%s: %s", self.name, text, extra=about(event))
 
 
-def _take_losses(arrivals: Iterable[Arrival]) -> Counter[Stream]:
-    """Return the unreported losses of each stream of these arrivals, and mark them as reported."""
-    losses = Counter[Stream]()
+def _take_losses(arrivals: Iterable[Arrival]) -> dict[Stream, int]:
+    """Return the unreported losses of the streams of these arrivals that have any, and mark them as reported."""
+    losses: dict[Stream, int] = {}
     for arrival in arrivals:
-        losses[arrival.stream] += arrival.lost + arrival.stream.unreported
-        arrival.stream.unreported = 0
+        stream = arrival.stream
+        lost = arrival.lost + stream.unreported
+        if lost:
+            losses[stream] = losses.get(stream, 0) + lost
+            stream.unreported = 0
     return losses
 
 
