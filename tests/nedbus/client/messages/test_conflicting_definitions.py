@@ -105,7 +105,7 @@ class Reader:
                     )
                 continue
             # `rows()` has no timeout
-            pop = partial(self.subscription._inbox.pop, rows=self.form == "rows")
+            pop = partial(self.subscription._inbox.pop, self.form == "rows")
             sample = self.subscription._next(pop, DEADLINE)
             self.read.append((sample.vehicle, as_dict(sample.message)))
 
