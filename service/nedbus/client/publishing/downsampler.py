@@ -21,7 +21,7 @@ from .group import Outgoing
 from .writer import Heartbeats, Writer
 
 # s between checks whether any downsampled stream of a vehicle has subscribers
-_CHECK: Final = 0.005
+_CHECK: Final = 0.02
 # ns for which an unmatched writer is kept, so returning readers can recover messages
 _LINGER: Final = 60_000_000_000
 
@@ -29,7 +29,8 @@ _LINGER: Final = 60_000_000_000
 class MatchingListener:
     """Matching status of a key expression, from a publisher that never publishes. Thread-safe.
 
-    `matched`: the status at the last call of `is_matched`.
+    `matched`: the status at the last call of `is_matched`. `next_check`: monotonic time before which publishers that
+    share an unmatched listener do not ask again [s].
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
@@ -43,6 +44,7 @@ class MatchingListener:
                 self._probe.undeclare()
                 raise
         self.matched = False
+        self.next_check = 0.0
         # all publishers of a vehicle share one listener; reentrant for signal handlers
         self._lock = threading.RLock()
         self._try_recv = self._listener.handler.try_recv
@@ -68,7 +70,8 @@ class Downsampler:
     """Publisher of the downsampled copies of one address; not thread-safe.
 
     `listener`: matched by subscribers of any downsampled stream of the vehicle.
-    `checks_at`: monotonic time before which `put` has nothing to do unless `listener` is known to be matched [s].
+    `is_open`: there were such subscribers. Otherwise `put` has nothing to do before `next_check` of the listener, unless
+    that is known to be matched.
     """
 
     def __init__(
@@ -79,15 +82,15 @@ class Downsampler:
         self._topic = get_topic(address.topic)
         self._address_listener: MatchingListener | None = None
         self._streams: list[_Stream] = []
-        self.checks_at = 0.0
+        self.is_open = False
 
     def put(self, message: Outgoing) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
         if self._address_listener is None:
             if not self.vehicle_listener.is_matched():
-                self.checks_at = monotonic() + _CHECK
+                self.vehicle_listener.next_check = monotonic() + _CHECK
                 return
-            self.checks_at = 0.0
+            self.is_open = True
             self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
         # not the message's timestamp: a replay at 10 times the speed would exceed the rate
         now = time.monotonic_ns()

@@ -240,7 +240,8 @@ class Publisher(AbstractContextManager["Publisher"]):
         try:
             writer.put(messages)
             self.last = messages[-1]
-            if writer.last_put >= downsampler.checks_at or downsampler.vehicle_listener.matched:
+            listener = downsampler.vehicle_listener
+            if downsampler.is_open or listener.matched or writer.last_put >= listener.next_check:
                 for message in messages:
                     downsampler.put(message)
         except zenoh.ZError as exc:
