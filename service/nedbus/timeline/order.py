@@ -7,8 +7,10 @@ a synchronized Unix time is set: these begin a new part of the axis, whose place
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import itemgetter
 from typing import Final, Generic
 
 from nedbus_msgs import Address
@@ -21,7 +23,9 @@ from .track import NEAR, Item, M, Placed, Track
 _OPENING: Final = 1000
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
-_PART: Final = 2048  # messages that are sorted and passed on at once
+_PART: Final = 1024  # messages that are sorted at once, and the least that wait for earlier ones
+# us by which a logger may write a message later than others; up to 2 s in real logs, for topics that it logs rarely
+_LATE: Final = 4_000_000
 
 _Waiting = tuple[int, int, M]
 """Place, number and message: a plain tuple, because tuples sort fastest."""
@@ -80,6 +84,7 @@ class Order(Generic[M]):
         usual: Track[M] | None = None  # of the last message, if that was usual
         shift = 0  # of the recorder's clock, as of the last usual message
         has_log_times = self._has_log_times
+        enough = 2 * _PART
         for number, message in enumerate(messages):
             stream = message.logged
             log = message.time
@@ -115,10 +120,12 @@ class Order(Generic[M]):
                     )
                 item = Item(message, stream, stamp, log if has_log_times else None, number, shift)
                 waiting += self._place(item, opening)
-            if len(waiting) >= _BUFFER + _PART:
+            if len(waiting) >= enough:
                 waiting.sort()
-                yield from self._emit(waiting[:_PART])
-                del waiting[:_PART]
+                ready = self._count_ready(waiting)
+                yield from self._emit(waiting[:ready])
+                del waiting[:ready]
+                enough = len(waiting) + _PART
         waiting += self._end(opening)
         waiting.sort()
         yield from self._emit(waiting)
@@ -150,6 +157,15 @@ class Order(Generic[M]):
         for track in self._tracks.values():
             placed += track.end()
         return _places_of(placed)
+
+    def _count_ready(self, waiting: Sequence[_Waiting[M]]) -> int:
+        """Return how many of these sorted messages no earlier one can follow: in a log, those that are old enough."""
+        beyond = max(0, len(waiting) - _BUFFER)
+        if self._has_log_times:
+            return beyond
+        newest, _, _ = waiting[-1]
+        old = bisect_left(waiting, newest - _LATE, key=itemgetter(0))
+        return max(beyond, min(old, len(waiting) - _PART))
 
     def _emit(self, placed: Iterable[_Waiting[M]]) -> Iterator[M]:
         """Yield sorted messages with their times on the axis; those from before its zero are at 0."""

@@ -127,6 +127,32 @@ def test_log_that_goes_back_by_more_than_a_second_has_a_new_boot(back: int, boot
     assert [each.timestamp for each in found] == first + again
 
 
+@pytest.mark.parametrize("rate", [100, 1_000, 2_000])
+def test_message_that_is_logged_late_is_in_order(rate: int) -> None:
+    """PX4 logs a topic with a low rate up to 2 s late, whatever the rate of the others."""
+    messages = list[Message]()
+    for number in range(30_000):
+        stamp = 5_000_000 + number * 1_000_000 // rate
+        messages.append(Message(stamp, stamp))
+        if number and number % (5 * rate) == 0:
+            late = stamp - 3_900_000
+            messages.append(Message(late, late, logged="slow"))
+    found = [*Order[Message](has_log_times=False).arrange(messages)]
+    assert [each.timestamp for each in found] == sorted(each.timestamp for each in messages)
+
+
+def test_message_from_before_a_pause_that_is_logged_after_it_is_in_order() -> None:
+    """However long a log pauses, a message may follow that a topic with a low rate sent before the pause."""
+    before = [5_000_000 + number * 1_000 for number in range(3_000)]
+    after = [stamp + 60_000_000 for stamp in before]
+    slow = [before[0], before[-10], after[-1]]
+    messages = [Message(stamp, stamp) for stamp in (*before, *after)]
+    for stamp, index in zip(slow, (1, len(before) + 1_000, len(messages)), strict=True):
+        messages.insert(index, Message(stamp, stamp, logged="slow"))
+    found = [*Order[Message](has_log_times=False).arrange(messages)]
+    assert [each.timestamp for each in found] == sorted(each.timestamp for each in messages)
+
+
 @pytest.mark.parametrize("has_log_times", [True, False])
 def test_last_message_after_a_pause_is_a_pause(*, has_log_times: bool) -> None:
     """A last message up to a day later ends a pause; one on no clock of the vehicle is out of order."""

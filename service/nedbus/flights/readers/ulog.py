@@ -12,7 +12,7 @@ from nedbus_msgs import ALL, TOPICS, Address, Definition
 from .formats import open_file
 from .reader import FlightReader, ReadOptions, Record, Run
 
-_CHUNK: Final = 2**17  # bytes read at a time
+_CHUNK: Final = 2**15  # bytes read at a time, whose messages fit the caches
 _LISTED_DAMAGES: Final = 5  # the others are counted
 
 
