@@ -70,8 +70,8 @@ class Downsampler:
     """Publisher of the downsampled copies of one address; not thread-safe.
 
     `listener`: matched by subscribers of any downsampled stream of the vehicle.
-    `is_open`: there were such subscribers. Otherwise `put` has nothing to do before `next_check` of the listener, unless
-    that is known to be matched.
+    `is_open`: there were such subscribers. Otherwise `put` has nothing to do before `next_check` of the listener,
+    unless that is known to be matched.
     """
 
     def __init__(
