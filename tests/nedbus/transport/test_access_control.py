@@ -55,6 +55,8 @@ from tests.peers.queryables import answer_queries, reply_with
 from tests.peers.zenohd import ROUTER_KINDS, start_zenohd
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
+from .size_limits import received_sizes
+
 __all__ = ["clock", "pki"]
 
 Join = Callable[[str], nedbus.Bus]
@@ -161,21 +163,9 @@ def test_message_that_is_not_built_in_is_decoded(join: Join) -> None:
 def test_large_puts_on_report_and_heartbeat_keys_are_not_forwarded(open_as: Open) -> None:
     """The size filter of the secure router includes @rejected and @adv, which `**` does not match."""
     vehicle, reader = open_as("vehicle-1"), open_as("reader")
-    keys = {f"nedbus/@rejected/1/{VLP}": 16384, f"nedbus/1/{VLP}/@adv/pub/1a/1/_": 64}
-    block = zenoh.CongestionControl.BLOCK
-    for key, limit in keys.items():
-        subscriber = reader.declare_subscriber(key, zenoh.handlers.RingChannel(10))
-        wait_for_matching(vehicle, key)
-        vehicle.put(key, bytes(limit + 1), congestion_control=block)
-        vehicle.put(key, bytes(limit), congestion_control=block)
-        received = list[int]()
-
-        def is_received(received: list[int] = received, subscriber: Any = subscriber) -> bool:
-            received.extend(len(each.payload) for each in iter(subscriber.handler.try_recv, None))
-            return bool(received)
-
-        wait_for(is_received, what="the message at the limit, which was sent last")
-        assert received == [limit]
+    report, heartbeat = f"nedbus/@rejected/1/{VLP}", f"nedbus/1/{VLP}/@adv/pub/1a/1/_"
+    assert received_sizes(vehicle, reader, report, 16_384) == [16_384]
+    assert received_sizes(vehicle, reader, heartbeat, 64) == [64]
 
 
 @pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])

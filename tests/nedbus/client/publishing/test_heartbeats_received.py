@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 
+import pytest
 import zenoh
 
 import nedbus
@@ -13,6 +14,7 @@ from tests.flights.local_position import decode
 from tests.flights.messages import VLP
 from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
+from tests.nedbus.transport.size_limits import received_sizes
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 
@@ -64,7 +66,7 @@ def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, zenoh_session: Ses
 
 
 def test_unread_heartbeats_are_bounded_in_bytes(endpoint: str, zenoh_session: Session) -> None:
-    """A reader that is busy holds at most 4096 heartbeats of at most 64 bytes: larger ones are not received."""
+    """A reader that is busy holds at most 4096 heartbeats, of at most 64 bytes: the router drops larger ones."""
     end, block = "nedbus/end", zenoh.CongestionControl.BLOCK
     with open_client([endpoint], timeout=DEADLINE) as reader:
         take, undeclare = follow_heartbeats(reader, f"nedbus/*/{VLP}")
@@ -84,3 +86,15 @@ def test_unread_heartbeats_are_bounded_in_bytes(endpoint: str, zenoh_session: Se
             str(number) for number in range(904, 5000)
         ]
         undeclare()
+
+
+@pytest.mark.parametrize(
+    ("key", "limit"),
+    [("@rejected/1/x", 16_384), ("1/x/@adv/pub/1a/1/_", 64), ("1/x/@rate/5/@adv/pub/1a/1/_", 64)],
+)
+def test_router_drops_large_puts_on_report_and_heartbeat_keys(
+    endpoint: str, zenoh_session: Session, key: str, limit: int
+) -> None:
+    """The router of nedbus limits the bytes of what readers count as messages."""
+    with open_client([endpoint], timeout=DEADLINE) as reader:
+        assert received_sizes(zenoh_session, reader, f"nedbus/{key}", limit) == [limit]
