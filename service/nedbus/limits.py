@@ -88,7 +88,7 @@ REQUESTS_OF_KEY: Final = 4
 """Requests in flight on one key, whose publishers may never answer. Further ones wait."""
 
 UNREAD_REPORTS: Final = 250
-"""Unread rejection reports, each of at most 16 kB. Beyond it the oldest are dropped."""
+"""Unread rejection reports, which the routers limit to 16 kB each. Beyond it the oldest are dropped."""
 
 REPORT_BYTES: Final = 2**16
 """Bytes of a rejection report from a peer. A longer one is ignored."""

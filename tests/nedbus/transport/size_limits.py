@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import zenoh
 
 from nedbus.transport import Session
 from tests.waits import wait_for, wait_for_matching
+
+KEYS_AND_LIMITS: Final = (
+    ("nedbus/@rejected/1/x", 16_384),
+    ("nedbus/1/x/@adv/pub/1a/1/_", 64),
+    ("nedbus/1/x/@rate/5/@adv/pub/1a/1/_", 64),
+)
 
 
 def received_sizes(sender: Session, reader: Session, key: str, limit: int) -> list[int]:

@@ -27,7 +27,7 @@ from tests.peers.processes import Process, Start
 from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, wait_for
 
-from .size_limits import received_sizes
+from .size_limits import KEYS_AND_LIMITS, received_sizes
 
 __all__ = ["pki"]
 
@@ -123,16 +123,13 @@ def test_storage_retains_the_last_message_of_a_vehicle(
         assert reader.vehicles() == {}
 
 
-@pytest.mark.parametrize(
-    ("key", "limit"),
-    [("@rejected/1/x", 16_384), ("1/x/@adv/pub/1a/1/_", 64), ("1/x/@rate/5/@adv/pub/1a/1/_", 64)],
-)
+@pytest.mark.parametrize(("key", "limit"), KEYS_AND_LIMITS)
 def test_large_puts_on_report_and_heartbeat_keys_are_not_forwarded(
     zenohd: str, zenoh_session: Session, key: str, limit: int
 ) -> None:
     """config/router.json5 limits the bytes of what readers count as messages."""
     with open_client([zenohd], timeout=DEADLINE) as sender:
-        assert received_sizes(sender, zenoh_session, f"nedbus/{key}", limit) == [limit]
+        assert received_sizes(sender, zenoh_session, key, limit) == [limit]
 
 
 def test_live_reply_takes_precedence_over_the_storage(

@@ -70,8 +70,8 @@ class Downsampler:
     """Publisher of the downsampled copies of one address; not thread-safe.
 
     `listener`: matched by subscribers of any downsampled stream of the vehicle.
-    `is_open`: there were such subscribers. Otherwise `put` has nothing to do before `next_check` of the listener,
-    unless that is known to be matched.
+    `address_listener`: matched by subscribers of this address; None until `listener` was matched. Before that, `put`
+    has nothing to do until `next_check` of the listener, unless that is known to be matched.
     """
 
     def __init__(
@@ -80,21 +80,19 @@ class Downsampler:
         self.vehicle_listener, self._heartbeats = listener, heartbeats
         self._key = partial(address.rate_key, prefix=prefix)
         self._topic = get_topic(address.topic)
-        self._address_listener: MatchingListener | None = None
+        self.address_listener: MatchingListener | None = None
         self._streams: list[_Stream] = []
-        self.is_open = False
 
     def put(self, message: Outgoing) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
-        if self._address_listener is None:
+        if self.address_listener is None:
             if not self.vehicle_listener.is_matched():
                 self.vehicle_listener.next_check = monotonic() + _CHECK
                 return
-            self.is_open = True
-            self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
+            self.address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
         # not the message's timestamp: a replay at 10 times the speed would exceed the rate
         now = time.monotonic_ns()
-        is_matched = self._address_listener.is_matched()
+        is_matched = self.address_listener.is_matched()
         if is_matched and not self._streams:
             self._streams = [
                 _Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES
@@ -107,8 +105,8 @@ class Downsampler:
         """Undeclare all streams and listeners."""
         for stream in self._streams:
             stream.close()
-        if self._address_listener is not None:
-            self._address_listener.close()
+        if self.address_listener is not None:
+            self.address_listener.close()
 
 
 class _Stream:

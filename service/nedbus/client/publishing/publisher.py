@@ -241,7 +241,8 @@ class Publisher(AbstractContextManager["Publisher"]):
             writer.put(messages)
             self.last = messages[-1]
             listener = downsampler.vehicle_listener
-            if downsampler.is_open or listener.matched or writer.last_put >= listener.next_check:
+            is_open = downsampler.address_listener is not None
+            if is_open or listener.matched or writer.last_put >= listener.next_check:
                 for message in messages:
                     downsampler.put(message)
         except zenoh.ZError as exc:

@@ -14,7 +14,7 @@ from tests.flights.local_position import decode
 from tests.flights.messages import VLP
 from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
-from tests.nedbus.transport.size_limits import received_sizes
+from tests.nedbus.transport.size_limits import KEYS_AND_LIMITS, received_sizes
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 
@@ -88,13 +88,10 @@ def test_unread_heartbeats_are_bounded_in_bytes(endpoint: str, zenoh_session: Se
         undeclare()
 
 
-@pytest.mark.parametrize(
-    ("key", "limit"),
-    [("@rejected/1/x", 16_384), ("1/x/@adv/pub/1a/1/_", 64), ("1/x/@rate/5/@adv/pub/1a/1/_", 64)],
-)
+@pytest.mark.parametrize(("key", "limit"), KEYS_AND_LIMITS)
 def test_router_drops_large_puts_on_report_and_heartbeat_keys(
     endpoint: str, zenoh_session: Session, key: str, limit: int
 ) -> None:
     """The router of nedbus limits the bytes of what readers count as messages."""
     with open_client([endpoint], timeout=DEADLINE) as reader:
-        assert received_sizes(zenoh_session, reader, f"nedbus/{key}", limit) == [limit]
+        assert received_sizes(zenoh_session, reader, key, limit) == [limit]
