@@ -80,7 +80,8 @@ def receive(form: Form, case: Case, count: int, rate: float) -> None:
     received, start, end = 0, (0.0, 0.0), (0.0, 0.0)
     delays: list[int] = []
 
-    def seen(stamp: int | Sequence[int]) -> bool:
+    def seen(stamp: Any) -> bool:
+        """Count a message, or those of an array of times; return whether more are expected."""
         nonlocal received, start, end
         if not received:
             start = now()
@@ -91,8 +92,7 @@ def receive(form: Form, case: Case, count: int, rate: float) -> None:
         else:
             received += len(stamp)
             if rate:
-                taken = time.monotonic_ns()
-                delays.extend(taken - int(each) for each in stamp)
+                delays.extend((time.monotonic_ns() - stamp).tolist())
         if received < count:
             return True
         end = now()  # before closing
