@@ -23,6 +23,7 @@ from .track import NEAR, Item, M, Placed, Track
 _OPENING: Final = 1000
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
+_LOG_BUFFER: Final = 32_768  # messages of a log that wait; logs have up to 5,000 messages per second
 _PART: Final = 1024  # messages that are sorted at once, and the least that wait for earlier ones
 # us by which a log may have a message later than others; PX4 writes topics with a low rate up to 2 s late
 _LATE: Final = 4_000_000
@@ -160,12 +161,12 @@ class Order(Generic[M]):
 
     def _count_ready(self, waiting: Sequence[_Waiting[M]]) -> int:
         """Return how many of these sorted messages no earlier one can follow: in a log, those that are old enough."""
-        beyond = max(0, len(waiting) - _BUFFER)
+        count = len(waiting)
         if self._has_log_times:
-            return beyond
+            return max(0, count - _BUFFER)
         newest, _, _ = waiting[-1]
         old = bisect_left(waiting, newest - _LATE, key=itemgetter(0))
-        return max(beyond, min(old, len(waiting) - _PART))
+        return max(count - _LOG_BUFFER, min(old, count - _PART))
 
     def _emit(self, placed: Iterable[_Waiting[M]]) -> Iterator[M]:
         """Yield sorted messages with their times on the axis; those from before its zero are at 0."""

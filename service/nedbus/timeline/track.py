@@ -111,6 +111,8 @@ class Track(Generic[M]):
         self.last: dict[Any, int] = {}
         self._batched: dict[Any, int] = {}  # the last timestamp of streams that were written later
         self.doubtful: list[Item[M]] = []
+        self._newest_before = 0  # timestamp of the newest message before the doubtful ones [us]
+        self._passed = 0  # usual messages since the first doubtful one
         self._previous: _Part | None = None
 
     def begin(self, first: Item[M], place: int) -> None:
@@ -132,20 +134,42 @@ class Track(Generic[M]):
         """Return the messages whose places are known now; this one may have to wait for others."""
         if not item.stamp:
             return [Placed(self._place_of_log(item.log), item)]
-        newest = self.newest
         place = self._place(item)
         if place is None:
-            self.doubtful.append(item)
-            is_enough = len(self.doubtful) >= _CONFIRM
-            if is_enough or self._is_set_back():
-                return self._decide()
-            return []
+            return self._doubt(item)
+        placed = [Placed(place, item)]
+        if not self.doubtful:
+            return placed
         if self._has_gone_on():
-            decided = self._decide()
-            return decided + self.add(item)
-        earlier = self._place_outliers(self.doubtful, newest)
+            return placed + self._decide()
+        self._passed += 1
+        if self._says_nothing(item):
+            return placed
+        earlier = self._place_outliers(self.doubtful, self._newest_before)
         self.doubtful = []
-        return [*earlier, Placed(place, item)]
+        return earlier + placed
+
+    def _doubt(self, item: Item[M]) -> list[Placed[M]]:
+        """Add a doubtful message; return the places of all of them if they are enough to decide."""
+        if not self.doubtful:
+            self._newest_before = self.newest
+            self._passed = 0
+        self.doubtful.append(item)
+        is_enough = len(self.doubtful) >= _CONFIRM
+        if is_enough or self._is_set_back():
+            return self._decide()
+        return []
+
+    def _says_nothing(self, item: Item[M]) -> bool:
+        """Return whether a usual message leaves it open whether the doubtful ones went on after a pause.
+
+        A log may have late messages of other streams between those that went on.
+        """
+        if item.log is not None or self._passed >= _CONFIRM:
+            return False
+        others = [each for each in self.doubtful if each.stream is not item.stream]
+        is_other_stream = len(others) == len(self.doubtful)
+        return is_other_stream and all(each.stamp > self.newest for each in others)
 
     def end(self) -> list[Placed[M]]:
         """Return the places of the messages that still wait."""

@@ -127,7 +127,7 @@ def test_log_that_goes_back_by_more_than_a_second_has_a_new_boot(back: int, boot
     assert [each.timestamp for each in found] == first + again
 
 
-@pytest.mark.parametrize("rate", [100, 1_000, 2_000])
+@pytest.mark.parametrize("rate", [100, 1_000, 2_000, 6_000])
 def test_message_that_is_logged_late_is_in_order(rate: int) -> None:
     """PX4 logs a topic with a low rate up to 2 s late, whatever the rate of the others."""
     messages = list[Message]()
@@ -151,6 +151,43 @@ def test_message_from_before_a_pause_that_is_logged_after_it_is_in_order() -> No
         messages.insert(index, Message(stamp, stamp, logged="slow"))
     found = [*Order[Message](has_log_times=False).arrange(messages)]
     assert [each.timestamp for each in found] == sorted(each.timestamp for each in messages)
+
+
+@pytest.mark.parametrize("streams", [1, 2, 3, 4])
+def test_late_message_right_after_a_pause_is_in_order(streams: int) -> None:
+    """After a dropout of 2 s, PX4 logs a first message of some streams, then one of another from before it.
+
+    As in `baro_failure.ulg` of a real PX4 (SITL), whose vehicle_command follows the first vehicle_attitude.
+    """
+    before = [5_000_000 + number * 4_000 for number in range(500)]
+    after = [stamp + 4_000_000 for stamp in before]
+    messages = [
+        Message(stamp, stamp, logged=f"fast {stream}")
+        for stamp in (*before, *after)
+        for stream in range(streams)
+    ]
+    late = before[-1] + 4_000
+    for stamp, index in ((before[0], 1), (late, len(before) * streams + streams)):
+        messages.insert(index + 1, Message(stamp, stamp, logged="slow"))
+    order = Order[Message](has_log_times=False)
+    found = [*order.arrange(messages)]
+    stamps = [each.timestamp for each in found]
+    assert stamps == sorted(stamps)
+    assert [each.at for each in found] == [(stamp - stamps[0]) / 1e6 for stamp in stamps]
+    assert not order.unordered
+
+
+def test_message_of_a_log_with_a_damaged_timestamp_is_counted() -> None:
+    """A single message of a log that is ahead of its own stream, and of the others, keeps its place in the file."""
+    stamps = [5_000_000 + number * 4_000 for number in range(2_000)]
+    messages = [Message(stamp, stamp, logged=stream) for stamp in stamps for stream in "ab"]
+    damaged = Message(40_000_000, 40_000_000, logged="a")
+    messages.insert(1_000, damaged)
+    order = Order[Message](has_log_times=False)
+    found = [*order.arrange(messages)]
+    assert found == messages
+    assert damaged.at == found[999].at
+    assert order.unordered.total() == 1
 
 
 @pytest.mark.parametrize("has_log_times", [True, False])
