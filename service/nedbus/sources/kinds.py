@@ -10,9 +10,9 @@ from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 from pydantic import ValidationError
 
+from nedbus import flights
 from nedbus.errors import AddressError, ConfigError
 from nedbus.extras import import_optional
-from nedbus.flights import find_format
 from nedbus.transport import Tls
 from nedbus_msgs import DEFAULT_PREFIX
 
@@ -129,7 +129,7 @@ def _suggest(text: str) -> str:
     """Return what to write instead of a text of unknown kind: the kind of a file by its name, or a known kind."""
     kind, _, rest = text.partition(":")
     path = rest if rest and "/" not in kind else text
-    kind_of_file = find_format(path.partition("?")[0])
+    kind_of_file = flights.find_format(path.partition("?")[0])
     if kind_of_file:
         return f"write {kind_of_file}:{path}"
     return _KNOWN_KINDS
