@@ -9,8 +9,6 @@ from nedbus.transport import Publishers
 from .discovery import (
     LogStreamStatus,
     PositionStatus,
-    RejectionReport,
-    Rejections,
     ServiceStatus,
     SourceStatus,
     StreamStatus,
@@ -39,8 +37,9 @@ if TYPE_CHECKING:
     from .bus import Bus, connect
     from .link import LinkCallback
     from .newest import Monitor, Newest, NewestMessage
+    from .rejections import RejectionReport, Rejections
     from .subscription import Subscription
-else:  # lazy: few scripts and no command use asyncio, and a service receives nothing, which saves 1 MB
+else:  # lazy: few scripts and no command use asyncio, and a service receives nothing, which saves it 1 MB
     _NAMES = {
         "async_bus": "AsyncBus AsyncPublisher connect_async",
         "async_newest": "AsyncNewest",
@@ -48,6 +47,7 @@ else:  # lazy: few scripts and no command use asyncio, and a service receives no
         "bus": "Bus connect",
         "link": "LinkCallback",
         "newest": "Monitor Newest NewestMessage",
+        "rejections": "RejectionReport Rejections",
         "subscription": "Subscription",
     }
     __getattr__ = lazy_exports(
