@@ -8,7 +8,7 @@ import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeGuard
 
 from pydantic import (
     AfterValidator,
@@ -208,7 +208,7 @@ def find_mistakes(
     values: dict[str, Any] = content | _read_environment() | flags
     details = list[ErrorDetails]()
     try:
-        settings = _usual_client_settings(values) or Settings(**values)
+        settings = _usual_settings(values) or Settings(**values)
     except ValidationError as exc:
         details = exc.errors()
         settings = Settings(**_without_mistakes(values, details))
@@ -226,25 +226,34 @@ def find_mistakes(
     return settings, mistakes
 
 
-def _usual_client_settings(values: Mapping[str, Any]) -> Settings | None:
+def _usual_settings(values: Mapping[str, Any]) -> Settings | None:
     """Return valid settings without Pydantic, whose schema and search for plugins take a tenth of a client's start.
 
-    None lets Pydantic decide: there are other settings than `connect` and `prefix`, or one may be invalid.
+    None lets Pydantic decide: there are other settings than those below, or one may be invalid.
     """
-    if not values.keys() <= {"connect", "prefix"}:
+    if not values.keys() <= {"connect", "listen", "prefix", "source"}:
         return None
-    endpoints = split_values(values.get("connect", ()))
+    connect = split_values(values.get("connect", ()))
+    listen = split_values(values.get("listen", ()))
+    source = split_sources(values.get("source", ()))
     prefix = values.get("prefix", DEFAULT_PREFIX)
-    if not isinstance(endpoints, tuple | list) or not isinstance(prefix, str):
+    if not (_are_texts(connect) and _are_texts(listen) and _are_texts(source)):
         return None
-    if not all(isinstance(endpoint, str) for endpoint in endpoints):
+    if not isinstance(prefix, str):
         return None
     try:
-        check_endpoints(endpoints, where="endpoint")
+        check_endpoints((*connect, *listen), where="endpoint")
         check_prefix(prefix)
     except ValueError:
         return None
-    return Settings.model_construct({*values}, connect=tuple(endpoints), prefix=prefix)
+    return Settings.model_construct(
+        {*values}, connect=tuple(connect), listen=tuple(listen), source=tuple(source), prefix=prefix
+    )
+
+
+def _are_texts(value: object) -> TypeGuard[Sequence[str]]:
+    """Return whether a value is a tuple or list of strings."""
+    return isinstance(value, tuple | list) and all(isinstance(item, str) for item in value)
 
 
 def state_folder() -> Path:

@@ -72,6 +72,24 @@ assert not unused & set(sys.modules), unused & set(sys.modules)
 
 
 @pytest.mark.slow
+def test_service_imports_no_receiver(start: Start) -> None:
+    """A service of a simulator loads no readers of messages, files or events, and compiles no validator."""
+    program = """
+import sys
+import nedbus.cli.commands.serve
+from nedbus.daemon import Daemon
+from nedbus.settings import load_settings
+Daemon(load_settings(source=["sim:"], listen=["tcp/127.0.0.1:7447"]), version="1.0")
+unused = {"numpy", "asyncio", "ssl", "rich", "ctypes", "http.server", "pydantic.plugin._loader"}
+unused |= {"nedbus.client.bus", "nedbus.client.receiving", "nedbus.flights.readers", "nedbus.ulog"}
+unused |= {"nedbus.vehicle_events.story", "nedbus.monitoring.observer"}
+assert not unused & set(sys.modules), unused & set(sys.modules)
+"""
+    process = start("-c", program, fresh=True)
+    assert process.wait() == 0, process.err
+
+
+@pytest.mark.slow
 def test_list_loads_only_the_client(start: Start, endpoint: str) -> None:
     """`nedbus list` of an empty host loads neither arrays, nor events, nor asyncio, nor rich's tables and Markdown."""
     program = f"""

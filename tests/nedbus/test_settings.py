@@ -61,10 +61,14 @@ def test_flag_overrides_environment_overrides_file(
         {"connect": "tcp/one:1, tls/two:2"},
         {"connect": ["tcp/one:1", "tcp/two:2"], "prefix": "fleet/a"},
         {"connect": "", "prefix": "nedbus"},
+        {"source": ["sim:"], "listen": ["tcp/127.0.0.1:7447"]},
+        {"source": "sim:?seed=1, ulog:a,b.ulg", "listen": "tcp/one:1,tcp/two:2"},
+        {"source": [{"kind": "sim", "seed": 1}]},
+        {"source": ""},
     ],
 )
-def test_usual_client_settings_equal_those_of_the_model(values: dict[str, Any]) -> None:
-    """Settings of a usual client, which are checked without Pydantic, are those that the model returns."""
+def test_usual_settings_equal_those_of_the_model(values: dict[str, Any]) -> None:
+    """Settings of a usual client or service, which are checked without Pydantic, are those that the model returns."""
     settings = load_settings(**values)
     model = Settings(**values)
     assert settings.model_dump() == model.model_dump()
@@ -81,10 +85,14 @@ def test_usual_client_settings_equal_those_of_the_model(values: dict[str, Any]) 
         ({"connect": 1}, "Input should be a valid tuple"),
         ({"prefix": "a//b"}, "chunks of A-Z"),
         ({"prefix": 1}, "Input should be a valid string"),
+        ({"listen": ["tcp/one:1", "two"]}, "'two' is not an endpoint"),
+        ({"listen": 1}, "Input should be a valid tuple"),
+        ({"source": 1}, "Input should be a valid tuple"),
+        ({"source": [1]}, "Input should be a valid string"),
     ],
 )
-def test_invalid_client_settings_name_the_reason(values: dict[str, object], reason: str) -> None:
-    """An invalid endpoint or prefix raises ConfigError with its name and the reason."""
+def test_invalid_settings_name_the_reason(values: dict[str, object], reason: str) -> None:
+    """An invalid endpoint, prefix or source raises ConfigError with its name and the reason."""
     with pytest.raises(ConfigError, match=reason) as caught:
         load_settings(**values)
     assert caught.value.where in values

@@ -6,12 +6,9 @@ from nedbus.extras import lazy_exports
 from nedbus.samples import Counts, Mode, Sample
 from nedbus.transport import Publishers
 
-from .bus import Bus, connect
 from .discovery import (
     LogStreamStatus,
     PositionStatus,
-    RejectionReport,
-    Rejections,
     ServiceStatus,
     SourceStatus,
     StreamStatus,
@@ -28,23 +25,30 @@ from .health import (
     health_of_last,
     stream_state,
 )
-from .link import LinkCallback
-from .newest import Monitor, Newest, NewestMessage
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .publishing.writer import HEARTBEAT
-from .subscription import Subscription
 
 if TYPE_CHECKING:
     from .async_bus import AsyncBus, AsyncPublisher, connect_async
     from .async_newest import AsyncNewest
     from .async_subscription import AsyncSubscription
-else:  # lazy: few scripts and no command use asyncio
+    from .bus import Bus, connect
+    from .link import LinkCallback
+    from .newest import Monitor, Newest, NewestMessage
+    from .rejections import RejectionReport, Rejections
+    from .subscription import Subscription
+else:  # lazy: few scripts and no command use asyncio, and a service receives nothing, which saves it 1 MB
     _NAMES = {
         "async_bus": "AsyncBus AsyncPublisher connect_async",
         "async_newest": "AsyncNewest",
         "async_subscription": "AsyncSubscription",
+        "bus": "Bus connect",
+        "link": "LinkCallback",
+        "newest": "Monitor Newest NewestMessage",
+        "rejections": "RejectionReport Rejections",
+        "subscription": "Subscription",
     }
     __getattr__ = lazy_exports(
         __name__, {name: ("", module) for module, names in _NAMES.items() for name in names.split()}

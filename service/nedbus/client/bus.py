@@ -38,7 +38,7 @@ from nedbus_msgs import (
 )
 
 from .closing import Finalizer
-from .discovery import Rejections, ServiceStatus, Vehicles, find_reports, find_services
+from .discovery import ServiceStatus, Vehicles, find_reports, find_services
 from .link import LinkCallback, LinkWatch
 from .newest import Newest
 from .publishing.publish_permission import PublishPermission
@@ -54,6 +54,7 @@ from .receiving import (
     Throttle,
     find_schemas,
 )
+from .rejections import Rejections
 from .subscription import Subscription
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Queries for vehicles, services, event reports and rejected messages; peers are untrusted."""
+"""Queries for vehicles, services and event reports; peers are untrusted."""
 
 from __future__ import annotations
 
@@ -9,21 +9,18 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import islice
 from typing import TYPE_CHECKING
 
-import zenoh
 from pydantic import TypeAdapter
 from pydantic_core import to_json
 
-from nedbus import clock, limits
-from nedbus.client.closing import Finalizer
+from nedbus import limits
 from nedbus.client.health import Health
 from nedbus.errors import AddressError
 from nedbus.log_event import about
 from nedbus.samples import LogStreamStatus, PositionStatus, UntrustedReply
-from nedbus.transport import RawSample, Session, query, translate_zenoh_errors
-from nedbus_msgs import REJECTED, Address, all_status_keys, parse_status_key
+from nedbus.transport import RawSample, Session, query
+from nedbus_msgs import Address, all_status_keys, parse_status_key
 
 if TYPE_CHECKING:
     from nedbus.vehicle_events import AccountReport
@@ -298,58 +295,6 @@ def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
     else:
         text = "omitted %d bytes of a reply, because readers accept at most %d per part: use fewer or shorter names"
         _log.warning(text, len(content), limits.REPLY_BYTES, extra=about("incomplete"))
-
-
-@dataclass(frozen=True, slots=True)
-class RejectionReport:
-    """A message that a service rejected.
-
-    `reason`: untrusted text from the service, at most 300 characters.
-    `received`: time at which the report arrived, ns since the epoch.
-    """
-
-    address: Address
-    reason: str
-    received: int
-
-
-class Rejections:
-    """A subscription to rejection reports; get one from `bus.rejections()`.
-
-    It closes with the bus, or when it is garbage-collected.
-    """
-
-    def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
-        self._prefix, self._owner = prefix, owner  # the owner keeps the bus open
-        with translate_zenoh_errors():
-            subscriber = session.declare_subscriber(
-                f"{prefix}{REJECTED}/**", zenoh.handlers.RingChannel(limits.UNREAD_REPORTS)
-            )
-        self._handler = subscriber.handler
-        self._finalizer = Finalizer(self, subscriber.undeclare)
-
-    def take(self) -> list[RejectionReport]:
-        """Return the reports received since the last call, at most 250, without waiting."""
-        with translate_zenoh_errors():
-            samples = list(islice(iter(self._handler.try_recv, None), limits.UNREAD_REPORTS))
-        reports: list[RejectionReport] = []
-        for sample in samples:
-            try:
-                address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
-                content = None
-                if len(sample.payload) <= limits.REPORT_BYTES:
-                    content = json.loads(sample.payload.to_bytes())
-            except (AddressError, ValueError, RecursionError):
-                continue
-            if isinstance(content, dict) and (reason := content.get("reason")):
-                reports.append(
-                    RejectionReport(address, str(reason)[: limits.PEER_TEXT], clock.utc_ns())
-                )
-        return reports
-
-    def close(self) -> None:
-        """End the subscription. Idempotent."""
-        self._finalizer.close_now()
 
 
 def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:

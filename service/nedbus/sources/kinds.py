@@ -10,9 +10,9 @@ from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 from pydantic import ValidationError
 
+from nedbus import flights
 from nedbus.errors import AddressError, ConfigError
 from nedbus.extras import import_optional
-from nedbus.flights import find_format
 from nedbus.transport import Tls
 from nedbus_msgs import DEFAULT_PREFIX
 
@@ -129,7 +129,7 @@ def _suggest(text: str) -> str:
     """Return what to write instead of a text of unknown kind: the kind of a file by its name, or a known kind."""
     kind, _, rest = text.partition(":")
     path = rest if rest and "/" not in kind else text
-    kind_of_file = find_format(path.partition("?")[0])
+    kind_of_file = flights.find_format(path.partition("?")[0])
     if kind_of_file:
         return f"write {kind_of_file}:{path}"
     return _KNOWN_KINDS
@@ -146,6 +146,10 @@ def _parse_options(kind: SourceKind, query: str, where: str) -> Options:
         reason = f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}"
         raise ConfigError(where, reason) from None
     values = dict(pairs)
+    if not values:
+        return (
+            kind.options.model_construct()
+        )  # for the defaults alone, Pydantic need not compile a validator
     try:
         options = kind.options.model_validate(values)
     except ValidationError as exc:

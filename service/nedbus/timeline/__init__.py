@@ -21,8 +21,6 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .arrivals import arrivals
-from .axis import Axis
-from .order import Order
 from .pace import SKIPPED_PAUSE, Pace
 from .reboots import RebootDetector, RebootSign
 from .utc_offset import UTC_COLUMNS, UtcOffset, provides_utc, to_unix_ns, unix_seconds, utc_text
@@ -36,11 +34,19 @@ from .vehicle_clock import (
 )
 
 if TYPE_CHECKING:
+    from .axis import Axis
+    from .order import Order
     from .utc_estimate import UtcEstimate, to_datetime64
 else:
-    # NumPy is slow to import.
+    # NumPy is slow to import, and only readers of files need the axis and the order.
     __getattr__ = lazy_exports(
-        __name__, dict.fromkeys(("UtcEstimate", "to_datetime64"), ("", "utc_estimate"))
+        __name__,
+        {
+            "Axis": ("", "axis"),
+            "Order": ("", "order"),
+            "UtcEstimate": ("", "utc_estimate"),
+            "to_datetime64": ("", "utc_estimate"),
+        },
     )
 
 __all__ = [

@@ -51,6 +51,16 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
 
 
 @pytest.mark.parametrize(
+    "text", ["sim:", "ulog:a.ulg", "mcap:a.mcap", "px4-zenoh:", "mavlink:udpin::1"]
+)
+def test_source_without_options_has_the_defaults_of_the_model(text: str) -> None:
+    """Options that are not given, which are not validated, are those that the model returns."""
+    options = parse_source(text).options
+    assert options == type(options).model_validate({})
+    assert not options.model_fields_set
+
+
+@pytest.mark.parametrize(
     ("source", "reason"),
     [
         ({}, "kind is missing; choose from sim, ulog"),
