@@ -146,10 +146,8 @@ def _parse_options(kind: SourceKind, query: str, where: str) -> Options:
         reason = f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}"
         raise ConfigError(where, reason) from None
     values = dict(pairs)
-    if not values:
-        return (
-            kind.options.model_construct()
-        )  # for the defaults alone, Pydantic need not compile a validator
+    if not values:  # for the defaults alone, Pydantic need not compile a validator
+        return kind.options.model_construct()
     try:
         options = kind.options.model_validate(values)
     except ValidationError as exc:

@@ -23,9 +23,8 @@ from .track import NEAR, Item, M, Placed, Track
 _OPENING: Final = 1000
 _OPENING_LATER: Final = 100  # messages that determine the start of a vehicle that appears later
 _BUFFER: Final = 8192  # messages, within which the streams of a recording may be batched
-_LOG_BUFFER: Final = (
-    32_768  # messages of a log that wait; logs have up to 5,000 messages per second
-)
+# messages of a log that wait at most; logs have up to 5,000 per second
+_LOG_BUFFER: Final = 32_768
 _PART: Final = 1024  # messages that are sorted at once, and the least that wait for earlier ones
 # us by which a log may have a message later than others; PX4 writes topics with a low rate up to 2 s late
 _LATE: Final = 4_000_000
