@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from statistics import fmean, median
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 from nedbus import clock, limits
 from nedbus.clock import format_duration
@@ -139,6 +139,16 @@ def _shares_of_one(flags: tuple[bool | None, ...]) -> dict[str, float]:
     return {name: float(is_set) for name, is_set in pairs if is_set is not None}
 
 
+class _Summary(NamedTuple):
+    """Values of a window, as in Health; the dictionary belongs to others, so copy it before it is given away."""
+
+    rate: float | None
+    jitter: float | None
+    latency: float | None
+    latency_max: float | None
+    flags: dict[str, float] | None
+
+
 @dataclass(slots=True, eq=False)
 class _Window:
     """Measurements of one second, or longer for a slow stream."""
@@ -149,18 +159,12 @@ class _Window:
     intervals: tuple[int, float, float] = (0, 0.0, 0.0)
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=limits.MEASURED_LATENCIES))
     flags: _FlagCounts = field(default_factory=Counter)
-    _sorted: list[float] | None = None  # the latencies; None after a new one
+    _summary: _Summary | None = None  # None after a new message
 
-    def add_latency(self, latency: float) -> None:
-        """Add a latency [s]."""
-        self.latencies.append(latency)
-        self._sorted = None
-
-    def sorted_latencies(self) -> list[float]:
-        """Return the latencies in ascending order [s]."""
-        if self._sorted is None:
-            self._sorted = sorted(self.latencies)
-        return self._sorted
+    def begin_batch(self, messages: int) -> None:
+        """Count messages that are about to be measured."""
+        self.messages += messages
+        self._summary = None
 
     def add_intervals(self, intervals: Collection[float]) -> None:
         """Add intervals [s] by Chan's method."""
@@ -172,6 +176,30 @@ class _Window:
             + (own - mean) ** 2 * number * added / total
         )
         self.intervals = total, mean + (own - mean) * added / total, squares
+
+    def summary(self) -> _Summary:
+        """Return the values of the messages so far."""
+        if self._summary is None:
+            self._summary = self._summarize()
+        return self._summary
+
+    def _summarize(self) -> _Summary:
+        number, mean, squares = self.intervals
+        rate = None
+        jitter = None
+        if mean > 0:
+            rate = 1 / mean
+            jitter = math.sqrt(squares / number)
+        latency = None
+        latency_max = None
+        if self.latencies:
+            latencies = sorted(self.latencies)
+            latency = latencies[len(latencies) // 2]
+            latency_max = latencies[-1]
+        flags = None
+        if self.flags:
+            flags = _flag_shares(self.flags)
+        return _Summary(rate, jitter, latency, latency_max, flags)
 
 
 class Histogram:
@@ -218,13 +246,14 @@ class StreamHealth:
         self._usual_interval: float | None = None  # their median; None after a new one
         self._usual_rate: float | None = None
         self._flags: _FlagCounts = Counter()
+        self._flags_ever: dict[str, float] | None = None  # their shares; None after a new message
         # counters of the last, and missing fields
         self._seen: tuple[tuple[int | None, ...], Collection[str]] = (), ()
         self._counters: dict[Quantity, int] = {}  # the last known ones
         self._resets: dict[Quantity, int] = dict.fromkeys(counters, 0)
         self._latencies = Histogram(_LATENCY_BUCKETS)
-        self._window = self._last_window = _Window(0)
-        self._last: Health | None = None  # when the last message arrived; None after a new one
+        self._window = _Window(0)
+        self._last_window: _Window | None = None  # the last full one
         # at most _BATCH
         self._waiting = deque[tuple[tuple[Any, ...], int, float | None, int, Collection[str]]]()
         self._window_end = _WINDOW  # of those that wait
@@ -256,7 +285,6 @@ class StreamHealth:
         """Measure them for a caller that holds the lock."""
         if not self._waiting:
             return
-        self._last = None
         waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
         self._measure_all(*zip(*waiting, strict=True))
 
@@ -271,7 +299,7 @@ class StreamHealth:
         if received[0] - self._window.start >= _WINDOW:
             self._begin_window(received[0])
         window = self._window
-        window.messages += len(values)
+        window.begin_batch(len(values))
         self._lost += sum(lost)
         if self._received is None:
             times = received
@@ -285,8 +313,9 @@ class StreamHealth:
         self._received = received[-1]
         for latency in latencies:
             if latency is not None:
-                window.add_latency(latency)
+                window.latencies.append(latency)
                 self._latencies.add(latency)
+        self._flags_ever = None
         for fields, absent, arrived in zip(values, missing, received, strict=True):
             rebooted = self._add_time(int(fields[0]), arrived)
             if self._is_position:
@@ -358,57 +387,43 @@ class StreamHealth:
         with self._lock:
             if self._waiting:
                 self._measure_waiting()
-            if self._last is None:
-                self._last = self._at_last_message()
-            age = None if self._received is None else (now - self._received) / 1e9
-            return _later(self._last, age)
+            return self._health(now)
 
-    def _at_last_message(self) -> Health:
-        """Return the health when the last message arrived; its dictionaries belong to others."""
-        if self._last_window.messages:
-            window = self._last_window
-        else:
-            window = self._window
-        latencies = window.sorted_latencies()
-        number, mean, squares = window.intervals
-        rate = None
-        jitter = None
-        if mean > 0:
-            rate = 1 / mean
-            jitter = math.sqrt(squares / number)
-        latency = None
-        latency_max = None
-        if latencies:
-            latency = latencies[len(latencies) // 2]
-            latency_max = latencies[-1]
-        flags = None
-        flags_ever = None
-        if self._is_position and window.messages:
-            flags = _flag_shares(window.flags)
-        if self._is_position and self._messages:
-            flags_ever = _flag_shares(self._flags)
+    def _health(self, now: int) -> Health:
+        """Return the health at time `now` [ns] as measured so far."""
+        window = self._last_window or self._window
+        rate, jitter, latency, latency_max, flags = window.summary()
+        age = None
         reboot_age = None
-        if self._rebooted is not None:
-            reboot_age = ((self._received or 0) - self._rebooted) / 1e9
+        if self._received is not None:
+            age = (now - self._received) / 1e9
+            if rate is not None and not (age < TIMINGS.stale or age < 2 / rate):
+                rate = None
+                jitter = None
+            if self._rebooted is not None:
+                reboot_age = (now - self._rebooted) / 1e9
+        if self._flags_ever is None and self._flags:
+            self._flags_ever = _flag_shares(self._flags)
+        # in the order of the fields: names take three times as long
         return Health(
-            rate=rate,
-            nominal=self._topic.rate,
-            jitter=jitter,
-            latency=latency,
-            latency_max=latency_max,
-            age=0.0,
-            messages=self._messages,
-            lost=self._lost,
-            gaps=self._gaps,
-            out_of_order=self._out_of_order,
-            reboots=self._reboots,
-            flags=flags,
-            flags_ever=flags_ever,
-            usual_rate=self._usual_rate,
-            resets=self._resets,
-            on_change=self._is_on_change,
-            usual_interval=self._median_interval(),
-            reboot_age=reboot_age,
+            rate,
+            self._topic.rate,
+            jitter,
+            latency,
+            latency_max,
+            age,
+            self._messages,
+            self._lost,
+            self._gaps,
+            self._out_of_order,
+            self._reboots,
+            None if flags is None else flags.copy(),
+            None if self._flags_ever is None else self._flags_ever.copy(),
+            self._usual_rate,
+            self._resets.copy(),
+            self._is_on_change,
+            self._median_interval(),
+            reboot_age,
         )
 
     def _add_counters(
@@ -470,41 +485,6 @@ class StreamHealth:
             return True
         self._out_of_order += 1
         return False
-
-
-def _later(last: Health, age: float | None) -> Health:
-    """Return the health of a stream that had this one when its last message arrived, `age` [s] ago.
-
-    Written out, in the order of the fields: names take three times as long, `dataclasses.replace` ten times.
-    """
-    rate = last.rate
-    jitter = last.jitter
-    if rate is not None and (age is None or not (age < TIMINGS.stale or age < 2 / rate)):
-        rate = None
-        jitter = None
-    reboot_age = last.reboot_age
-    if reboot_age is not None and age is not None:
-        reboot_age += age
-    return Health(
-        rate,
-        last.nominal,
-        jitter,
-        last.latency,
-        last.latency_max,
-        age,
-        last.messages,
-        last.lost,
-        last.gaps,
-        last.out_of_order,
-        last.reboots,
-        None if last.flags is None else last.flags.copy(),
-        None if last.flags_ever is None else last.flags_ever.copy(),
-        last.usual_rate,
-        last.resets.copy(),
-        last.on_change,
-        last.usual_interval,
-        reboot_age,
-    )
 
 
 def _is_regular(steps: Collection[int], usual: float) -> bool:

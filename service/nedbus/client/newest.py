@@ -155,8 +155,8 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
         self._to_utc = clock.utc_ns() - self._latest  # from the monotonic to the wall clock [ns]
         self._streams: dict[Address, NewestMessage[Any]] = {}  # least recently updated first
         self._by_topic: defaultdict[str, dict[Address, NewestMessage[Any]]] = defaultdict(dict)
-        # addresses of the streams; None after a new or removed one
-        self._sorted: list[Address] | None = None
+        # the streams in the order of their addresses; None after a new or removed one
+        self._sorted: dict[Address, NewestMessage[Any]] | None = None
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
         """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`.
@@ -215,10 +215,10 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
         """Return the health of each measured stream, by address, now or at `now` [ns] of the clock used in `add`."""
         with self._lock:
-            streams = [self._streams[address] for address in self._sorted_addresses()]
+            streams = self._in_order()
         return {
-            stream.sample.address: stream._measured.snapshot(now)
-            for stream in streams
+            address: stream._measured.snapshot(now)
+            for address, stream in streams.items()
             if stream._measured
         }
 
@@ -251,10 +251,10 @@ class Monitor(Mapping[Address, NewestMessage[Message]]):
                 stream._put(sample, received)
         return stream
 
-    def _sorted_addresses(self) -> list[Address]:
-        """Return the addresses of all streams in order; the caller holds the lock."""
+    def _in_order(self) -> dict[Address, NewestMessage[Any]]:
+        """Return the streams in the order of their addresses; the caller holds the lock."""
         if self._sorted is None:
-            self._sorted = sorted(self._streams)
+            self._sorted = {address: self._streams[address] for address in sorted(self._streams)}
         return self._sorted
 
     def _copy(self) -> dict[Address, NewestMessage[Any]]:
