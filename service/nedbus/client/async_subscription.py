@@ -16,7 +16,7 @@ from nedbus.samples import M_co, Sample
 from nedbus.transport import require_unforked
 
 from .closing import Finalizer
-from .receiving import Inbox, Receiver
+from .receiving import Inbox, Receiver, check_timeout
 from .subscription import Pop, SubscriptionBase
 
 if TYPE_CHECKING:
@@ -43,12 +43,14 @@ class AsyncSubscription(SubscriptionBase[M_co]):
 
     async def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it; `timeout` and errors as in `Subscription.receive`."""
+        check_timeout(timeout)
         return await self._next(self._pop_sample, timeout)
 
     async def receive_batch(
         self, timeout: float | None = None, *, max_messages: int | None = None
     ) -> Batch:
         """Wait for at least one message and return unread ones, as `Subscription.receive_batch` does."""
+        check_timeout(timeout)
         return await self._next(self._pop_batch(max_messages), timeout)
 
     def rows(self) -> AsyncIterator[Sample[M_co]]:

@@ -53,6 +53,7 @@ from .receiving import (
     Receiver,
     Throttle,
     find_schemas,
+    has_router,
 )
 from .rejections import Rejections
 from .subscription import Subscription
@@ -90,7 +91,10 @@ class Bus(AbstractContextManager["Bus"]):
         )
         self._reopen = partial(open_client, self.routers, timeout=0.0, tls=self._tls)
         self._directory = VehicleDirectory.of_fleet(self._reopen, Selection(), prefix=prefix)
-        self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
+        self._layouts = LayoutLookup(
+            partial(find_schemas, session=session, prefix=prefix),
+            is_linked=partial(has_router, session),
+        )
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         self._links: list[LinkWatch] = []  # one, created by the first `on_link`
         self._links_lock = threading.Lock()

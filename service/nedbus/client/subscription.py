@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, suppress
@@ -16,7 +16,7 @@ from nedbus.samples import Counts, M_co, Sample
 from nedbus.transport import require_unforked
 
 from .closing import Finalizer
-from .receiving import Inbox, Receiver, check_count
+from .receiving import Inbox, Receiver, check_count, check_timeout
 
 if TYPE_CHECKING:
     from nedbus.samples import Batch
@@ -74,8 +74,9 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
         """Wait for the next sample and return it.
 
         Raises NoDataError if none arrives within `timeout` seconds, ClosedError if the subscription is closed,
-        ReceiveError if it has failed.
+        ReceiveError if it has failed, ArgumentError if `timeout` is no number.
         """
+        check_timeout(timeout)
         return self._next(self._pop_sample, timeout)
 
     def receive_batch(
@@ -85,6 +86,7 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
 
         Raises the errors of `receive`.
         """
+        check_timeout(timeout)
         return self._next(self._pop_batch(max_messages), timeout)
 
     def rows(self) -> Iterator[Sample[M_co]]:
@@ -125,7 +127,7 @@ class Subscription(SubscriptionBase[M_co], AbstractContextManager["Subscription[
     def _next(self, pop: Pop[_T], timeout: float | None = None) -> _T:
         require_unforked()
         deadline = None
-        if timeout is not None and timeout != math.inf:
+        if timeout is not None and timeout < threading.TIMEOUT_MAX:
             deadline = time.monotonic() + timeout
         if self._inbox.newest_only:
             self._receiver.receive()  # newer samples may be in the ring

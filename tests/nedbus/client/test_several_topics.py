@@ -9,7 +9,7 @@ import pytest
 
 import nedbus
 from nedbus import Counts, Mode, SensorGps, VehicleAttitude, limits
-from nedbus.errors import AddressError, ArgumentError
+from nedbus.errors import AddressError, ArgumentError, NoDataError
 from nedbus.transport import open_router
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import wait_for_subscriber
@@ -136,6 +136,25 @@ def test_limit_below_one_message_raises(client: nedbus.Bus, count: Any) -> None:
         for call in (subscription.batches, subscription.receive_batch):
             with pytest.raises(ArgumentError, match="max_messages"):
                 call(max_messages=count)
+
+
+@pytest.mark.parametrize("timeout", ["1", float("nan"), True])
+def test_timeout_that_is_no_number_raises(client: nedbus.Bus, timeout: Any) -> None:
+    """A timeout is a number of seconds; a negative one is over at once."""
+    with client.subscribe() as subscription, client.newest() as view:
+        for call in (subscription.receive, subscription.receive_batch, view.update):
+            with pytest.raises(ArgumentError, match="timeout"):
+                call(timeout)
+        with pytest.raises(NoDataError):
+            subscription.receive(-1)
+
+
+def test_timeout_beyond_the_clock_waits(client: nedbus.Bus) -> None:
+    """A timeout that the system's clock cannot reach does not end the wait."""
+    sent = nedbus.VehicleLocalPosition(timestamp=1)
+    with client.subscribe() as subscription, client.publisher(VLP, vehicle="1") as publisher:
+        publisher.publish(sent)
+        assert subscription.receive(1e10).message == sent
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])

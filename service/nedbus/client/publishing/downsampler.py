@@ -22,8 +22,8 @@ from .writer import Heartbeats, Writer
 
 # s between checks whether any downsampled stream of a vehicle has subscribers
 _CHECK: Final = 0.02
-# ns for which an unmatched writer is kept, so returning readers can recover messages
-_LINGER: Final = 60_000_000_000
+# ns for which an unmatched writer is kept, so readers that return after an outage recover and count what they missed
+_LINGER: Final = 600_000_000_000
 
 
 class MatchingListener:
@@ -110,7 +110,7 @@ class Downsampler:
 
 
 class _Stream:
-    """The stream of one rate; its writer exists while the stream has subscribers, and for one minute afterwards."""
+    """The stream of one rate; its writer exists while the stream has subscribers, and for ten minutes afterwards."""
 
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, topic: Topic) -> None:
         self.writer: Writer | None = None

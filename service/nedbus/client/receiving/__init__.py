@@ -2,7 +2,7 @@
 
 from .decoder import Decoder
 from .downsampled import Downsampled
-from .inbox import Inbox, check_count
-from .layout_lookup import LayoutLookup, find_schemas
+from .inbox import Inbox, check_count, check_timeout
+from .layout_lookup import LayoutLookup, find_schemas, has_router
 from .receiver import Receiver
 from .throttle import Throttle

@@ -443,6 +443,13 @@ def check_count(name: str, count: object) -> None:
         raise ArgumentError(name, count, "a number of messages above 0, or None for the default")
 
 
+def check_timeout(timeout: object) -> None:
+    """Raise ArgumentError unless `timeout` is None or a number of seconds."""
+    is_number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
+    if timeout is not None and not (is_number and timeout == timeout):  # NaN differs from itself
+        raise ArgumentError("timeout", timeout, "a number of seconds, or None to wait without limit")
+
+
 @cache
 def _batch_maker() -> Callable[..., Batch]:
     from .batch import make_batch  # on first use, because NumPy loads slowly

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from typing import Annotated, Any, Final, NamedTuple
 
+import zenoh
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from nedbus import limits
@@ -30,6 +30,8 @@ _PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
 _QUERY_PAUSE: Final = 0.2  # s between a query without a result and the next one
 # s of wait budget regained per second; peers cannot make readers wait longer
 _BUDGET_RATE: Final = 0.1
+_RETURN: Final = 3.0  # s after the link is up again in which publishers return to the router
+_LONGEST_OUTAGE: Final = 6.0  # s for which a reader waits for a definition while the link is down
 
 SchemaId = tuple[str, str]  # message name, and hash of the definition
 Schemas = Mapping[SchemaId, Mapping[str, str]]  # definitions from publishers: field types by name
@@ -57,16 +59,21 @@ class LayoutLookup:
 
     A message of a newer layout is invalid until the answer arrives; any other unknown message stays in the queue.
     Receiving threads do not wait: any peer can send unknown messages and leave queries unanswered.
+
+    `is_linked`: whether the session has a router. Lookups go on while it has none, and shortly afterwards.
     """
 
     def __init__(
         self,
         find: Callable[[Mapping[SchemaId, Sender]], Schemas],
         *,
+        is_linked: Callable[[], bool] = lambda: True,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._find = find
+        self._is_linked = is_linked
         self._now = now
+        self._returning_until = float("-inf")  # monotonic time, as of the last outage of the link
         self._known: dict[SchemaId, _Known] = {}
         self._full = False
         self._errors = UnexpectedErrors(
@@ -87,7 +94,7 @@ class LayoutLookup:
         """Return the codec of the definition with this hash; None if it is unknown, which starts a lookup.
 
         `sender`: after a failed lookup, a lookup for another sender starts at once, without backoff.
-        `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
+        `wait`: wait for a lookup in progress, as `wait` does; never use it on a receiving thread.
         """
         schema_id = name, identity
         if schema_id not in self._known:
@@ -101,21 +108,39 @@ class LayoutLookup:
         return known.codec
 
     def wait(self, schema_id: SchemaId | None = None) -> None:
-        """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
+        """Wait for one lookup or for all, up to 3 s, or 6 s for one while the link is down or just up again.
+
+        Never call it on a receiving thread.
+        """
         with self._changed:
             start = time.monotonic()
             longest = TIMINGS.definition_timeout
-            budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
             if schema_id is None:
-                is_pending = self._open.__len__
-                timeout = longest
-            else:
-                is_pending = partial(self._open.__contains__, schema_id)
-                timeout = budget
-            self._changed.wait_for(lambda: self._closed or not is_pending(), timeout)
-            if schema_id is not None and schema_id not in self._known:
+                self._changed.wait_for(lambda: self._closed or not self._open, longest)
+                return
+            budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
+            timeout = budget
+            while not self._closed and schema_id in self._open:
+                self._note_outage()
+                if self._is_returning:
+                    timeout = _LONGEST_OUTAGE
+                left = start + timeout - time.monotonic()
+                if left <= 0:
+                    break
+                self._changed.wait(min(left, _QUERY_PAUSE))
+            if timeout == budget and schema_id not in self._known:
                 self._budget_time = time.monotonic()
                 self._wait_budget = max(0.0, budget - (self._budget_time - start))
+
+    def _note_outage(self) -> None:
+        """Note that the link is down, if it is."""
+        if not self._is_linked():
+            self._returning_until = time.monotonic() + _RETURN
+
+    @property
+    def _is_returning(self) -> bool:
+        """Whether the link was down a short time ago: publishers may not have returned to the router yet."""
+        return time.monotonic() < self._returning_until
 
     def close(self) -> None:
         """Start no more lookups and wait for the one in progress."""
@@ -152,6 +177,7 @@ class LayoutLookup:
                     return
                 queried = dict(islice(self._open.items(), limits.UNKNOWN_DEFINITIONS))
             added: list[SchemaId] = []
+            self._note_outage()
             with self._errors, suppress(NedbusError):  # the session is closed
                 schemas = self._find(queried)
                 added = [
@@ -165,7 +191,12 @@ class LayoutLookup:
         self, queried: Mapping[SchemaId, Sender], added: Collection[SchemaId]
     ) -> None:
         with self._changed:
+            if not added:
+                self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
+            self._note_outage()  # after the pause, because Zenoh ends a query before it reports a broken link
             for schema_id, queried_sender in queried.items():
+                if self._is_returning and schema_id not in added:
+                    continue  # asked again
                 sender = self._open.pop(schema_id)
                 failures = self._failed.pop(schema_id, (0,))[0]
                 if schema_id not in added and sender != queried_sender:
@@ -176,8 +207,6 @@ class LayoutLookup:
             while len(self._failed) > limits.FAILED_DEFINITIONS:
                 del self._failed[next(iter(self._failed))]
             self._changed.notify_all()
-            if not added:
-                self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
 
     def _add(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
         size = len(fields) + _BASE
@@ -232,6 +261,14 @@ _FIELDS: Final = TypeAdapter(
     Annotated[list[_Field], Field(max_length=limits.LAYOUT_FIELDS)],
     config=ConfigDict(defer_build=True),
 )
+
+
+def has_router(session: Session) -> bool:
+    """Return whether a session has a router; True for a closed one."""
+    try:
+        return bool(session.info.routers_zid())
+    except zenoh.ZError:
+        return True
 
 
 def find_schemas(ids: Mapping[SchemaId, Sender], *, session: Session, prefix: str) -> Schemas:

@@ -107,6 +107,22 @@ def test_lookups_continue_after_an_unexpected_error(caplog: pytest.LogCaptureFix
     lookup.close()
 
 
+def test_lookup_goes_on_while_the_link_is_down() -> None:
+    """A reader waits for a definition whose publisher is out of reach, and a lookup without a link is no failure."""
+    is_linked, queries = threading.Event(), list[bool]()
+
+    def find(ids: Collection[SchemaId]) -> Schemas:
+        queries.append(is_linked.is_set())
+        if queries.count(False) > 2:
+            is_linked.set()
+        returned = queries.count(True) > 2  # the publisher returns to the router after the reader
+        return dict.fromkeys(ids, FIELDS) if returned else {}
+
+    lookup = LayoutLookup(find, is_linked=is_linked.is_set)
+    assert lookup.codec("First", "hash", wait=True)
+    lookup.close()
+
+
 def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
     """A request on the receiving thread starts a lookup without waiting for the reply; closing waits for it."""
     queried, answering = threading.Event(), threading.Event()
