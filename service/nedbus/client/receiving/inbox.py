@@ -8,6 +8,7 @@ oldest beyond its limit. Either way drops are counted, and neither the session n
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import threading
 import time
@@ -443,10 +444,12 @@ def check_count(name: str, count: object) -> None:
         raise ArgumentError(name, count, "a number of messages above 0, or None for the default")
 
 
-def check_timeout(timeout: object) -> None:
+def check_timeout(timeout: float | None) -> None:
     """Raise ArgumentError unless `timeout` is None or a number of seconds."""
+    if timeout is None:
+        return
     is_number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
-    if timeout is not None and not (is_number and timeout == timeout):  # NaN differs from itself
+    if not is_number or math.isnan(timeout):
         raise ArgumentError("timeout", timeout, "a number of seconds, or None to wait without limit")
 
 
