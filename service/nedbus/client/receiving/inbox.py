@@ -444,13 +444,14 @@ def check_count(name: str, count: object) -> None:
         raise ArgumentError(name, count, "a number of messages above 0, or None for the default")
 
 
-def check_timeout(timeout: float | None) -> None:
+def check_timeout(timeout: object) -> None:
     """Raise ArgumentError unless `timeout` is None or a number of seconds."""
     if timeout is None:
         return
-    is_number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
-    if not is_number or math.isnan(timeout):
-        raise ArgumentError("timeout", timeout, "a number of seconds, or None to wait without limit")
+    if not isinstance(timeout, int | float) or isinstance(timeout, bool) or math.isnan(timeout):
+        raise ArgumentError(
+            "timeout", timeout, "a number of seconds, or None to wait without limit"
+        )
 
 
 @cache
