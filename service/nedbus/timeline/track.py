@@ -22,6 +22,8 @@ _CREDIBLE_PAUSE: Final = 30 * 86_400_000_000  # us between two log times; a long
 _CREDIBLE_END: Final = 86_400_000_000
 _CONFIRM: Final = 20  # messages in a row that show that a clock has changed
 _AGREEING: Final = 3  # streams that show together that a clock has gone on
+# messages of a log that may be late between the first ones after a pause
+_LATE_AFTER_PAUSE: Final = 5
 
 
 class Message(Protocol):
@@ -165,15 +167,18 @@ class Track(Generic[M]):
 
         A log may have late messages of other streams between those that went on.
         """
-        if item.log is not None or self._passed >= _CONFIRM:
+        if item.log is not None or self._passed > _LATE_AFTER_PAUSE:
             return False
-        others = [each for each in self.doubtful if each.stream is not item.stream]
-        is_other_stream = len(others) == len(self.doubtful)
-        return is_other_stream and all(each.stamp > self.newest for each in others)
+        are_ahead = all(each.stamp > self.newest for each in self.doubtful)
+        are_others = all(each.stream is not item.stream for each in self.doubtful)
+        return are_ahead and are_others
 
     def end(self) -> list[Placed[M]]:
         """Return the places of the messages that still wait."""
         placed: list[Placed[M]] = []
+        if self._passed:
+            placed += self._place_outliers(self.doubtful, self._newest_before)
+            self.doubtful = []
         while self.doubtful:
             placed += self._decide(is_end=True)
         return placed

@@ -177,6 +177,21 @@ def test_late_message_right_after_a_pause_is_in_order(streams: int) -> None:
     assert not order.unordered
 
 
+@pytest.mark.parametrize("end", range(1, 8))
+def test_stream_of_a_log_on_another_clock_has_its_places_in_the_file(end: int) -> None:
+    """A stream that is always ahead, as of a receiver with its own clock, is no pause, unless the log ends with it."""
+    stamps = [5_000_000 + number * STEP for number in range(500)]
+    messages = list[Message]()
+    for number, stamp in enumerate(stamps):
+        messages.append(Message(stamp, stamp))
+        if number % 10 == 9 - end:
+            ahead = stamp + 4_000_000_000
+            messages.append(Message(ahead, ahead, logged="ahead"))
+    order = Order[Message](has_log_times=False)
+    assert [*order.arrange(messages)] == messages
+    assert order.duration == pytest.approx(9.98)
+
+
 def test_message_of_a_log_with_a_damaged_timestamp_is_counted() -> None:
     """A single message of a log that is ahead of its own stream, and of the others, keeps its place in the file."""
     stamps = [5_000_000 + number * 4_000 for number in range(2_000)]
