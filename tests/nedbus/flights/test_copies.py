@@ -216,10 +216,10 @@ def test_growing_file_is_read_as_far_as_it_is(tmp_path: Path) -> None:
     writer = UlogWriter()
     writer.define([VLP])
     for index in range(20_000):
-        writer.add(VLP, message(1_000_000 + index, x=float(index)))
+        writer.add(VLP, message(10_000 * (100 + index), x=float(index)))
     path = writer.write(tmp_path / "a.ulg")
     written = len(writer.data)
-    writer.add(VLP, message(2_000_000))
+    writer.add(VLP, message(10_000 * 20_100))
     with nedbus.open(path) as flight:
         samples = flight()
         next(samples)
