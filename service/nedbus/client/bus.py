@@ -122,7 +122,7 @@ class Bus(AbstractContextManager["Bus"]):
     @property
     def connected(self) -> bool:
         """True if the bus is connected to a router."""
-        return bool(self._session.info.routers_zid())
+        return has_router(self._session)
 
     @overload
     def subscribe(

@@ -127,11 +127,11 @@ def test_log_that_goes_back_by_more_than_a_second_has_a_new_boot(back: int, boot
     assert [each.timestamp for each in found] == first + again
 
 
-@pytest.mark.parametrize("rate", [100, 1_000, 2_000, 6_000])
+@pytest.mark.parametrize("rate", [100, 1_000, 2_000, 8_000])
 def test_message_that_is_logged_late_is_in_order(rate: int) -> None:
     """PX4 logs a topic with a low rate up to 2 s late, whatever the rate of the others."""
     messages = list[Message]()
-    for number in range(30_000):
+    for number in range(11 * rate):
         stamp = 5_000_000 + number * 1_000_000 // rate
         messages.append(Message(stamp, stamp))
         if number and number % (5 * rate) == 0:

@@ -123,6 +123,24 @@ def test_lookup_goes_on_while_the_link_is_down() -> None:
     lookup.close()
 
 
+def test_reader_does_not_wait_for_the_end_of_a_long_outage(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """While the link is down, each wait for a definition ends, and the lookup goes on."""
+    monkeypatch.setattr(layout_lookup, "_LONGEST_OUTAGE", 0.3)
+    is_linked = threading.Event()
+
+    def find(ids: Collection[SchemaId]) -> Schemas:
+        return dict.fromkeys(ids, FIELDS) if is_linked.is_set() else {}
+
+    lookup = LayoutLookup(find, is_linked=is_linked.is_set)
+    for _ in range(3):
+        assert lookup.codec("First", "hash", wait=True) is None
+    is_linked.set()
+    wait_for(lambda: lookup.codec("First", "hash"), what="the definition")
+    lookup.close()
+
+
 def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
     """A request on the receiving thread starts a lookup without waiting for the reply; closing waits for it."""
     queried, answering = threading.Event(), threading.Event()
