@@ -3,11 +3,14 @@
 Rates and ages use a monotonic clock, because the wall clock may be set at any time.
 """
 
+from __future__ import annotations
+
 import math
 import threading
 import time
+from array import array
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -149,6 +152,17 @@ class _Summary(NamedTuple):
     flags: dict[str, float] | None
 
 
+def _numbers() -> array[float]:
+    """Return an empty series of numbers of 8 bytes each, a quarter of those in a deque: there may be 10,000 streams."""
+    return array("d")
+
+
+def _keep_latest(numbers: array[float], count: int) -> None:
+    """Remove all numbers but the latest `count`."""
+    if len(numbers) > count:
+        del numbers[:-count]
+
+
 @dataclass(slots=True, eq=False)
 class _Window:
     """Measurements of one second, or longer for a slow stream."""
@@ -157,7 +171,7 @@ class _Window:
     messages: int = 0
     # number, mean [s], sum of squared differences from the mean
     intervals: tuple[int, float, float] = (0, 0.0, 0.0)
-    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=limits.MEASURED_LATENCIES))
+    latencies: array[float] = field(default_factory=_numbers)  # the latest ones [s]
     flags: _FlagCounts = field(default_factory=Counter)
     _summary: _Summary | None = None  # None after a new message
 
@@ -219,6 +233,14 @@ class Histogram:
         self.sum += value
 
 
+@lru_cache(maxsize=256)
+def _reader_of(topic: str) -> FieldReader:
+    """Return the reader of the evaluated fields of a topic, which its streams share."""
+    if topic in DEFAULT.topics:
+        return FieldReader(_FIELDS)
+    return FieldReader(_FIELDS[:1])
+
+
 class StreamHealth:
     """Measure one stream, message by message, in constant memory; one thread may add while others read.
 
@@ -228,21 +250,19 @@ class StreamHealth:
     def __init__(self, topic: str) -> None:
         self._topic = get_topic(topic)
         self._is_position = topic in DEFAULT.topics  # the message that has flags and reset counters
-        fields = _FIELDS[:1]
         counters: Iterable[Quantity] = ()
         if self._is_position:
-            fields = _FIELDS
             counters = RESET_COUNTERS
-        self._read = FieldReader(fields)
+        self._read = _reader_of(topic)
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
         self._earlier = 0  # PX4's time before the last one
-        self._steps = deque[int](maxlen=_USUAL)  # us between two messages
+        self._steps = _numbers()  # the latest ones between two messages [us]
         self._usual_step = 0.0  # their median, updated every _USUAL messages and at a gap
         self._is_regular = True  # by these steps, updated with their median
         self._rebooted: int | None = None  # when the first message after the last reboot arrived
-        self._intervals = deque[float](maxlen=_USUAL)  # s between arrivals
+        self._intervals = _numbers()  # the latest ones between arrivals [s]
         self._usual_interval: float | None = None  # their median; None after a new one
         self._usual_rate: float | None = None
         self._flags: _FlagCounts = Counter()
@@ -255,7 +275,7 @@ class StreamHealth:
         self._window = _Window(0)
         self._last_window: _Window | None = None  # the last full one
         # at most _BATCH
-        self._waiting = deque[tuple[tuple[Any, ...], int, float | None, int, Collection[str]]]()
+        self._waiting = list[tuple[tuple[Any, ...], int, float | None, int, Collection[str]]]()
         self._window_end = _WINDOW  # of those that wait
         self._lock = threading.Lock()
 
@@ -285,7 +305,8 @@ class StreamHealth:
         """Measure them for a caller that holds the lock."""
         if not self._waiting:
             return
-        waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        waiting = self._waiting.copy()
+        del self._waiting[: len(waiting)]  # others may be added meanwhile
         self._measure_all(*zip(*waiting, strict=True))
 
     def _measure_all(
@@ -308,13 +329,15 @@ class StreamHealth:
         if len(times) > 1:
             intervals = [(later - earlier) / 1e9 for earlier, later in pairwise(times)]
             window.add_intervals(intervals)
-            self._intervals.extend(intervals)
+            self._intervals.fromlist(intervals)
+            _keep_latest(self._intervals, _USUAL)
             self._usual_interval = None
         self._received = received[-1]
         for latency in latencies:
             if latency is not None:
                 window.latencies.append(latency)
                 self._latencies.add(latency)
+        _keep_latest(window.latencies, limits.MEASURED_LATENCIES)
         self._flags_ever = None
         for fields, absent, arrived in zip(values, missing, received, strict=True):
             rebooted = self._add_time(int(fields[0]), arrived)
@@ -455,6 +478,8 @@ class StreamHealth:
         is_gap = step > _FACTOR * self._usual_step > 0 and len(steps) >= _MIN_STEPS
         self._gaps += is_gap and not self._is_on_change
         steps.append(step)
+        if len(steps) > _USUAL:
+            steps.pop(0)
         if is_gap or len(steps) < _USUAL or self._messages % _USUAL == 0:
             self._usual_step = median(steps)
             if not self._topic.rate:
@@ -481,13 +506,13 @@ class StreamHealth:
                 self._rebooted = received
             self._time = timestamp
             self._usual_step = 0.0
-            self._steps.clear()
+            self._steps = _numbers()
             return True
         self._out_of_order += 1
         return False
 
 
-def _is_regular(steps: Collection[int], usual: float) -> bool:
+def _is_regular(steps: Collection[float], usual: float) -> bool:
     """Return whether these intervals are those of a periodic stream; `usual`: their median."""
     outliers = sum(not usual / _FACTOR <= step <= usual * _FACTOR for step in steps)
     return usual > 0 and outliers <= _IRREGULAR * len(steps)
