@@ -23,6 +23,7 @@ COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "err
 """
 
 _STEP: Final = 0.095  # s between two points
+_FIRST_POINTS: Final = 16  # for which a history has memory at first
 _TRUTH_WINDOW: Final = 0.5  # s; older ground truth is not compared with an estimate
 _state_of = attrgetter(
     "xy_reset_counter",
@@ -67,14 +68,16 @@ class Position(NamedTuple):
 
 
 class History:
-    """Ring buffer of the newest `size` points; `written` counts all points written so far."""
+    """Ring buffer of the newest `size` points; `written` counts all points written so far.
+
+    Its memory grows with its points: there are up to 1,000 streams, and many have few points.
+    """
 
     def __init__(self, size: int, step: float) -> None:
         self.size = size
         self.step = step
         self.written = 0
-        # uses no memory until written, and only positions are written
-        self._points = np.empty((size, len(COLUMNS)))
+        self._points = np.empty((0, len(COLUMNS)))
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
         """Return points `begin` to `end` that are not overwritten yet, oldest first; shape (n, columns)."""
@@ -86,8 +89,17 @@ class History:
 
     def write(self, values: list[float]) -> None:
         """Write the next point."""
-        self._points[self.written % self.size] = values
+        slot = self.written % self.size
+        if slot == len(self._points):
+            self._grow()
+        self._points[slot] = values
         self.written += 1
+
+    def _grow(self) -> None:
+        length = min(self.size, max(_FIRST_POINTS, 2 * len(self._points)))
+        grown = np.empty((length, len(COLUMNS)))
+        grown[: len(self._points)] = self._points
+        self._points = grown
 
 
 class Origin(CommonOrigin):

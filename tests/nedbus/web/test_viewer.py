@@ -7,6 +7,7 @@ import math
 import re
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -145,6 +146,22 @@ def test_track_is_a_ring_with_a_line_per_state() -> None:
     assert lines["east"] == pytest.approx([0, 1, 2, nan, nan, nan, 0, nan], nan_ok=True)
     assert lines["valid0"] == pytest.approx([10, nan, 12, nan, nan, nan, 10, nan], nan_ok=True)
     assert lines["doubtful"][:3] == pytest.approx([nan, 11, nan], nan_ok=True)
+
+
+def test_history_grows_with_its_points() -> None:
+    """A history of 600 points takes under 2 kB for its first one, and keeps the newest points however many follow."""
+    tracemalloc.start()
+    try:
+        history = History(size=600, step=0.1)
+        history.write([0.0] * len(COLUMNS))
+        used, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert used < 2000
+    for number in range(1, 1000):
+        history.write([float(number)] * len(COLUMNS))
+        first = max(0, number - 599)
+        assert history.points()[:, 0].tolist() == list(range(first, number + 1))
 
 
 def test_tracks_send_only_new_points(sim: SimulatedFleet) -> None:
