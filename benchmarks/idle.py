@@ -29,7 +29,7 @@ NAMES: Final = """
 import json, os, threading
 def resume():
     while os.read(0, 1):
-        print(json.dumps({each.native_id: each.name for each in threading.enumerate()}), flush=True)
+        print(json.dumps({thread.native_id: thread.name for thread in threading.enumerate()}), flush=True)
 threading.Thread(target=resume, name="benchmark", daemon=True).start()
 """  # print the names of the Python threads for each line on stdin: Linux knows only Zenoh's thread names
 BUSES: Final = """
@@ -140,8 +140,8 @@ def measure(process: Process, seconds: float) -> str:
 def switches(process: Process) -> dict[int, Any]:
     """Return the context switches of each thread so far; voluntary switches are wake-ups."""
     return {
-        each.id: psutil.Process(each.id).num_ctx_switches()
-        for each in psutil.Process(process.pid).threads()
+        thread.id: psutil.Process(thread.id).num_ctx_switches()
+        for thread in psutil.Process(process.pid).threads()
     }
 
 

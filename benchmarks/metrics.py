@@ -79,8 +79,8 @@ class Service:
 
     def _cpu(self) -> dict[int, float]:
         return {
-            each.id: each.user_time + each.system_time
-            for each in psutil.Process(self.process.pid).threads()
+            thread.id: thread.user_time + thread.system_time
+            for thread in psutil.Process(self.process.pid).threads()
         }
 
     def _published(self) -> float:

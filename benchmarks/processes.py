@@ -40,7 +40,7 @@ class Checkout(NamedTuple):
         """Start a Python process that imports this checkout; `errors`: target of its stderr."""
         packages = {
             "PYTHONPATH": os.pathsep.join(
-                str(self.folder / each) for each in ("service", "schemas")
+                str(self.folder / name) for name in ("service", "schemas")
             )
         }
         return start(

@@ -109,13 +109,15 @@ def _motion(quantity: Quantity, messages: Sequence[Fields]) -> list[Point]:
             moved[index] = (turned,)
             continue
         near = [
-            each for each in (index - 1, index + 1) if 0 <= each < len(pairs) and not is_reset[each]
+            other
+            for other in (index - 1, index + 1)
+            if 0 <= other < len(pairs) and not is_reset[other]
         ]
         rates = [
-            [step / seconds[each] for step in steps[each]] for each in near if seconds[each] > 0
+            [step / seconds[other] for step in steps[other]] for other in near if seconds[other] > 0
         ]
         moved[index] = tuple(
-            seconds[index] * sum(each) / len(each) for each in zip(*rates, strict=True)
+            seconds[index] * sum(axis) / len(axis) for axis in zip(*rates, strict=True)
         )
         moved[index] = moved[index] or (math.nan,) * len(steps[index])
     return moved
@@ -164,7 +166,7 @@ def main() -> None:
             *(f"{rule:>10}" for rule in RULES),
         )
         for quantity, by_rule in residuals(arguments.folder, thinned=thinned).items():
-            sums = (f"{sum(each):>10.3f}" for each in by_rule.values())
+            sums = (f"{sum(values):>10.3f}" for values in by_rule.values())
             print(f"{quantity + ' [' + UNITS[quantity] + ']':<16} {len(by_rule['rule']):>6}", *sums)
 
 

@@ -188,8 +188,8 @@ def measure(vehicles: int, readers: int, seconds: int, way: str) -> str:
         results = [json.loads(expect(reader)) for reader in receiving]
         end(*receiving, publisher)
     received, lost = (
-        min(each["received"] for each in results),
-        max(each["lost"] for each in results),
+        min(result["received"] for result in results),
+        max(result["lost"] for result in results),
     )
     return (
         f"{vehicles:8} {readers:7} {seconds:8}  {received:8} / {sent:<8} {lost:8}"

@@ -30,7 +30,7 @@ from nedbus.transport import open_router
 from nedbus_msgs import Address
 endpoint, count, interval = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 types = {"vehicle_local_position": nedbus.VehicleLocalPosition, "vehicle_status": nedbus.VehicleStatus}
-messages = {topic: each(timestamp=1) for topic, each in types.items()}
+messages = {topic: message(timestamp=1) for topic, message in types.items()}
 here, name, opening = collections.deque(), 0, collections.deque(maxlen=500)
 def start(readers):
     session = open_router(listen=(endpoint,))
@@ -128,7 +128,7 @@ def measure(
         opening, seconds = json.loads(expect(processes["publisher"], timeout))
         time.sleep(3.0)
         stages.append([memory_mb(process) for process in processes.values()])
-        memory = " ".join(f"{each:9.1f}" for each in stages[-1])
+        memory = " ".join(f"{megabytes:9.1f}" for megabytes in stages[-1])
         scrapes = "; ".join(f"{name} {scrape(pages[name])}" for name in ("service", "export"))
         print(
             f"{number * stage:8} {stage / seconds:8.1f} {opening:8.2f}      {memory}   {scrapes}",

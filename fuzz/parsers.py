@@ -212,9 +212,9 @@ def parse_mavlink(data: bytes) -> int:
                         system, LogStream(str(system), options, receiver.vehicles[system].client)
                     )
                     found += log.add(item.chunk, now)
-                for each in found:
-                    if isinstance(each, SourceMessage):
-                        _validate(each.definition or BY_TOPIC[each.address.topic], each.fields)
+                for made in found:
+                    if isinstance(made, SourceMessage):
+                        _validate(made.definition or BY_TOPIC[made.address.topic], made.fields)
                         count += 1
     for system, log in logs.items():
         client, now = receiver.vehicles[system].client, time.monotonic()

@@ -60,7 +60,7 @@ def mcap_seeds() -> Iterator[bytes]:
     with TemporaryDirectory() as folder:
         path = Path(folder, "seed.mcap")
         with RecordingWriter(path) as writer:
-            chosen = (each for each in _golden() if each[0].name in _RECORDED)
+            chosen = [vector for vector in _golden() if vector[0].name in _RECORDED]
             for number, (definition, fields) in enumerate(chosen, 1):
                 message = definition.model.model_validate(fields)
                 topic = next(iter(definition.topics.values()))
@@ -109,13 +109,16 @@ def mavlink_seeds() -> Iterator[bytes]:
     sent = [frame for _, is_sent, frame in datagrams(SHORT) if is_sent]
     telemetry = [unpack(frame) for frame in sent if stream_message(frame) is None]
     stream = [unpack(frame) for frame in sent if stream_message(frame) is not None]
-    heartbeat = next(each for each in telemetry if each[0] == dialect.MAVLINK_MSG_ID_HEARTBEAT)
+    heartbeat = next(
+        (number, payload)
+        for number, payload in telemetry
+        if number == dialect.MAVLINK_MSG_ID_HEARTBEAT
+    )
     kinds = {number: payload for number, payload in telemetry if number in MAVLINK_KINDS}
     for number, payload in kinds.items():
         yield _framed([heartbeat, (number, payload), (number, payload)])
-    yield _framed(
-        [heartbeat, *(each for each in telemetry if each[0] in MAVLINK_KINDS)][:_TELEMETRY]
-    )
+    used = [(number, payload) for number, payload in telemetry if number in MAVLINK_KINDS]
+    yield _framed([heartbeat, *used][:_TELEMETRY])
     yield _framed([heartbeat, *stream[:_STREAM]])
     result = struct.pack("<HBBiBB", dialect.MAV_CMD_LOGGING_START, 0, 0, 0, *MAVLINK_IDS)
     answer = dialect.MAVLINK_MSG_ID_COMMAND_ACK, result
@@ -182,7 +185,7 @@ def _streamed_log() -> bytes:
     messages = filter(
         None, (stream_message(frame) for _, is_sent, frame in datagrams(SHORT) if is_sent)
     )
-    unique = {each.sequence: each.data for each in messages}
+    unique = {message.sequence: message.data for message in messages}
     return _trim(b"".join(unique.values()))
 
 
@@ -270,7 +273,8 @@ def _as_stream(log: bytes) -> Iterator[tuple[int, bytes]]:
         starts.append(offset)
     for number, start in enumerate(range(0, len(log), _PIECE)):
         piece = log[start : start + _PIECE]
-        first = next((each - start for each in starts if start <= each < start + len(piece)), 255)
+        begun = (begin - start for begin in starts if start <= begin < start + len(piece))
+        first = next(begun, 255)
         payload = struct.pack("<HBBBB", number, *MAVLINK_IDS, len(piece), first) + piece
         is_acked = start < len(log) / 2
         ids = dialect.MAVLINK_MSG_ID_LOGGING_DATA_ACKED, dialect.MAVLINK_MSG_ID_LOGGING_DATA

@@ -59,7 +59,7 @@ def main() -> None:
     complete = Part(
         find_forms(),
         list(LOADS),
-        [DEFAULT_FLIGHT, *(each for each in FLIGHTS if each != DEFAULT_FLIGHT)],
+        [DEFAULT_FLIGHT, *(flight for flight in FLIGHTS if flight != DEFAULT_FLIGHT)],
     )
     parser = argparse.ArgumentParser(description="Compare nedbus with its peers.")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
@@ -164,7 +164,7 @@ def print_medians(results: Results) -> None:
             if results.has(flight, load, other) and form != other
         ]
         medians = describe(load, results.median(flight, load, form))
-        print(f"{flight}, {name}, {form}: {medians}" + "".join(f"; {each}" for each in ratios))
+        print(f"{flight}, {name}, {form}: {medians}" + "".join(f"; {ratio}" for ratio in ratios))
     for form, reason in results.failed.items():
         print(f"{form}: {reason}")
 

@@ -74,7 +74,7 @@ def flight_table(results: Results) -> str:
             for key in ("publish_cpu", "receive_cpu", "p50")
         ]
         lines.append(
-            f"| {form.replace('_', ' ')} | {' | '.join(cells)} | {' / '.join(f'{each:.2f}' for each in ten)} |"
+            f"| {form.replace('_', ' ')} | {' | '.join(cells)} | {' / '.join(f'{ratio:.2f}' for ratio in ten)} |"
         )
     return "\n".join(lines)
 

@@ -67,7 +67,7 @@ def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) ->
         stuck = start("-m", "benchmarks.readers.stuck_reader", behaves, endpoint, stuck_reads)
         live = _publisher(endpoint, sent[LIVE], rate, LIVE)
         replay = _publisher(endpoint, messages, 0, REPLAYED) if REPLAYED in healthy_reads else None
-        processes = [each for each in (healthy, stuck, live, replay) if each is not None]
+        processes = [process for process in (healthy, stuck, live, replay) if process is not None]
         try:
             for process in processes:
                 expect(process)

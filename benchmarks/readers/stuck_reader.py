@@ -63,7 +63,7 @@ def main() -> None:
         reads_on.set()
         sys.stdin.readline()
         wait_for_quiet(
-            lambda: max(each.last for each in got.values()), quiet=QUIET, timeout=TIMEOUT
+            lambda: max(reader.last for reader in got.values()), quiet=QUIET, timeout=TIMEOUT
         )
         report = {
             vehicle: {

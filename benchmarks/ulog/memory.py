@@ -104,13 +104,13 @@ def read_stream(name: str) -> Recording:
 
 def prolong(recording: Recording, name: str, seconds: float) -> None:
     """Replace the messages after the header by as many as PX4 sends in this time, and by heartbeats."""
-    data = [each for each in recording.entries if isinstance(each.content, Message)]
+    data = [entry for entry in recording.entries if isinstance(entry.content, Message)]
     rate = _SIZE * len(data) / (data[-1].time - data[0].time)  # bytes of ULog per second
     begin = recording.header_end
     heartbeat = next(
-        each.content
-        for each in recording.entries
-        if isinstance(each.content, bytes) and is_heartbeat(each.content)
+        entry.content
+        for entry in recording.entries
+        if isinstance(entry.content, bytes) and is_heartbeat(entry.content)
     )
     stream = [
         Entry(begin + number * _SIZE / rate, message)

@@ -70,12 +70,12 @@ def measure(seconds: float) -> str:
     recording = read_recording(FLIGHT)
     with ExitStack() as closing:
         setups = [Setup(recording, options, closing) for options in ("", POSITION)]
-        scripts = [start("-c", SCRIPT, each.endpoint) for each in setups]
+        scripts = [start("-c", SCRIPT, setup.endpoint) for setup in setups]
         for script in scripts:
             closing.callback(end, script, timeout=2.0)
             expect(script)
         time.sleep(HEADER)
-        services = [each.service for each in setups]
+        services = [setup.service for setup in setups]
         before, began = cpu_seconds(*services), time.monotonic()
         time.sleep(seconds)
         after, passed = cpu_seconds(*services), time.monotonic() - began

@@ -71,9 +71,10 @@ def compare(
     name: str, measure: Callable[[Checkout], float], checkouts: tuple[Checkout, ...], rounds: int
 ) -> None:
     """Measure each checkout in turn, and print the times and the median of their ratios."""
-    times = [[measure(each) for each in checkouts] for _ in range(rounds)]
-    costs = " vs. ".join(f"{statistics.median(each):.1f} us" for each in zip(*times, strict=True))
-    ratios = [each[0] / each[1] for each in times if len(each) > 1]
+    times = [[measure(checkout) for checkout in checkouts] for _ in range(rounds)]
+    medians = [statistics.median(of_checkout) for of_checkout in zip(*times, strict=True)]
+    costs = " vs. ".join(f"{median:.1f} us" for median in medians)
+    ratios = [of_round[0] / of_round[1] for of_round in times if len(of_round) > 1]
     ratio = (
         f", ratio {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
         if ratios

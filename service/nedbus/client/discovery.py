@@ -98,9 +98,9 @@ class SourceStatus(UntrustedReply):
             *self.silent,
             *(stream.address for stream in self.streams),
         )
-        return {_vehicle_of(each) for each in addresses} | {
-            each.vehicle for each in self.log_streams
-        }
+        vehicles = {_vehicle_of(address) for address in addresses}
+        vehicles.update(log_stream.vehicle for log_stream in self.log_streams)
+        return vehicles
 
     def about(self, vehicle: str, *, refused: Collection[str]) -> SourceStatus:
         """Return what this status says about one vehicle, and which streams it has of the `refused` ones."""

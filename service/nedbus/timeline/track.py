@@ -169,8 +169,8 @@ class Track(Generic[M]):
         """
         if item.log is not None or self._passed > _LATE_AFTER_PAUSE:
             return False
-        are_ahead = all(each.stamp > self.newest for each in self.doubtful)
-        are_others = all(each.stream is not item.stream for each in self.doubtful)
+        are_ahead = all(other.stamp > self.newest for other in self.doubtful)
+        are_others = all(other.stream is not item.stream for other in self.doubtful)
         return are_ahead and are_others
 
     def end(self) -> list[Placed[M]]:

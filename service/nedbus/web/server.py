@@ -324,6 +324,8 @@ class _TextHandler(RequestHandler):
         self.set_header("X-Content-Type-Options", "nosniff")
         self.finish(page.content)
 
+    head = get  # Tornado leaves the content out
+
 
 class _Refusal(_TextHandler):
-    head = post = put = patch = delete = options = _TextHandler.get
+    post = put = patch = delete = options = _TextHandler.get

@@ -101,8 +101,19 @@ def test_page_has_the_viewport_of_a_phone(endpoint: str) -> None:
         assert '<meta name="viewport" content="width=device-width' in page.read().decode()
 
 
+def test_probes_may_ask_for_the_head_only(url: str) -> None:
+    """HEAD has the status and the length of GET, as probes and `curl -I` expect."""
+    for path in PATHS[1:]:
+        request = urllib.request.Request(url + path, method="HEAD")  # noqa: S310 - our own address
+        with urllib.request.urlopen(request, timeout=DEADLINE) as response:  # noqa: S310 - our own address
+            assert response.status == 200
+            assert response.headers["Content-Length"] == str(len(Page.text("a text").content))
+            assert not response.read()
+    assert status_of(url, method="HEAD", Host="evil.example") == 403
+
+
 def test_write_methods_and_large_bodies_are_refused(url: str) -> None:
-    """Only GET is answered; a body of 100 MB is refused before it is sent, whatever the Host header."""
+    """Only GET and HEAD are answered; a body of 100 MB is refused before it is sent, whatever the Host header."""
     for path, method in product(PATHS, ("POST", "PUT", "DELETE")):
         assert status_of(url + path, method=method) in {403, 405}
         assert status_of(url + path, method=method, Host="evil.example") == 403
