@@ -30,7 +30,7 @@ from nedbus.transport import open_router
 from nedbus_msgs import Address
 endpoint, count, interval = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 types = {"vehicle_local_position": nedbus.VehicleLocalPosition, "vehicle_status": nedbus.VehicleStatus}
-messages = {topic: message(timestamp=1) for topic, message in types.items()}
+messages = {topic: model(timestamp=1) for topic, model in types.items()}
 here, name, opening = collections.deque(), 0, collections.deque(maxlen=500)
 def start(readers):
     session = open_router(listen=(endpoint,))

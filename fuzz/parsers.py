@@ -212,9 +212,10 @@ def parse_mavlink(data: bytes) -> int:
                         system, LogStream(str(system), options, receiver.vehicles[system].client)
                     )
                     found += log.add(item.chunk, now)
-                for made in found:
-                    if isinstance(made, SourceMessage):
-                        _validate(made.definition or BY_TOPIC[made.address.topic], made.fields)
+                for output in found:
+                    if isinstance(output, SourceMessage):
+                        definition = output.definition or BY_TOPIC[output.address.topic]
+                        _validate(definition, output.fields)
                         count += 1
     for system, log in logs.items():
         client, now = receiver.vehicles[system].client, time.monotonic()

@@ -60,7 +60,11 @@ def mcap_seeds() -> Iterator[bytes]:
     with TemporaryDirectory() as folder:
         path = Path(folder, "seed.mcap")
         with RecordingWriter(path) as writer:
-            chosen = [vector for vector in _golden() if vector[0].name in _RECORDED]
+            chosen = [
+                (definition, fields)
+                for definition, fields in _golden()
+                if definition.name in _RECORDED
+            ]
             for number, (definition, fields) in enumerate(chosen, 1):
                 message = definition.model.model_validate(fields)
                 topic = next(iter(definition.topics.values()))
@@ -273,8 +277,8 @@ def _as_stream(log: bytes) -> Iterator[tuple[int, bytes]]:
         starts.append(offset)
     for number, start in enumerate(range(0, len(log), _PIECE)):
         piece = log[start : start + _PIECE]
-        begun = (begin - start for begin in starts if start <= begin < start + len(piece))
-        first = next(begun, 255)
+        offsets = (begin - start for begin in starts if start <= begin < start + len(piece))
+        first = next(offsets, 255)
         payload = struct.pack("<HBBBB", number, *MAVLINK_IDS, len(piece), first) + piece
         is_acked = start < len(log) / 2
         ids = dialect.MAVLINK_MSG_ID_LOGGING_DATA_ACKED, dialect.MAVLINK_MSG_ID_LOGGING_DATA

@@ -72,9 +72,9 @@ def compare(
 ) -> None:
     """Measure each checkout in turn, and print the times and the median of their ratios."""
     times = [[measure(checkout) for checkout in checkouts] for _ in range(rounds)]
-    medians = [statistics.median(of_checkout) for of_checkout in zip(*times, strict=True)]
+    medians = [statistics.median(checkout_times) for checkout_times in zip(*times, strict=True)]
     costs = " vs. ".join(f"{median:.1f} us" for median in medians)
-    ratios = [of_round[0] / of_round[1] for of_round in times if len(of_round) > 1]
+    ratios = [round_times[0] / round_times[1] for round_times in times if len(round_times) > 1]
     ratio = (
         f", ratio {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
         if ratios

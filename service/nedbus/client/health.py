@@ -153,7 +153,7 @@ class _Summary(NamedTuple):
 
 
 def _numbers() -> array[float]:
-    """Return an empty series of numbers of 8 bytes each, a quarter of those in a deque: there may be 10,000 streams."""
+    """Return an empty array of doubles, which take 8 bytes each, a quarter of the floats in a deque."""
     return array("d")
 
 
@@ -190,6 +190,11 @@ class _Window:
             + (own - mean) ** 2 * number * added / total
         )
         self.intervals = total, mean + (own - mean) * added / total, squares
+
+    def add_latencies(self, latencies: list[float]) -> None:
+        """Add latencies [s]; keep the latest ones."""
+        self.latencies.fromlist(latencies)
+        _keep_latest(self.latencies, limits.MEASURED_LATENCIES)
 
     def summary(self) -> _Summary:
         """Return the values of the messages so far."""
@@ -233,9 +238,9 @@ class Histogram:
         self.sum += value
 
 
-@lru_cache(maxsize=256)
-def _reader_of(topic: str) -> FieldReader:
-    """Return the reader of the evaluated fields of a topic, which its streams share."""
+@lru_cache(maxsize=1024)
+def _topic_reader(topic: str) -> FieldReader:
+    """Return the reader of the evaluated fields, which all streams of a topic share."""
     if topic in DEFAULT.topics:
         return FieldReader(_FIELDS)
     return FieldReader(_FIELDS[:1])
@@ -253,7 +258,7 @@ class StreamHealth:
         counters: Iterable[Quantity] = ()
         if self._is_position:
             counters = RESET_COUNTERS
-        self._read = _reader_of(topic)
+        self._read = _topic_reader(topic)
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
@@ -333,11 +338,10 @@ class StreamHealth:
             _keep_latest(self._intervals, _USUAL)
             self._usual_interval = None
         self._received = received[-1]
-        for latency in latencies:
-            if latency is not None:
-                window.latencies.append(latency)
-                self._latencies.add(latency)
-        _keep_latest(window.latencies, limits.MEASURED_LATENCIES)
+        known = [latency for latency in latencies if latency is not None]
+        window.add_latencies(known)
+        for latency in known:
+            self._latencies.add(latency)
         self._flags_ever = None
         for fields, absent, arrived in zip(values, missing, received, strict=True):
             rebooted = self._add_time(int(fields[0]), arrived)
@@ -478,8 +482,7 @@ class StreamHealth:
         is_gap = step > _FACTOR * self._usual_step > 0 and len(steps) >= _MIN_STEPS
         self._gaps += is_gap and not self._is_on_change
         steps.append(step)
-        if len(steps) > _USUAL:
-            steps.pop(0)
+        _keep_latest(steps, _USUAL)
         if is_gap or len(steps) < _USUAL or self._messages % _USUAL == 0:
             self._usual_step = median(steps)
             if not self._topic.rate:

@@ -324,7 +324,7 @@ class _TextHandler(RequestHandler):
         self.set_header("X-Content-Type-Options", "nosniff")
         self.finish(page.content)
 
-    head = get  # Tornado leaves the content out
+    head = get  # Tornado omits the body
 
 
 class _Refusal(_TextHandler):

@@ -23,7 +23,7 @@ COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "err
 """
 
 _STEP: Final = 0.095  # s between two points
-_FIRST_POINTS: Final = 16  # for which a history has memory at first
+_FIRST_POINTS: Final = 16  # initial capacity of a history
 _TRUTH_WINDOW: Final = 0.5  # s; older ground truth is not compared with an estimate
 _state_of = attrgetter(
     "xy_reset_counter",
@@ -70,7 +70,7 @@ class Position(NamedTuple):
 class History:
     """Ring buffer of the newest `size` points; `written` counts all points written so far.
 
-    Its memory grows with its points: there are up to 1,000 streams, and many have few points.
+    Its memory grows with its points, because many streams have few.
     """
 
     def __init__(self, size: int, step: float) -> None:
