@@ -86,6 +86,14 @@ def test_health_does_not_depend_on_when_it_is_read() -> None:
     assert first == second
 
 
+def test_usual_interval_is_that_of_the_latest_messages() -> None:
+    """After 40 intervals of 0.1 s, 7 of 1 s are not usual yet, and 8 are: half of the latest 15."""
+    fast = [number / 10 for number in range(41)]
+    slow = [4.0 + number for number in range(1, 9)]
+    assert stream_at(*fast, *slow[:7]).usual_interval == pytest.approx(0.1)
+    assert stream_at(*fast, *slow).usual_interval == pytest.approx(1.0)
+
+
 def test_slow_streams_are_small() -> None:
     """The health of a stream at 2 Hz takes at most 5 kB, because a fleet has thousands of them."""
     number = 200
