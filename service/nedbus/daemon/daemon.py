@@ -264,6 +264,8 @@ class Daemon:
             queries.close()
             registry.heartbeats.close()
             session.close()
+            # their calls into Zenoh fail now; a thread that is still in one when Python exits aborts the process
+            stop_workers(self._workers, _GRACE)
             if self._permission is not None:
                 self._permission.close()
         has_failed = any(source.state == "failed" for source in self.sources)

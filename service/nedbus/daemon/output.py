@@ -2,6 +2,7 @@
 
 import logging
 import math
+import threading
 from collections import Counter
 from collections.abc import Callable, Container
 from contextlib import suppress
@@ -147,8 +148,10 @@ class SourceOutput:
         """First rejection of each origin."""
         return tuple(self._warnings.values())
 
-    def claim_all(self, run: ReplayRun, *, lossless: bool) -> None:
+    def claim_all(self, run: ReplayRun, *, lossless: bool, stop: threading.Event) -> None:
         """Claim all addresses known at the start of a run, or none, so two sources cannot block each other.
+
+        `stop` ends it early: a busy computer may take seconds for a log of several hundred topics.
 
         Raises AddressInUseError if another source of this service publishes one of them.
         """
@@ -156,6 +159,8 @@ class SourceOutput:
             if address in self._registry.publishers:
                 raise AddressInUseError(address)
         for address, definition in islice(run.addresses.items(), limits.REPLAYED_ADDRESSES):
+            if stop.is_set():
+                return
             self.claim(address, definition, lossless=lossless)
 
     def claim(

@@ -255,7 +255,7 @@ class Worker:
         speed = source.options.speed
         run = self._open_run(source)
         self._output.release(keep=run.addresses)
-        self._output.claim_all(run, lossless=speed is None)
+        self._output.claim_all(run, lossless=speed is None, stop=self._clock)
         self._set_state("running")
         pace = Pace(speed or 1.0)
         start = self._clock.now()

@@ -6,9 +6,10 @@ import json
 import math
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus.daemon import Daemon, PlannedSource
 from nedbus.daemon.output import SourceOutput
+from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus.vehicle_events import EventLog
@@ -342,6 +345,36 @@ def test_signal_stops_a_replay_blocked_by_a_stuck_reader(tmp_path: Path, serve: 
         wait_for(is_blocked, what="the replay to block")
         service.signal(signal.SIGTERM)
         service.wait()
+
+
+class SlowToOpen:
+    """A source in a call that returns a moment after its session was closed, as some calls into Zenoh do."""
+
+    def __init__(self) -> None:
+        self.has_started = threading.Event()
+
+    def listen(self, router: Session | None) -> Iterator[None]:
+        assert router is not None
+        self.has_started.set()
+        with suppress(zenoh.ZError):
+            while True:
+                router.put("slow", b"")
+        threading.Event().wait(0.2)
+        yield None
+
+
+def test_service_ends_after_the_threads_of_its_sources() -> None:
+    """A source that is busy in Zenoh has ended when the service ends; otherwise it would abort the process."""
+    daemon = Daemon(load_settings(source=("sim:",), listen=(free_endpoint(),)), version="0")
+    source = SlowToOpen()
+    daemon._plan = [PlannedSource(0, "slow:", "1", source)]
+    thread = threading.Thread(target=daemon.run)
+    thread.start()
+    assert source.has_started.wait(10.0)
+    daemon.stop()
+    thread.join(20.0)
+    assert not thread.is_alive()
+    assert "slow:" not in {running.name for running in threading.enumerate()}
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -157,7 +158,8 @@ def test_addresses_of_a_replay_are_limited() -> None:
     addresses: dict[Address, Definition[Any] | None] = dict.fromkeys(
         Address(f"v{number}", VLP) for number in range(10_001)
     )
-    fake.output.claim_all(ReplayRun(iter(()), addresses, None, ""), lossless=True)
+    run = ReplayRun(iter(()), addresses, None, "")
+    fake.output.claim_all(run, lossless=True, stop=threading.Event())
     assert len(fake.output.addresses) == 10_000
     last = [*addresses][-1]
     for address in (last, last, POSITION):

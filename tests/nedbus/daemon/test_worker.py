@@ -218,6 +218,24 @@ def test_replay_at_full_speed_is_lossless_and_unpaced() -> None:
     assert harness.registry.log[0] == "0 +1 lossless ulog"
 
 
+def test_stop_ends_the_opening_of_publishers() -> None:
+    """On a busy computer, a stopped replay of hundreds of topics does not open the rest of its publishers."""
+    clock = FakeClock(stop_at=3.0)
+    harness = Harness(
+        FakeReplay([at(0.0, Address(str(number), VLP)) for number in range(10)]), clock
+    )
+    open_publisher = harness.registry.publisher
+
+    def open_slowly(*arguments: Any, **options: Any) -> SimpleNamespace:
+        clock.seconds += 1.0
+        return open_publisher(*arguments, **options)
+
+    harness.registry.publisher = open_slowly  # type: ignore[method-assign]
+    harness.worker.run()
+    assert harness.status.published == 0
+    assert len(harness.registry.publishers) == 3
+
+
 def test_late_replay_shifts_its_schedule() -> None:
     """After its host was suspended, a replay does not send faster to catch up."""
     clock = FakeClock()
