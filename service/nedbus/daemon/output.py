@@ -55,13 +55,13 @@ class _Stream:
         """Whether a live source has delivered a message."""
         return self.last_received > -math.inf
 
-    @property
-    def patience(self) -> float:
-        """Seconds without a message until the stream is stale."""
+    def is_fresh(self, now: float) -> bool:
+        """Return whether the last message is recent, compared with the usual interval."""
+        silence = now - self.last_received
+        if silence < TIMINGS.stale:  # most streams; needs no interval
+            return True
         usual = self.health.usual_interval
-        if usual is None:
-            return TIMINGS.stale
-        return max(TIMINGS.stale, 3 * usual)
+        return usual is not None and silence < 3 * usual
 
     def carries(self, definition: Definition[Any] | None) -> bool:
         """Return whether the publisher is open for messages of a definition; None for that of the topic."""
@@ -293,11 +293,7 @@ class SourceOutput:
         without a rate stay published while other messages of their vehicle arrive.
         """
         now = self._now()
-        fresh = {
-            address
-            for address, stream in self._streams.items()
-            if now - stream.last_received < stream.patience
-        }
+        fresh = {address for address, stream in self._streams.items() if stream.is_fresh(now)}
         vehicles = {address.vehicle for address in fresh}
         for address in self._streams:
             if address.vehicle in vehicles and not get_topic(address.topic).rate:
