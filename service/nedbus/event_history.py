@@ -22,7 +22,7 @@ class EventHistory:
     `reports`: by vehicle, worst first, the report that describes it; `vehicles` has the states.
     `times`: conversion of event times to UTC. `from_start`: by vehicle, the conditions that are active since its first
     message and cause no event, as text. `dropped`: oldest events left out, because there are more than 100,000.
-    `warnings`: damage of the files, and what was left out.
+    `warnings`: damage of the files, and what was left out. `begins`: by vehicle, when its file begins; 0 if not named.
     """
 
     events: tuple[Event, ...]
@@ -31,6 +31,7 @@ class EventHistory:
     from_start: Mapping[str, str] = field(default_factory=dict)
     dropped: int = 0
     warnings: tuple[str, ...] = ()
+    begins: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def vehicles(self) -> dict[str, VehicleReport]:
@@ -91,6 +92,7 @@ class EventHistory:
             end=report.now,
             at=at_time,
             since=state.first,
+            begin=self.begins.get(name, 0.0),
         )
         others = tuple(events_outside(verdict.stories, events))
         return replace(verdict, others=others)

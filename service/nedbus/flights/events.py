@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +15,7 @@ from nedbus.samples import SourceMessage
 from nedbus.timeline import UtcOffset
 from nedbus.vehicle_events import EVENT_TOPICS, EventLog, Times, by_vehicle, report_of
 
-from .flight import Flight, open_messages
+from .flight import Extent, Flight, open_messages
 from .readers import ReadOptions
 
 EVENT_OPTIONS: Final = ReadOptions(topics={*EVENT_TOPICS})
@@ -30,17 +30,24 @@ _SETTLE_TIME: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class FileEvents:
-    """Events of complete files; `end`: time of the last message. Times are seconds since the first message."""
+    """Events of complete files; `end`: time of the last message. Times are seconds since the first message.
+
+    `extents`: begin and end of the file of each vehicle, for several files.
+    """
 
     event_log: EventLog
     times: Times
     end: float
     warnings: tuple[str, ...]
+    extents: Mapping[str, Extent] = field(default_factory=dict)
 
     def history(self) -> EventHistory:
         """Return the retained events and the state of each vehicle at the end."""
         events, total = self.event_log.events_since(0)
         report = report_of(self.event_log, "", "", self.end, within=math.inf)
+        reports = by_vehicle([report])
+        for name in self.extents.keys() & reports.keys():
+            reports[name] = replace(reports[name], now=self.extents[name].end)
         from_start = {}
         for name, vehicle in sorted(self.event_log.vehicles.items()):
             text = vehicle.held_from_start
@@ -48,11 +55,12 @@ class FileEvents:
                 from_start[name] = text
         return EventHistory(
             events=tuple(sorted(events, key=lambda event: event.time)),
-            reports=by_vehicle([report]),
+            reports=reports,
             times=self.times,
             from_start=from_start,
             dropped=total - len(events),
             warnings=self.warnings,
+            begins={name: extent.begin for name, extent in self.extents.items()},
         )
 
 
@@ -63,7 +71,8 @@ def read_file_events(*paths: Path) -> FileEvents:
         for _ in follow_flight(flight, event_log):
             pass
         event_log.label_first_events()
-        return FileEvents(event_log, times_of(flight), flight.duration, flight.warnings)
+        extents = flight._extents(flight._readers)
+        return FileEvents(event_log, times_of(flight), flight.duration, flight.warnings, extents)
 
 
 def read_flight_events(flight: Flight) -> FileEvents:
@@ -81,7 +90,8 @@ def read_flight_events(flight: Flight) -> FileEvents:
         for reader in readers:
             reader.close()
     event_log.label_first_events()
-    return FileEvents(event_log, times_of(flight), end, flight.warnings)
+    extents = flight._extents(readers)
+    return FileEvents(event_log, times_of(flight), end, flight.warnings, extents)
 
 
 def times_of(flight: Flight) -> Times:

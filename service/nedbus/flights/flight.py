@@ -98,6 +98,13 @@ def open_messages(paths: Sequence[Path], options: ReadOptions = _BUILT_IN) -> Fl
     return flight
 
 
+class Extent(NamedTuple):
+    """Begin and end of one of several files: seconds since the first message of all."""
+
+    begin: float
+    end: float
+
+
 class _Period(NamedTuple):
     """A part of a flight: seconds since its first message; `end`: None for the rest of it."""
 
@@ -365,6 +372,19 @@ class Flight(AbstractContextManager["Flight"]):
         """The Unix time of the first message of each file [s]; raise SourceError if it is unknown."""
         files = zip(self._readers, self._utc, strict=True)
         return [_start_of(reader, utc) for reader, utc in files]
+
+    def _extents(self, readers: Sequence[FlightReader]) -> dict[str, Extent]:
+        """Return the extent of the file of each vehicle after a pass over several files; {} for one file."""
+        extents = dict[str, Extent]()
+        if len(readers) == 1:
+            return extents
+        starts = self._starts
+        for start, reader, names in zip(starts, readers, self._names, strict=True):
+            begin = start - min(starts)
+            extent = Extent(begin, begin + reader.order.duration)
+            for name in names.values():
+                extents[name] = extent
+        return extents
 
     def _find(self, address: Address) -> tuple[int, Address]:
         """Return the number of the file that has an address, and the address in this file."""

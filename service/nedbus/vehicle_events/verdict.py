@@ -164,13 +164,14 @@ def verdict_of(
     end: float,
     at: float | None = None,
     since: float | None = None,
+    begin: float = 0.0,
 ) -> Verdict:
     """Return the verdict on a vehicle.
 
     `events`: events in chronological order; only those of this vehicle and of ALL are used. `held`: conditions active
     after the last event. `topics`: published topics. `unknown`: flags that its position does not provide.
     `end`: now, or the end of the file, on the event log's clock [s]. `at`: the time in question, None for all.
-    `since`: time of the first position in live data, None if unknown.
+    `since`: time of the first position in live data, None if unknown. `begin`: the begin of the vehicle's file.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     held = list(held)
@@ -178,7 +179,7 @@ def verdict_of(
     has_validity = not set(POSITIONS).isdisjoint(topics) and "xy_valid" not in unknown
     healthy = True if has_validity else None
     if not stories:
-        text = _without_faults(held, times, end, since)
+        text = _without_faults(held, times, end, since, begin)
         if not has_validity:
             text += f"; {_describe_unknown(topics)}"
         return Verdict(text, healthy, vehicle, times, end)
@@ -262,10 +263,10 @@ def _missing(worst: Story, evidence: _Evidence) -> str:
 
 
 def _without_faults(
-    held: Iterable[Condition], times: Times, end: float, since: float | None
+    held: Iterable[Condition], times: Times, end: float, since: float | None, begin: float
 ) -> str:
     if not times.is_live:
-        text = f"no faults in {end:.0f} s"
+        text = f"no faults in {end - begin:.0f} s"
     elif since is None:
         text = "no faults in the services' history"
     else:

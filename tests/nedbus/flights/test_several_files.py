@@ -18,7 +18,7 @@ from nedbus.tables import array_of, read_plotted
 from nedbus.web.playback import Recording
 from nedbus_msgs import Selection
 from tests.flights.messages import VALID, VLP, message
-from tests.flights.ulogs import UlogWriter
+from tests.flights.ulogs import LOGS, UlogWriter
 from tests.peers.command_line import run_command
 from tests.waits import wait_for
 
@@ -73,6 +73,34 @@ def test_events_of_several_files_share_utc(swarm: list[str]) -> None:
     assert run_command("events", "-v", "a_1", *swarm).out == ""
     why = run_command("why", "-v", "b", "--at", "08:54:26", *swarm)
     assert "b: not usable: xy and vxy not valid from 08:54:25.0" in why.out, why.err
+
+
+def test_verdict_refers_to_the_file_of_its_vehicle(tmp_path: Path) -> None:
+    """Of two flights an hour apart, each lasts as long as its own file, and so does a fault until its end."""
+    first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=7)
+    second = write_flight(tmp_path / "b.ulg", boot=0, start=3600, seconds=4)
+    files = [first, second]
+    with nedbus.open(files) as flight:
+        for history in (nedbus.events(files), nedbus.events(flight)):
+            verdicts = history.verdicts()
+            assert "until the end (2.9 s)" in verdicts["a"].text
+            assert verdicts["b"].text.startswith("no faults in 4 s; ")
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} does not exist")
+def test_verdict_among_several_files_is_that_of_the_file_alone() -> None:
+    """Four real flights of one vehicle have the same verdicts together as each alone."""
+    names = [
+        "gps_off_in_flight",
+        "link_cut_20s_in_flight",
+        "baro_failure",
+        "foreign_stop_in_flight",
+    ]
+    files = {name: LOGS.parent / "px4" / f"{name}.ulg" for name in names}
+    together = nedbus.why([*files.values()])
+    for name, path in files.items():
+        assert together[name].text == nedbus.why(path)["4"].text
 
 
 def test_commands_in_the_docs_run(
