@@ -113,9 +113,13 @@ class EventHistory:
             expected = f"one of {', '.join(names)}"
         raise AddressError("vehicle", vehicle, expected, problem="is not in this history")
 
-    def _moment(self, at: str | None, events: list[Event]) -> float | None:
+    def _moment(self, at: object, events: list[Event]) -> float | None:
         """Return the time in question on the clock of the events; None for all."""
-        if at is None or not events:
+        if at is None:
+            return None
+        if not isinstance(at, str):
+            raise ArgumentError("at", at, f"a string, such as {_AT}")
+        if not events:
             return None
         try:
             return self.times.find(at, events[-1])

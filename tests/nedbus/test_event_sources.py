@@ -162,6 +162,9 @@ def test_invalid_source_raises(log: Path, tmp_path: Path, bus: nedbus.Bus) -> No
             match=rf"at '{at}' is not in this data \({reason}\): expected 14:05",
         ):
             nedbus.why(log, at=at)
+    number: Any = 6.5
+    with pytest.raises(nedbus.ArgumentError, match=r"at 6\.5 is not valid: expected a string"):
+        nedbus.why(log, at=number)
     with nedbus.open(log) as flight:
         pass
     with pytest.raises(nedbus.ClosedError):

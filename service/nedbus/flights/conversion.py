@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from pydantic import ValidationError
 
 from nedbus.atomic_write import atomic_write
-from nedbus.errors import OutputError, SourceError
+from nedbus.errors import ConfigError, OutputError, SourceError
 from nedbus.extras import import_optional
 from nedbus.log_event import about
 from nedbus.samples import SourceMessage
@@ -71,8 +71,9 @@ def convert_files(
     far, and that of all.
 
     Raises the errors of `nedbus.open` for the files, AddressError for an invalid topic or vehicle, ConfigError for an
-    output with another suffix, OutputError if the output exists or cannot be written, SourceError if all messages are
-    rejected. No partial file is left behind. Needs the extra `mcap`, else raises ConfigError.
+    output with another suffix, or `vehicle` with several files, OutputError if the output exists or cannot be written,
+    SourceError if all messages are rejected. No partial file is left behind. Needs the extra `mcap`, else raises
+    ConfigError.
     """
     sources = [source] if isinstance(source, str | Path) else source
     paths = [Path(path).expanduser() for path in sources]
@@ -82,6 +83,8 @@ def convert_files(
         name = None
     else:
         name = check_vehicle(vehicle_name(vehicle))
+        if len(paths) > 1:
+            raise ConfigError("vehicle", "one id would join several files; remove this option")
     with open_messages(paths, ReadOptions(topics_of(names), name)) as flight:
         summary = convert_flight(flight, Path(output).expanduser(), on_progress=on_progress)
         known = {address.topic for address in flight.definitions}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -9,6 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from itertools import islice
+from numbers import Real
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypedDict, Unpack, overload
@@ -428,10 +430,12 @@ class Flight(AbstractContextManager["Flight"]):
             warnings += [f"{reader.path}: {text}" for text in texts]
         return tuple(warnings)
 
-    def _seconds(self, time: float | datetime, name: str) -> float:
+    def _seconds(self, time: object, name: str) -> float:
         """Return seconds since the first message."""
         if not isinstance(time, datetime):
-            return time
+            if not isinstance(time, Real) or math.isnan(time):
+                raise ArgumentError(name, time, "seconds, or a datetime with a time zone")
+            return float(time)
         if time.tzinfo is None:
             expected = "seconds, or a datetime with a time zone, such as datetime(2025, 10, 9, 8, 53, tzinfo=UTC)"
             raise ArgumentError(

@@ -44,6 +44,8 @@ def test_conversion_of_invalid_arguments_leaves_no_file(tmp_path: Path) -> None:
         nedbus.convert(log, output, topics="not a topic")
     with pytest.raises(AddressError, match="vehicle"):
         nedbus.convert(log, output, vehicle="a/b")
+    with pytest.raises(ConfigError, match="one id would join several files"):
+        nedbus.convert([log, log], output, vehicle=7)
     with pytest.raises(ConfigError, match="must end with"):
         nedbus.convert(log, tmp_path / "flight.csv")
     assert list(tmp_path.iterdir()) == [log]

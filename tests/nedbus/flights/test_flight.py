@@ -88,6 +88,17 @@ def test_datetime_without_a_time_zone_is_an_error(tmp_path: Path, option: str) -
         flight(**{option: naive})  # type: ignore[call-overload] # mypy does not know which of the options it is
 
 
+@pytest.mark.parametrize("option", ["start", "end"])
+@pytest.mark.parametrize("value", ["10", math.nan])
+def test_start_and_end_that_are_no_time_raise(tmp_path: Path, option: str, value: Any) -> None:
+    """A string and NaN raise ArgumentError; NaN would select the whole flight."""
+    with (
+        nedbus.open(paused(tmp_path / "a.ulg")) as flight,
+        pytest.raises(ArgumentError, match=f"{option} .* expected seconds, or a datetime"),
+    ):
+        flight(**{option: value})
+
+
 def test_utc_in_a_flight_without_utc_is_an_error(tmp_path: Path) -> None:
     """The error names the remedy: seconds."""
     path = write_log(tmp_path / "a.ulg", steps(1_000_000, 20))
