@@ -48,7 +48,10 @@ _LIVE_ADVICE: Final = (
 )
 _ADVICE: Final = {
     ".ulg": "PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)",
-    ".mcap": "to record them, run 'nedbus record' without --topic while a source publishes them",
+    ".mcap": (
+        "to record them, run 'nedbus record' without --topic while a source publishes them; "
+        "to have them in a converted log, run 'nedbus convert --topics \"*\"' with the log"
+    ),
 }
 
 

@@ -145,7 +145,9 @@ def test_converted_log_has_the_same_events(log: Path, tmp_path: Path) -> None:
     """A log converted to MCAP yields the same events."""
     assert run_command("convert", str(log), "flight.mcap").exit_code == 0
     assert lines_of(run_command("events", "flight.mcap")) == EXPECTED_EVENTS
-    assert "'nedbus record' without --topic" in run_command("why", "flight.mcap", "--all").out
+    advice = run_command("why", "flight.mcap", "--all").out
+    assert "'nedbus record' without --topic" in advice
+    assert "'nedbus convert --topics \"*\"' with the log" in advice
 
 
 @pytest.mark.logs
