@@ -39,11 +39,11 @@ def test_list_of_commands_imports_no_command(start: Start) -> None:
     """`nedbus --help`, and `nedbus` alone, load no message, no setting and no session."""
     program = """
 import sys
-from nedbus.cli import main
+from nedbus.cli import run_command
 for arguments in ["--help"], []:
     sys.argv = ["nedbus", *arguments]
     try:
-        main()
+        run_command()
     except SystemExit:
         pass
     assert not {"pydantic", "nedbus_msgs", "zenoh", "numpy", "nedbus.settings"} & set(sys.modules), arguments

@@ -5,14 +5,27 @@ import gc
 import os
 import signal
 import sys
+from contextlib import suppress
 
 from nedbus import __version__
 
-__all__ = ["main"]
+__all__ = ["main", "run_command"]
 
 
 def main() -> None:
-    """Run `nedbus`."""
+    """Run `nedbus`, and end the process."""
+    exit_code: list[int] = []
+    atexit.register(_end_process, exit_code)  # the first one, so it runs last
+    try:
+        run_command()
+    except SystemExit as exc:
+        if isinstance(exc.code, int):
+            exit_code.append(exc.code)
+        raise
+
+
+def run_command() -> None:
+    """Run the command in `sys.argv`; raise SystemExit when it ends."""
     # no traceback during the imports; a script's `&` sets SIG_IGN
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
@@ -48,6 +61,19 @@ def _repeat_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
         threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
     else:
         sys.__unraisablehook__(unraisable)
+
+
+def _end_process(exit_code: list[int]) -> None:
+    """End the process before Python's finalization, which aborts it if a background thread is in Zenoh or Pydantic.
+
+    A command does not wait for all of its threads: one may still connect to a router, open a log or render a page.
+    """
+    if exit_code:
+        with suppress(OSError):  # the finalization reports it
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(exit_code[0])
 
 
 def _discard_broken_stderr() -> None:

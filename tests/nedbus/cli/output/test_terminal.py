@@ -589,6 +589,36 @@ def test_interrupt_inside_a_destructor_is_repeated(start: Start) -> None:
     assert not health.err
 
 
+FINALIZED = """
+import sys, threading, time
+import zenoh
+from nedbus.cli import main
+
+config = zenoh.Config()
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("listen/endpoints", "[]")
+session = zenoh.open(config)
+subscriber = session.declare_subscriber("end", zenoh.handlers.RingChannel(1))
+threading.Thread(target=subscriber.handler.recv, daemon=True).start()
+
+class Finalized:
+    def __del__(self, put=session.put, sleep=time.sleep):
+        put("end", b"")
+        sleep(100)
+
+sys.finalized = Finalized()
+main()
+"""
+
+
+@pytest.mark.slow
+def test_thread_in_zenoh_does_not_abort_the_exit(start: Start) -> None:
+    """A command ends with its exit code and its whole output, even if a thread returns from Zenoh meanwhile."""
+    schema = start("-c", FINALIZED, "schema", "VehicleAttitude", coverage=False)
+    assert schema.wait() == 0
+    assert json.loads(schema.out)["title"] == "VehicleAttitude"
+
+
 STUCK = """
 import time
 from nedbus.cli import run
