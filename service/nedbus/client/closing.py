@@ -3,6 +3,7 @@
 import atexit
 import ctypes
 import os
+import signal
 import threading
 import time
 import weakref
@@ -13,8 +14,6 @@ from nedbus.transport import is_forked
 from .io_thread import CallThread
 
 _closer = CallThread("nedbus-closer")
-# a thread still in Zenoh at interpreter exit aborts the process
-atexit.register(_closer.drain, timeout=2.0)
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 
 
@@ -61,7 +60,22 @@ def _close_later(close: Callable[[], object]) -> None:
     if threading.main_thread().is_alive():
         _closer.put(close)
     else:  # the process is exiting and no longer waits for threads
+        _let_interrupts_kill()
         close()
+
+
+@atexit.register
+def _drain() -> None:
+    """Wait for the closing thread: one that is still in Zenoh at interpreter exit aborts the process."""
+    _let_interrupts_kill()
+    _closer.drain(timeout=2.0)
+
+
+def _let_interrupts_kill() -> None:
+    """End the process at once on Ctrl-C, instead of leaving a bus open, and its threads in Zenoh, during its exit."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _after_fork() -> None:

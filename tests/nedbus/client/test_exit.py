@@ -214,6 +214,48 @@ def test_ten_subscriptions_need_at_most_twelve_threads(endpoint: str) -> None:
         assert len(set(threading.enumerate()) - before) <= 12
 
 
+INTERRUPTED = """
+import os, signal, threading
+from nedbus.client.closing import Finalizer
+
+class Bus:
+    pass
+
+def close():
+    os.kill(os.getpid(), signal.SIGINT)
+    threading.Event().wait(100)
+
+bus = Bus()
+Finalizer(bus, close)
+"""
+COLLECTED = """
+import os, signal, threading
+from nedbus.client import closing
+
+class Bus:
+    pass
+
+def close():
+    while closing._closer._calls.empty():
+        threading.Event().wait(0.01)  # until the main thread waits for this one
+    os.kill(os.getpid(), signal.SIGINT)
+    threading.Event().wait(100)
+
+bus = Bus()
+closing.Finalizer(bus, close)
+del bus
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [INTERRUPTED, COLLECTED], ids=["open", "collected"])
+def test_ctrl_c_while_a_bus_is_closed_at_exit_kills_the_process(start: Start, script: str) -> None:
+    """Ctrl-C at exit must not leave a bus half closed: a thread that is still inside Zenoh would abort the process."""
+    process = start("-c", script, coverage=False)
+    assert process.wait() == -signal.SIGINT
+    assert not process.err
+
+
 @pytest.mark.long
 def test_publisher_exits_during_a_flood_of_queries(start: Start, endpoint: str) -> None:
     """A reply in progress at process exit does not abort a publisher that is flooded with schema queries."""
