@@ -280,8 +280,11 @@ def _columns_of(definition: Definition[Any]) -> list[str]:
     return [*definition.types, *derived_from(definition.types)]
 
 
-def parse_fields(text: str | None, selection: Selection) -> list[str]:
-    """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
+def parse_fields(text: str | None, selection: Selection, *, elements: bool = False) -> list[str]:
+    """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has.
+
+    `elements`: accept elements of arrays, such as `q[0]`, too.
+    """
     if text is None:
         return []
     names = [name.strip() for name in text.split(",") if name.strip()]
@@ -296,8 +299,11 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     for definition in messages:
         known.update(_columns_of(definition))
     for name in names:
-        if name not in known:
-            raise ConfigError("--field", messages[0].explain_unknown_field(name))
+        field = name
+        if elements:
+            field, _, _ = name.partition("[")
+        if field not in known:
+            raise ConfigError("--field", messages[0].explain_unknown_field(field))
     return names
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -49,6 +50,8 @@ _BOOT: Final = Times()
 _NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
 _MANY_ROWS: Final = 12  # more rows get smaller labels
+# an element of an array field, such as `q[0]`
+_ELEMENT: Final = re.compile(r"(?P<field>\w+)\[(?P<index>\d{1,3})\]", re.ASCII)
 
 _FLAGS: Final = (  # estimator flags
     "xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning",
@@ -117,7 +120,7 @@ def draw_fields(
     streams: _Arrays, names: Sequence[str], path: Path, *, title: str, events: Iterable[Event] = (),
     times: Times = _BOOT,
 ) -> None:  # fmt: skip
-    """Plot fields of streams over time, one below the other; also names of `nedbus.frames.DERIVED`.
+    """Plot fields of streams over time, one below the other; also elements, `q[0]`, and names of `frames.DERIVED`.
 
     Invalid values are gaps. Time axis, events and errors as in `draw`; ConfigError also for a field that no stream has,
     or that is not a number.
@@ -258,23 +261,40 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
 
 
 def _plottable(messages: MessageArray) -> list[str]:
-    """Return the names of the fields with one number or flag each, and of the quantities derived from fields."""
+    """Return what can be plotted: fields, elements of arrays as `q[0] to q[3]`, and quantities derived from fields."""
     names = messages.dtype.names or ()
     plottable = []
     for name in names:
         dtype = messages.dtype[name]
-        if dtype.shape == () and dtype.kind in "biuf":
+        if dtype.base.kind not in "biuf":
+            continue
+        if dtype.shape:
+            plottable.append(f"{name}[0] to {name}[{dtype.shape[0] - 1}]")
+        else:
             plottable.append(name)
     return plottable + derived_from(names)
 
 
 def _values_of(messages: MessageArray, name: str) -> Any:
-    """Return the values of a field, NaN where invalid; None if the messages do not have it."""
+    """Return the values of a field or an element, NaN where invalid; None if the messages do not have it."""
+    element = _ELEMENT.fullmatch(name)
+    if element is not None:
+        return _elements_of(messages, element["field"], int(element["index"]))
     if name not in _plottable(messages):
         return None
     if name in (messages.dtype.names or ()):
         return mask_invalid(messages)[name]
     return derive_column(messages, name)
+
+
+def _elements_of(messages: MessageArray, field: str, index: int) -> Any:
+    """Return the values of an element of an array field; None if the messages do not have it."""
+    if field not in (messages.dtype.names or ()):
+        return None
+    dtype = messages.dtype[field]
+    if dtype.base.kind not in "biuf" or not dtype.shape or index >= dtype.shape[0]:
+        return None
+    return mask_invalid(messages)[field][:, index]
 
 
 def _streams(streams: _Arrays) -> tuple[list[_Stream], float]:

@@ -318,6 +318,20 @@ def test_fields_are_drawn_by_name() -> None:
         plot.draw_field_figure([(address, array)], ["delta_xy"], title="a")
 
 
+@pytest.mark.slow
+def test_elements_of_arrays_are_drawn_by_name() -> None:
+    """`delta_xy[1]` is the second element; one beyond the end is an error that names the last one."""
+    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)
+    address, array = flight_of()
+    array["delta_xy"][:, 1] = np.arange(len(array))
+    figure = plot.draw_field_figure([(address, array)], ["delta_xy[1]"], title="a")
+    (line,) = figure.axes[0].lines
+    assert np.array_equal(line.get_ydata(), array["delta_xy"][:, 1])
+    for name in "delta_xy[2]", "x[0]", "none[0]":
+        with pytest.raises(nedbus.ConfigError, match=r"delta_xy\[0\] to delta_xy\[1\]"):
+            plot.draw_field_figure([(address, array)], [name], title="a")
+
+
 @pytest.mark.long
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL, reason="no real logs")
@@ -326,7 +340,7 @@ def test_plot_command_draws_angles(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     log, picture = LOGS.parent / "px4" / "ev_right.ulg", tmp_path / "a.png"
     command = "plot", str(log), "-t", "vehicle_attitude", "-o", str(picture)
-    plotted = run_command(*command, "--field", "roll_deg,yaw")
+    plotted = run_command(*command, "--field", "roll_deg,yaw,q[3]")
     assert plotted.exit_code == 0, plotted.err
     assert picture.stat().st_size > 10_000
     assert "name fields with --field" in run_command(*command).err

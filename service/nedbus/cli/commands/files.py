@@ -18,7 +18,7 @@ from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 _FLIGHTS: Final = ".ulg, .mcap or .tlog files; several are merged by UTC"
 _IMAGE: Final = "Image to write (default: next to the flight)"
-_PLOTTED: Final = "Fields to plot over time, or height, speed, roll_deg, ..."
+_PLOTTED: Final = "Fields to plot over time, such as x or q[0], or height, speed, roll_deg, ..."
 FlightsArgument = Annotated[
     list[Path], typer.Argument(metavar="FLIGHT", help=_FLIGHTS, show_default=False)
 ]
@@ -76,7 +76,7 @@ def plot(
     draw = tables.draw  # names a missing package before the files are read
     name = ", ".join(map(str, sources))
     selection = Selection(topic, vehicle or ANY, instance)
-    fields = parse_fields(field, selection)
+    fields = parse_fields(field, selection, elements=True)
     is_position = topic in (ANY, *DEFAULT.topics)
     if not fields and not is_position:
         positions = " or ".join(DEFAULT.topics)
