@@ -16,7 +16,7 @@
     │   ├── ListenError (OSError)            cannot listen on the endpoint: port in use, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
     │   ├── RefusedError (PermissionError)   the router's access rules drop what this process publishes
-    │   ├── ClosedError (RuntimeError)       the bus, subscription or publisher is closed
+    │   ├── ClosedError (RuntimeError)       the bus, subscription, publisher or flight is closed
     │   ├── ReceiveError (RuntimeError)      a subscription whose session or thread failed
     │   └── ForkError (RuntimeError)         this process was forked from a connected one
     └── the data
@@ -170,10 +170,10 @@ class OutputError(NedbusError, OSError):
 
 
 class ClosedError(NedbusError, RuntimeError):
-    """Raised when a bus, a subscription or a publisher is used after it was closed."""
+    """Raised when a bus, a subscription, a publisher or a flight is used after it was closed."""
 
     def __init__(self) -> None:
-        super().__init__("the bus, subscription or publisher is closed: open a new one")
+        super().__init__("the bus, subscription, publisher or flight is closed: open a new one")
 
 
 class RefusedError(NedbusError, PermissionError):
