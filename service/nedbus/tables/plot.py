@@ -260,41 +260,44 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
     axes.grid(alpha=0.3)
 
 
-def _plottable(messages: MessageArray) -> list[str]:
-    """Return what can be plotted: fields, elements of arrays as `q[0] to q[3]`, and quantities derived from fields."""
-    names = messages.dtype.names or ()
-    plottable = []
-    for name in names:
+def _numeric_fields(messages: MessageArray) -> dict[str, int]:
+    """Return the number of elements of each field of numbers or flags, 0 for a field that is not an array."""
+    sizes = dict[str, int]()
+    for name in messages.dtype.names or ():
         dtype = messages.dtype[name]
         if dtype.base.kind not in "biuf":
             continue
+        sizes[name] = 0
         if dtype.shape:
-            plottable.append(f"{name}[0] to {name}[{dtype.shape[0] - 1}]")
+            sizes[name] = dtype.shape[0]
+    return sizes
+
+
+def _plottable(messages: MessageArray) -> list[str]:
+    """Return what can be plotted: fields, elements of arrays as `q[0] to q[3]`, and quantities derived from fields."""
+    plottable = derived_from(messages.dtype.names or ())
+    for name, size in _numeric_fields(messages).items():
+        if size:
+            plottable.append(f"{name}[0] to {name}[{size - 1}]")
         else:
             plottable.append(name)
-    return plottable + derived_from(names)
+    return plottable
 
 
 def _values_of(messages: MessageArray, name: str) -> Any:
     """Return the values of a field or an element, NaN where invalid; None if the messages do not have it."""
+    sizes = _numeric_fields(messages)
     element = _ELEMENT.fullmatch(name)
     if element is not None:
-        return _elements_of(messages, element["field"], int(element["index"]))
-    if name not in _plottable(messages):
-        return None
-    if name in (messages.dtype.names or ()):
+        field = element["field"]
+        index = int(element["index"])
+        if index < sizes.get(field, 0):
+            return mask_invalid(messages)[field][:, index]
+    elif sizes.get(name) == 0:
         return mask_invalid(messages)[name]
-    return derive_column(messages, name)
-
-
-def _elements_of(messages: MessageArray, field: str, index: int) -> Any:
-    """Return the values of an element of an array field; None if the messages do not have it."""
-    if field not in (messages.dtype.names or ()):
-        return None
-    dtype = messages.dtype[field]
-    if dtype.base.kind not in "biuf" or not dtype.shape or index >= dtype.shape[0]:
-        return None
-    return mask_invalid(messages)[field][:, index]
+    elif name in derived_from(messages.dtype.names or ()):
+        return derive_column(messages, name)
+    return None
 
 
 def _streams(streams: _Arrays) -> tuple[list[_Stream], float]:

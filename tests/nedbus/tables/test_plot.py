@@ -327,7 +327,7 @@ def test_elements_of_arrays_are_drawn_by_name() -> None:
     figure = plot.draw_field_figure([(address, array)], ["delta_xy[1]"], title="a")
     (line,) = figure.axes[0].lines
     assert np.array_equal(line.get_ydata(), array["delta_xy"][:, 1])
-    for name in "delta_xy[2]", "x[0]", "none[0]":
+    for name in "delta_xy[2]", "delta_xy[0] to delta_xy[1]", "x[0]", "none[0]":
         with pytest.raises(nedbus.ConfigError, match=r"delta_xy\[0\] to delta_xy\[1\]"):
             plot.draw_field_figure([(address, array)], [name], title="a")
 
