@@ -146,7 +146,7 @@ def test_killed_service_is_restarted(machine: Machine) -> None:
 
 def test_watchdog_restarts_hanging_service(machine: Machine) -> None:
     """The watchdog kills only a hanging service, which writes the stacks of its threads and is restarted."""
-    extend(machine, "WatchdogSec=3s\n")
+    extend(machine, "WatchdogSec=8s\n")
     machine.run("systemctl start nedbus")
     process = machine.property("MainPID")
     machine.run(f"{NEDBUS} echo --every -v 1 -n 1000 --json")  # 10 s at 100 Hz

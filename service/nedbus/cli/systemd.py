@@ -62,7 +62,7 @@ class Notifier:
         self._send: Callable[..., bool] = lambda **_: False
         if self._is_active:
             self._send = partial(notify, address)
-        self._watchdog = watchdog_interval(environment)
+        self._watchdog = watchdog_limit(environment)
         self._router_deadline = time.monotonic() + TIMINGS.systemd_patience
         self._counted = time.monotonic(), 0  # time, and messages published until then
         # READY was accepted; `tick` was called since the last ping
@@ -106,8 +106,8 @@ class Notifier:
             self._is_ready = False  # the thread sends READY
 
     def _run(self) -> None:
-        next_status = next_ping = 0.0
-        interval = self._watchdog
+        next_status = 0.0
+        limit = self._watchdog
         errors = UnexpectedErrors(_log, "unexpected error in a status update (logged once)")
         while True:
             now = time.monotonic()
@@ -120,22 +120,22 @@ class Notifier:
                 elif now >= next_status:
                     self._send(STATUS=self._status())
                     next_status = now + TIMINGS.systemd_status
-                if interval is not None and now >= next_ping and self._is_alive(interval):
+                if limit is not None and self._is_alive(limit):
                     self._ticked = False
-                    next_ping = now + interval
                     self._send(WATCHDOG=1)
             if self._is_ready:
                 pause = TIMINGS.systemd_status
             else:
                 pause = _START_INTERVAL
-            if interval is not None:
-                pause = min(pause, interval / 2)
+            if limit is not None:
+                # a ping may be rejected, or a paused host delay it: three more follow within the limit
+                pause = min(pause, limit / 4)
             if self._stop.wait(pause):
                 return
 
-    def _is_alive(self, interval: float) -> bool:
-        """Return whether the main thread has run since the last ping, and no thread has been busy for an interval."""
-        return self._ticked and self._daemon.busy < interval
+    def _is_alive(self, limit: float) -> bool:
+        """Return whether the main thread has run since the last ping, and no source is busy for half of the limit."""
+        return self._ticked and self._daemon.busy < limit / 2
 
     def _status(self) -> str:
         daemon = self._daemon
@@ -161,12 +161,12 @@ class Notifier:
         return to_text("; ".join(texts), limits.LINE_TEXT)
 
 
-def watchdog_interval(environment: Mapping[str, str]) -> float | None:
-    """Return the interval of watchdog pings [s], half of systemd's limit; None if the watchdog is off."""
-    limit = environment.get("WATCHDOG_USEC", "")
+def watchdog_limit(environment: Mapping[str, str]) -> float | None:
+    """Return the longest time that systemd allows between two pings [s]; None if it does not watch this process."""
+    text = environment.get("WATCHDOG_USEC", "")
     pid = environment.get("WATCHDOG_PID", "")
-    if not limit.isdecimal() or int(limit) == 0:
+    if not text.isdecimal() or int(text) == 0:
         return None
     if pid and pid != str(os.getpid()):
         return None
-    return int(limit) / 2e6
+    return int(text) / 1e6
