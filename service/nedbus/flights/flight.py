@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
@@ -433,9 +433,13 @@ class Flight(AbstractContextManager["Flight"]):
     def _seconds(self, time: object, name: str) -> float:
         """Return seconds since the first message."""
         if not isinstance(time, datetime):
-            if not isinstance(time, Real) or math.isnan(time):
+            seconds = math.nan
+            if isinstance(time, Real):
+                with suppress(OverflowError):
+                    seconds = float(time)
+            if math.isnan(seconds):
                 raise ArgumentError(name, time, "seconds, or a datetime with a time zone")
-            return float(time)
+            return seconds
         if time.tzinfo is None:
             expected = "seconds, or a datetime with a time zone, such as datetime(2025, 10, 9, 8, 53, tzinfo=UTC)"
             raise ArgumentError(

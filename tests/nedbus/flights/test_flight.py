@@ -89,9 +89,9 @@ def test_datetime_without_a_time_zone_is_an_error(tmp_path: Path, option: str) -
 
 
 @pytest.mark.parametrize("option", ["start", "end"])
-@pytest.mark.parametrize("value", ["10", math.nan])
+@pytest.mark.parametrize("value", ["10", math.nan, pytest.param(10**400, id="large")])
 def test_start_and_end_that_are_no_time_raise(tmp_path: Path, option: str, value: Any) -> None:
-    """A string and NaN raise ArgumentError; NaN would select the whole flight."""
+    """A string, NaN and an integer beyond float64 raise ArgumentError."""
     with (
         nedbus.open(paused(tmp_path / "a.ulg")) as flight,
         pytest.raises(ArgumentError, match=f"{option} .* expected seconds, or a datetime"),

@@ -39,6 +39,8 @@ from nedbus_msgs import (
 )
 
 _SIMILAR: Final = 0.8  # minimum similarity of a name that counts as a misspelling
+# of a stream without a message so far, or whose publisher does not answer
+_NO_MESSAGE: Final = "no last message"
 
 
 @command
@@ -86,7 +88,7 @@ def list_(bus: Bus, *, vehicle: VehiclesOption = None, json_output: JsonOption =
 
 @dataclass(slots=True)
 class _Stream:
-    """A listed stream; without a sample, health and state are None: its publisher has not answered."""
+    """A listed stream; without a sample, health and state are None."""
 
     address: Address
     health: Health | None = None
@@ -102,7 +104,7 @@ class _Stream:
     def fields(self) -> dict[str, object]:
         """Return the fields of a line of JSON."""
         fields = asdict(self.address)
-        fields |= {"age": None, "state": None, "reason": "no answer"}
+        fields |= {"age": None, "state": None, "reason": _NO_MESSAGE}
         if self.health:
             fields["age"] = self.health.age
         if self.state:
@@ -114,7 +116,7 @@ class _Stream:
     def cells(self) -> list[str]:
         """Return the cells of a row: address, age and state."""
         age = "-"
-        text = "no answer"
+        text = _NO_MESSAGE
         if self.health and self.state:
             text = describe_stream(self.health, self.state)
             if self.health.age is not None:

@@ -100,6 +100,7 @@ def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
             vehicle
         ] * count
         assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
+        assert ('"no last message"' in listed.out) == (vehicle == "silent")
         assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), (
             "no hint about permissions"
         )
