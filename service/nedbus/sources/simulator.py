@@ -28,7 +28,8 @@ _OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
 _ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
 # latitude, longitude [deg], altitude [m]: PX4's default home
 _REFERENCE: Final = (47.397742, 8.545594, 488.0)
-_BOOT: Final = 10_000_000  # us since boot at the start
+UPTIME: Final = 1_500_000
+"""Time since boot at the start [us]: so short that a restart of the simulation is a possible reboot."""
 
 _HEADING_RESET: Final = 15.0  # s into a lap
 _VALID_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
@@ -92,7 +93,7 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float]) 
     heading = wrap(direction + math.pi / 4)
     if math.hypot(velocity[0], velocity[1]) > 0.5:
         heading = math.atan2(velocity[1], velocity[0])
-    timestamp = _BOOT + round(time * 1e6)
+    timestamp = UPTIME + round(time * 1e6)
     return Truth(time, timestamp, position, velocity, acceleration, heading, origin)
 
 
@@ -206,7 +207,7 @@ class Estimator:
             fields |= {
                 "xy_global": True,
                 "z_global": True,
-                "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6),
+                "ref_timestamp": UPTIME + round(_ORIGIN_SET * 1e6),
                 "ref_lat": latitude,
                 "ref_lon": longitude,
                 "ref_alt": altitude,
@@ -263,8 +264,8 @@ class Estimator:
         if failsafe:
             mode = _Status.NAVIGATION_STATE_ALTCTL
         return {
-            "armed_time": _BOOT - 1_000_000,
-            "takeoff_time": _BOOT,
+            "armed_time": UPTIME - 1_000_000,
+            "takeoff_time": UPTIME,
             "arming_state": _Status.ARMING_STATE_ARMED,
             "nav_state": mode,
             "nav_state_display": mode,
