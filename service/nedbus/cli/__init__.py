@@ -11,6 +11,9 @@ from nedbus import __version__
 
 __all__ = ["main", "run_command"]
 
+# by the exceptions that they raise
+_SIGNALS = {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}
+
 
 def main() -> None:
     """Run `nedbus`, and end the process."""
@@ -37,7 +40,7 @@ def run_command() -> None:
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # before the slow imports below
         return
-    sys.unraisablehook = _repeat_interrupt
+    sys.unraisablehook = _repeat_signal
     atexit.register(_discard_broken_stderr)
     # Pydantic would search all installed packages for plugins, which takes a tenth of a short command and 1 MB.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
@@ -53,12 +56,13 @@ def run_command() -> None:
     app()
 
 
-def _repeat_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Report an exception that Python ignores; repeat Ctrl-C, which Python ignores inside destructors and callbacks."""
-    if unraisable.exc_type is KeyboardInterrupt:
+def _repeat_signal(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Report an exception that Python ignores; repeat a signal that it ignored, inside a destructor or callback."""
+    number = _SIGNALS.get(unraisable.exc_type)
+    if number is not None:
         import threading
 
-        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+        threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
     else:
         sys.__unraisablehook__(unraisable)
 

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -49,7 +48,6 @@ def follow(
             _log.warning("the link to %s is lost: reconnecting", routers, extra=about("link_lost"))
 
     bus.on_link(log_link)
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         while seen < most and (now := time.monotonic()) < end:
             if now >= next_second:

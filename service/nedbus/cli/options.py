@@ -5,9 +5,11 @@ import inspect
 import logging
 import re
 import signal
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
@@ -153,36 +155,57 @@ def _options_of(factory: Callable[..., object]) -> list[inspect.Parameter]:
 @contextmanager
 def exit_on_errors() -> Iterator[None]:
     """Report errors in one line and exit: 1 for a failure, 2 for wrong usage, 130 for an interrupt."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # set by `main` for the imports
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    with _raising_signals():
+        try:
+            yield
+        except (ArgumentError, ConfigError, LayoutError) as exc:
+            raise _exit_with(exc, 2) from exc
+        except NedbusError as exc:
+            raise _exit_with(exc, 1) from exc
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+        except BrokenPipeError:
+            # the reader of the pipe has gone (`| head`): the flush at exit would also fail
+            discard_stdout()
+            raise typer.Exit(0) from None
+        except EOFError as exc:  # Typer prints "Aborted." alone
+            hint = "if a full disk truncated Python's bytecode, delete all __pycache__ folders"
+            reason = f"unexpected end of data ({exc}): {hint}; --debug shows the traceback"
+            raise _exit_with(NedbusError(reason), 1) from exc
+        except OSError as exc:
+            where = ""
+            if exc.filename:
+                where = f"{exc.filename}: "
+            raise _exit_with(NedbusError(f"{where}{system_reason(exc)}"), 1) from exc
+        except BaseException as exc:
+            # Zenoh raises this class, which cannot be imported
+            if type(exc).__name__ != "PanicException":
+                raise
+            hint = "check the system clock, free memory and the limit of open files ('ulimit -n')"
+            raise _exit_with(NedbusError(f"Zenoh failed ({exc}): {hint}"), 1) from exc
+
+
+@contextmanager
+def _raising_signals() -> Iterator[None]:
+    """Let signals end a command with an exception: it removes an unfinished file, and shows the cursor again."""
+    handlers = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: _end_command,
+        signal.SIGHUP: _end_command,  # the terminal was closed
+    }
+    for number, handler in handlers.items():
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(number, handler)
     try:
         yield
-    except (ArgumentError, ConfigError, LayoutError) as exc:
-        raise _exit_with(exc, 2) from exc
-    except NedbusError as exc:
-        raise _exit_with(exc, 1) from exc
-    except KeyboardInterrupt:
-        raise typer.Exit(130) from None
-    except BrokenPipeError:
-        # the reader of the pipe has gone (`| head`): the flush at exit would also fail
-        discard_stdout()
-        raise typer.Exit(0) from None
-    except EOFError as exc:  # Typer prints "Aborted." alone
-        hint = "if a full disk truncated Python's bytecode, delete all __pycache__ folders; --debug shows the traceback"
-        raise _exit_with(NedbusError(f"unexpected end of data ({exc}): {hint}"), 1) from exc
-    except OSError as exc:
-        where = ""
-        if exc.filename:
-            where = f"{exc.filename}: "
-        raise _exit_with(NedbusError(f"{where}{system_reason(exc)}"), 1) from exc
-    except BaseException as exc:
-        # Zenoh raises this class, which cannot be imported
-        if type(exc).__name__ != "PanicException":
-            raise
-        hint = "check the system clock, free memory and the limit of open files ('ulimit -n')"
-        raise _exit_with(NedbusError(f"Zenoh failed ({exc}): {hint}"), 1) from exc
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the exit
+        for number in handlers:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, signal.SIG_DFL)  # no traceback during the exit
+
+
+def _end_command(number: int, _: FrameType | None) -> None:
+    sys.exit(128 + number)
 
 
 def _read_settings(

@@ -3,7 +3,6 @@
 import io
 import os
 import shutil
-import signal
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -128,7 +127,6 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
         vertical_overflow="crop",
         redirect_stderr=sys.stderr.isatty(),
     )
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         with live:
             yield show

@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Self
 
 import pytest
+import typer
 from rich.console import Console
 
 import nedbus
+from nedbus.cli.options import exit_on_errors
 from nedbus.cli.output.samples import Lines
 from nedbus.cli.output.streams import printable, to_text
 from nedbus.cli.output.table import live_table, to_table
@@ -27,6 +29,7 @@ from nedbus.timings import Timings
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.flights.messages import VALID, VLP, message
+from tests.nedbus.flights.formats import write_flight
 from tests.peers.command_line import fork_command, run_command, run_until_shown
 from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
@@ -291,7 +294,7 @@ def test_hz_redraws_in_place(
 
 
 @pytest.mark.parametrize(
-    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+    ("number", "raised"), [(signal.SIGINT, typer.Exit), (signal.SIGTERM, SystemExit)]
 )
 def test_signal_during_table_setup_restores_the_cursor(
     monkeypatch: pytest.MonkeyPatch, number: signal.Signals, raised: type[BaseException]
@@ -308,9 +311,10 @@ def test_signal_during_table_setup_restores_the_cursor(
     monkeypatch.setattr(Console, "show_cursor", show_cursor)
     monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: 80)
     handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for each in handlers:
+        signal.signal(each, signal.SIG_DFL)
     try:
-        with pytest.raises(raised), live_table(HEAD, ()) as show:
+        with pytest.raises(raised), exit_on_errors(), live_table(HEAD, ()) as show:
             show(ROWS)
     finally:
         for each, handler in handlers.items():
@@ -564,13 +568,15 @@ def test_interrupt_during_imports_prints_no_traceback(
 
 
 IGNORED = """
-import signal, time
+import signal, sys, time
 from nedbus import settings
 from nedbus.cli import main
 
+number = int(sys.argv.pop())
+
 class Interrupted:
     def __del__(self):
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
 
 def load(*_, **__):
     Interrupted()
@@ -582,11 +588,48 @@ main()
 
 
 @pytest.mark.slow
-def test_interrupt_inside_a_destructor_is_repeated(start: Start) -> None:
-    """Ctrl-C ends a command even if it arrives inside a destructor or callback, where Python ignores it."""
-    health = start("-c", IGNORED, "health", coverage=False)
-    assert health.wait() == 130
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signal_inside_a_destructor_is_repeated(
+    start: Start, number: signal.Signals, exit_code: int
+) -> None:
+    """A signal ends a command even if it arrives inside a destructor or callback, where Python ignores it."""
+    health = start("-c", IGNORED, "health", str(int(number)), coverage=False)
+    assert health.wait() == exit_code
     assert not health.err
+
+
+PAUSED = """
+import time
+from nedbus.cli import main
+from nedbus.flights import conversion
+
+def pause(*_):
+    print("converting", flush=True)
+    time.sleep(100)
+
+conversion._CHUNK = 1
+convert = conversion.convert_flight
+conversion.convert_flight = lambda flight, path, on_progress: convert(flight, path, on_progress=pause)
+main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_signal_during_a_conversion_leaves_no_file(
+    start: Start, tmp_path: Path, number: signal.Signals, exit_code: int
+) -> None:
+    """A conversion that Ctrl-C, `timeout` or a closed terminal ends removes its unfinished file."""
+    log = write_flight(tmp_path / "a.ulg")
+    convert = start("-c", PAUSED, "convert", str(log), str(tmp_path / "a.mcap"), coverage=False)
+    wait_for(lambda: "converting" in convert.out, what="the conversion")
+    assert [*tmp_path.glob("*.mcap")]
+    convert.signal(number)
+    assert convert.wait() == exit_code
+    assert not [*tmp_path.glob("*.mcap")]
+    assert not convert.err
 
 
 FINALIZED = """
