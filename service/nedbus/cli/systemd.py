@@ -128,7 +128,7 @@ class Notifier:
             else:
                 pause = _START_INTERVAL
             if limit is not None:
-                # a ping may be rejected, or a paused host delay it: three more follow within the limit
+                # several within the limit: systemd may reject one, or a busy host delay it
                 pause = min(pause, limit / 4)
             if self._stop.wait(pause):
                 return
