@@ -184,6 +184,10 @@ class SourceOutput:
             if address not in keep:
                 stream.close()
 
+    def begin_dropout(self, message: SourceMessage) -> None:
+        """Record the logging dropout before a message of a replay that is due later: its vehicle is not silent."""
+        self._event_log.add_dropout(message.address.vehicle, message.dropout, clock.steady())
+
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
         address = message.address
@@ -237,14 +241,10 @@ class SourceOutput:
             lost=lost,
             missing=missing,
         )
-        steady = clock.steady()
-        if message.dropout:
-            begin = steady - message.dropout
-            self._event_log.add_dropout(address.vehicle, message.dropout, begin)
         self._event_log.add(
             address,
             row,
-            steady,
+            clock.steady(),
             missing=missing,
             lost=lost,
             is_estimate=message.source == _ULOG_STREAM,
@@ -264,6 +264,9 @@ class SourceOutput:
         received = message.arrived or self._now()
         stream.last_received = received
         stream.last = message
+        if message.dropout:
+            begin = clock.steady() - message.dropout
+            self._event_log.add_dropout(address.vehicle, message.dropout, begin)
         self._publish(message, stream, received)
 
     def _claim_live(self, message: SourceMessage, known: _Stream | None) -> _Stream | None:

@@ -261,6 +261,8 @@ class Worker:
         start = self._clock.now()
         for message in run.messages:
             due = pace.publish_at(message.at)
+            if message.dropout:
+                self._output.begin_dropout(message)
             if speed is not None:
                 start += self._wait_until(start + due)
             if self._clock.is_set():

@@ -143,4 +143,6 @@ class LinkLosses:
 
 
 def _on_link(event: Event, service: str) -> Event:
+    if event.kind == "dropout":  # of the vehicle's logger
+        return event
     return replace(event, text=f"{event.text}, on the link to the service {service}")

@@ -399,7 +399,7 @@ def _slerp(first: _Floats, second: _Floats, weight: _Floats) -> _Floats:
 
 
 def _stamps(stream: str, messages: MessageArray) -> _Ints:
-    """Return the timestamps [us]; raise ConfigError if they restart, for example after a reboot."""
+    """Return the timestamps [us]; raise ConfigError if they step back, for example after a reboot."""
     stamps: _Ints = np.minimum(messages["timestamp"], _NO_TIME).astype(np.int64)
     latest_before = np.maximum.accumulate(stamps)
     earliest_after = np.minimum.accumulate(stamps[::-1])[::-1]
@@ -407,8 +407,9 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
     early = np.count_nonzero(stamps > earliest_after)
     # A few wild timestamps make many others late, or many others early, but not both.
     if min(late, early) > max(1, _STRAY * len(stamps)):
-        remedy = "align the messages of each boot separately, as slices of `read`"
-        raise ConfigError(stream, f"timestamps restart; {remedy}")
+        cause = "after a reboot, or because the vehicle's clock was set"
+        remedy = "align the messages before and after it separately, as slices of `read`"
+        raise ConfigError(stream, f"timestamps step back {cause}; {remedy}")
     return stamps
 
 

@@ -176,7 +176,7 @@ class Vehicle(Conditions):
         if state == "gone":
             self._fall_silent("gone", self.main.stream, time)
             return
-        is_silent = state == "stale"
+        is_silent = state == "stale" and time > self._main_time  # later during a logging dropout
         if state is None and is_connected:
             is_silent = time - self._main_time > rules.SILENCE
         if is_silent:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from nedbus import limits
+from nedbus import clock, limits
 from nedbus.client import PublisherRegistry
 from nedbus.daemon import PlannedSource
 from nedbus.daemon.worker import Clock, Worker
@@ -208,6 +208,27 @@ def test_replay_publishes_each_message_at_its_due_time() -> None:
         True,
     )
     assert harness.ends == 1
+
+
+def test_vehicle_is_not_silent_during_a_dropout_of_a_replay() -> None:
+    """While a replay waits for the end of a logging dropout of 5 s, its vehicle is not silent."""
+    waits = list[float]()
+
+    @dataclass
+    class Watching(FakeClock):
+        def wait(self, seconds: float) -> bool:
+            waits.append(seconds)
+            event_log.update(clock.steady() + 0.9 * seconds, {ONE: "stale"})
+            return super().wait(seconds)
+
+    harness = Harness(
+        FakeReplay([at(0.0), replace(at(5.0), dropout=5.0), at(11.0)]), Watching(stop_at=10.0)
+    )
+    event_log = harness.worker._output._event_log
+    harness.worker.run()
+    assert waits == [5.0, 6.0]
+    assert [event.kind for event in event_log.events] == ["dropout", "silent"]
+    assert event_log.events[1].numbers["age"] == pytest.approx(5.4, abs=0.1)  # after the dropout
 
 
 def test_replay_at_full_speed_is_lossless_and_unpaced() -> None:

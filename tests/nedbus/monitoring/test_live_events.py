@@ -63,3 +63,13 @@ def test_losses_on_the_link_of_a_vehicle_are_live_events(
     assert [(event.vehicle, event.text, event.time) for event in first] == [
         ("7", text, 1.7e9 + 150)
     ]
+
+
+def test_logging_dropout_is_not_on_the_link() -> None:
+    """A dropout is of the vehicle's logger; only losses name the link to the service."""
+    event_log = EventLog()
+    event_log.add(Address("7", VLP), message(1), 0.0)
+    event_log.add_dropout("7", 5.0, 0.1)
+    event_log.settle(20.0)
+    [dropout] = event_log.events
+    assert live_events._on_link(dropout, "gcs") == dropout

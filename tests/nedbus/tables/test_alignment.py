@@ -309,7 +309,8 @@ def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
     assert nedbus.align({VLP: twice}, on=[1_000_000, 1_300_000])[f"{VLP}.x"].tolist() == [1, 3]
     again = np.concatenate([POSITIONS, POSITIONS])
     with pytest.raises(
-        ConfigError, match=f"^{VLP}: timestamps restart; align the messages of each boot"
+        ConfigError,
+        match=f"^{VLP}: timestamps step back after a reboot, or because the vehicle.s clock was set; align",
     ):
         nedbus.align({VLP: again})
     with pytest.raises(
@@ -595,7 +596,7 @@ def test_more_than_one_percent_of_earlier_timestamps_are_a_restart(
     ]
     arrays = {VLP: array_of(VLP, *({"timestamp": stamp} for stamp in stamps))}
     if is_restart:
-        with pytest.raises(ConfigError, match="timestamps restart"):
+        with pytest.raises(ConfigError, match="timestamps step back"):
             nedbus.align(arrays)
     else:
         assert len(nedbus.align(arrays)) == 200
