@@ -284,6 +284,20 @@ def test_truncated_file_is_read_up_to_the_cut(tmp_path: Path) -> None:
     assert counts[-1] == 10
 
 
+def test_recording_that_goes_on_is_read_to_where_it_was_opened(tmp_path: Path) -> None:
+    """What a recorder writes after the file was opened, over the end of the file, is no damage."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        write(writer, message(1))
+        writer.flush()
+        with open_recording(path) as reader:
+            write(writer, *(message(number) for number in range(2, 1000)))
+            writer.flush()
+            assert len([*reader.records()]) == 1
+            assert not reader.warnings
+            assert not reader.damaged
+
+
 def empty_recording() -> bytes:
     file = BytesIO()
     writer = Writer(file)

@@ -61,6 +61,8 @@ _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 # opcode, length, start of summary and summary offsets, CRC, magic
 _FOOTER: Final = struct.Struct("<BQQQI8s")
+# of a recording without an index: a DataEnd record, the footer and the magic
+_END_BYTES: Final = 13 + _FOOTER.size
 # pymcap-cli 0.34.0 `recover`: a chunk keeps the part of its indexes that was left, which lacks the messages of other
 # channels; the statistics lack them as well
 _PARTIAL_INDEXES: Final = "pymcap-cli"
@@ -260,7 +262,7 @@ class ChunkFile:
         while not is_listed or offset < stop:
             record = self._head_at(offset)
             if record is None or record.end > stop:
-                if not is_listed:
+                if not is_listed and not self._is_recorded_on(offset):
                     text = f"skipped truncated or damaged data from byte {offset} of {self.size} to the end"
                     self.warn(text, lost=True)
                 return
@@ -278,6 +280,11 @@ class ChunkFile:
             if opcode in {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}:
                 yield _Place(opcode, offset, record.end)
             offset = record.end
+
+    def _is_recorded_on(self, offset: int) -> bool:
+        """Return whether a recorder has replaced the end of the file, at this byte, since it was opened."""
+        has_grown = os.fstat(self._file.fileno()).st_size > self.size
+        return has_grown and self.size - offset == _END_BYTES
 
     def _head_at(self, offset: int) -> _Head | None:
         """Return the head of the record at this byte; None if it is damaged."""
