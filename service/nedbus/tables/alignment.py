@@ -27,7 +27,7 @@ from .arrays import (
     recording_start,
     to_dataframe,
 )
-from .reading import FlightPath, ReadStreams, read_streams
+from .reading import FlightPath, ReadStreams, names_of, read_streams
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -106,9 +106,8 @@ def align(
     """
     if method not in _METHODS:
         raise ArgumentError("method", method, f"one of {', '.join(_METHODS)}")
-    if isinstance(topics, str):
-        topics = [topics]
-    names = list(topics or ())
+    topics = names_of(topics)
+    names = [*topics] if topics else []
     if isinstance(on, str):
         names.insert(0, on)
     opened: ReadStreams | None = None

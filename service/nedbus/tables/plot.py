@@ -7,6 +7,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -50,6 +51,8 @@ _BOOT: Final = Times()
 _NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
 _MANY_ROWS: Final = 12  # more rows get smaller labels
+_NOTE_WIDTH: Final = 160  # characters
+_RESTART: Final = 1.0  # s; a longer step back is no reordering
 # an element of an array field, such as `q[0]`
 _ELEMENT: Final = re.compile(r"(?P<field>\w+)\[(?P<index>\d{1,3})\]", re.ASCII)
 
@@ -177,7 +180,7 @@ def draw_figure(
     label = _label_times(axes["altitude"], drawn, start, times)
     for name in {"speed", lowest}:
         axes[name].set_xlabel(label)
-    notes = "\n".join(_missing_notes(drawn))
+    notes = "\n".join(fill(note, _NOTE_WIDTH) for note in _notes(drawn))
     figure.supxlabel(notes, fontsize="small")
     if marks:
         _draw_events(figure, axes["events"], marks)
@@ -228,13 +231,26 @@ def _new_figure(height: float, title: str) -> Figure:
     return figure
 
 
-def _missing_notes(streams: Sequence[_Stream]) -> Iterator[str]:
-    """Yield a note for each stream that lacks plotted fields."""
+def _notes(streams: Sequence[_Stream]) -> Iterator[str]:
+    """Yield a note for each stream that lacks plotted fields, and for each with several boots."""
     for stream in streams:
         missing = missing_of(stream.messages)
         names = [name for name in (*_FLAGS, *_COUNTERS) if name in missing]
-        if names:
-            yield f"not in {stream.address}: {', '.join(names)}"
+        absent = [name for name in names if not _has(stream, name)]
+        if absent:
+            yield f"not in {stream.address}: {', '.join(absent)}"
+        partial = [name for name in names if name not in absent]
+        if partial:
+            yield f"not in all messages of {stream.address}, and drawn as off there: {', '.join(partial)}"
+        if (np.diff(stream.seconds) < -_RESTART).any():
+            yield f"{stream.address} restarts, as after a reboot: its parts are drawn over one another"
+
+
+def _has(stream: _Stream, name: str) -> bool:
+    """Return whether any message has a flag or a counter; the missing ones are false or 0."""
+    if name not in missing_of(stream.messages):
+        return True
+    return bool(stream.messages[name].any())
 
 
 def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
@@ -339,7 +355,7 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
     step = _step_of(high - low)
     first = np.ceil(low / step)
     ticks = np.arange(first, high / step) * step
-    labels = [f"{tick:.7g}" for tick in ticks]
+    labels = [f"{tick + 0.0:.7g}" for tick in ticks]  # 0 for -0
     if has_utc:
         labels = [format_utc(tick).removesuffix(".0") for tick in ticks]
     axes.set_xticks(ticks - shift, labels)
@@ -434,12 +450,11 @@ def _rows(streams: Sequence[_Stream]) -> list[_Row]:
         suffix = ""
         if len(streams) > 1:
             suffix = f" {stream.address}"
-        missing = missing_of(stream.messages)
         for flag in _FLAGS:
-            if flag not in missing:
+            if _has(stream, flag):
                 rows.append(_Row(flag + suffix, stream, flag))
         for counter, name in _COUNTERS.items():
-            if counter in missing:
+            if not _has(stream, counter):
                 continue
             if name == "heading" or len(stream.resets(counter)):
                 rows.append(_Row(f"{name} resets{suffix}", stream, counter))

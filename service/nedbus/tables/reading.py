@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, Unpack, overload
 
 from nedbus import Flight
-from nedbus.errors import AddressError, SourceError
+from nedbus.errors import AddressError, ArgumentError, SourceError
 from nedbus.flights import (
     ReadOptions,
     matching,
@@ -126,6 +126,17 @@ class ReadStreams(NamedTuple):
     unix_times: bool
 
 
+def names_of(topics: str | Sequence[str] | None) -> list[str] | None:
+    """Return the names of one topic or several; raise ArgumentError for a message class."""
+    if topics is None:
+        return None
+    names = [topics] if isinstance(topics, str | type) else [*topics]
+    for name in names:
+        if not isinstance(name, str):
+            raise ArgumentError("topic", name, "names of topics, such as 'vehicle_attitude'")
+    return names
+
+
 def read_streams(
     path: Files,
     topics: str | Sequence[str] | None,
@@ -139,7 +150,7 @@ def read_streams(
 
     `topics`: None selects the streams of all topics known to nedbus. `utc`: also read what provides UTC.
     """
-    names = [topics] if isinstance(topics, str) else topics
+    names = names_of(topics)
     vehicle = vehicle_name(vehicle)
     if isinstance(path, FlightPath):
         select = single_match if isinstance(topics, str) else matching

@@ -140,19 +140,52 @@ def test_never_valid_estimate_sets_axis_limits() -> None:
     assert parts["speed"].get_ylim()[0] < 1.0 < parts["speed"].get_ylim()[1]
 
 
+def lacking_flags(array: MessageArray) -> MessageArray:
+    """Return messages whose flags and reset counters some or all of them lack, as `read` returns them."""
+    names = [
+        name for name in array.dtype.names or () if array.dtype[name].kind == "b" or "reset" in name
+    ]
+    return array.view(np.dtype(array.dtype.descr, metadata={"missing": names}))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("events", [[], [event_of("few_satellites", "begin", "watch", 5.0)]])
 def test_flight_without_flags_is_drawn(events: list[Event]) -> None:
     """LOCAL_POSITION_NED without ESTIMATOR_STATUS has no flags: the plot has no rows for them."""
     address, array = flight_of()
-    names = tuple(
-        name for name in array.dtype.names or () if array.dtype[name].kind == "b" or "reset" in name
-    )
-    messages = array.view(
-        np.dtype(array.dtype.descr, metadata={"missing": (*names, "heading_reset_counter")})
-    )
+    messages = lacking_flags(array)
+    for name in messages.dtype.metadata["missing"]:  # type: ignore[index] # it has metadata
+        messages[name] = 0
     axes = drawn([(address, messages)], events)
     assert axes.keys() == {"track", "altitude", "speed"} | ({"events"} if events else set())
+
+
+@pytest.mark.slow
+def test_flags_that_some_messages_lack_are_drawn() -> None:
+    """A MAVLink recording that begins before the first ESTIMATOR_STATUS still shows its flags."""
+    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)
+    address, array = flight_of()
+    array["xy_valid"][:10] = False
+    figure = plot.draw_figure([(address, lacking_flags(array))], title="a flight")
+    axes = {str(each.get_label()): each for each in figure.axes}
+    assert "xy_valid" in rows_of(axes["flags"])
+    assert f"not in all messages of {address}, and drawn as off there: xy_valid" in notes_of(figure)
+
+
+@pytest.mark.slow
+def test_restart_of_a_stream_is_noted() -> None:
+    """Boots are drawn over one another, which a note states."""
+    plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)
+    address, array = flight_of()
+    assert "restarts" not in notes_of(plot.draw_figure([(address, array)], title="a flight"))
+    twice = np.concatenate([array, array])
+    figure = plot.draw_figure([(address, twice)], title="a flight")
+    assert f"{address} restarts, as after a reboot" in notes_of(figure)
+
+
+def notes_of(figure: Any) -> str:
+    """Return the notes below a plot, without line breaks."""
+    return str(figure.get_supxlabel()).replace("\n", " ")
 
 
 @pytest.mark.slow

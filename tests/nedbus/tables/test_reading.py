@@ -26,7 +26,7 @@ from nedbus_msgs.frames import MapProjection
 from tests.flights.local_position import FIELD_TYPES, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
-from tests.flights.ulogs import LOGS, UlogWriter
+from tests.flights.ulogs import LOGS, UlogWriter, write_log
 from tests.peers.command_line import run_command
 
 from .test_alignment import array_of, write
@@ -610,3 +610,13 @@ def test_topic_that_only_the_file_defines_means_its_first_instance(tmp_path: Pat
     path = writer.write(tmp_path / "a.ulg")
     assert nedbus.read(path, "own_topic")["value"].tolist() == [10]
     assert nedbus.read(path, "own_topic", instance=1)["value"].tolist() == [11]
+
+
+@pytest.mark.parametrize("topic", [VehicleLocalPosition, [VehicleLocalPosition]])
+def test_message_class_as_topic_raises(tmp_path: Path, topic: Any) -> None:
+    """`read` and `align` take names of topics; a message class raises ArgumentError."""
+    path = write_log(tmp_path / "a.ulg", [1_000_000])
+    with pytest.raises(ArgumentError, match="expected names of topics"):
+        nedbus.read(path, topic)
+    with pytest.raises(ArgumentError, match="expected names of topics"):
+        nedbus.align(path, topics=topic)

@@ -157,7 +157,7 @@ class UlogReader(FlightReader):
         if not self._subscribed:
             return reason
         names = ", ".join(sorted(self._subscribed)[: limits.SHOWN_NAMES])
-        return f"{reason}, but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
+        return f"{reason}, but of {names}; choose them by name, or all with '*'"
 
     def _take_runs(self, runs: Mapping[ulog.Subscription, Run]) -> Iterator[Run]:
         for subscription, (stream, payloads, _) in runs.items():
