@@ -75,7 +75,17 @@ class _Stream(NamedTuple):
     def resets(self, counter: str) -> Any:
         """Return the times of the changes of a reset counter [s]."""
         steps = np.diff(self.messages[counter].astype(np.int16))
+        steps[self.restarts - 1] = 0
         return self.seconds[1:][steps != 0]
+
+    @property
+    def restarts(self) -> Any:
+        """The indices of the first messages after a restart of the timestamps, as after a reboot."""
+        return np.flatnonzero(np.diff(self.seconds) < -_RESTART) + 1
+
+    def line(self, values: Any) -> Any:
+        """Return values of the messages for a line that breaks at restarts."""
+        return np.insert(np.asarray(values, dtype=np.float64), self.restarts, np.nan)
 
     def position_at(self, seconds: float) -> Any:
         """Return the message nearest in time; None if it is far from that."""
@@ -242,7 +252,7 @@ def _notes(streams: Sequence[_Stream]) -> Iterator[str]:
         partial = [name for name in names if name not in absent]
         if partial:
             yield f"not in all messages of {stream.address}, and drawn as off there: {', '.join(partial)}"
-        if (np.diff(stream.seconds) < -_RESTART).any():
+        if len(stream.restarts):
             yield f"{stream.address} restarts, as after a reboot: its parts are drawn over one another"
 
 
@@ -260,7 +270,9 @@ def _draw_field(axes: Any, streams: Sequence[_Stream], name: str) -> None:
         values = _values_of(stream.messages, name)
         if values is not None:
             label = str(stream.address)
-            axes.plot(stream.seconds, values, color=stream.color, linewidth=0.9, label=label)
+            seconds = stream.line(stream.seconds)
+            values = stream.line(values)
+            axes.plot(seconds, values, color=stream.color, linewidth=0.9, label=label)
             is_drawn = True
     if not is_drawn:
         known = set[str]()
@@ -430,15 +442,17 @@ def _draw_lines(
         if is_valid.any():
             has_valid = True
     for stream, (x, y) in zip(streams, lines, strict=True):
+        x_line = stream.line(x)
+        y_line = stream.line(y)
         # below all other lines
-        thin = Line2D(x, y, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)
+        thin = Line2D(x_line, y_line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)
         if has_valid:
             axes.add_artist(thin)  # artists do not affect the axis limits
         else:
             axes.add_line(thin)
-        is_valid = stream.messages[flag]
-        valid_x = np.where(is_valid, x, np.nan)
-        valid_y = np.where(is_valid, y, np.nan)
+        is_valid = np.insert(stream.messages[flag], stream.restarts, False)
+        valid_x = np.where(is_valid, x_line, np.nan)
+        valid_y = np.where(is_valid, y_line, np.nan)
         label = str(stream.address)
         axes.plot(valid_x, valid_y, color=stream.color, linewidth=width, label=label)
 
@@ -468,14 +482,16 @@ def _draw_flags(axes: Any, rows: Sequence[_Row]) -> None:
             heights = np.full(len(times), number)
             axes.plot(times, heights, "|", color=stream.color, markersize=7)
             continue
-        flag = stream.messages[field]
+        seconds = stream.line(stream.seconds)
+        flag = np.insert(stream.messages[field], stream.restarts, False)
         if field == "dead_reckoning":
             color = _WARNING_COLOR
         else:
             color = stream.color
         before = np.append(False, flag[:-1])
         is_shown = flag | before  # fill to the first message without the flag
-        axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
+        is_shown &= np.isfinite(seconds)
+        axes.fill_between(seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
     size = "small"
     if len(rows) > _MANY_ROWS:
         size = "x-small"

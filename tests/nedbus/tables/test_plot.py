@@ -174,13 +174,20 @@ def test_flags_that_some_messages_lack_are_drawn() -> None:
 
 @pytest.mark.slow
 def test_restart_of_a_stream_is_noted() -> None:
-    """Boots are drawn over one another, which a note states."""
+    """Boots are drawn over one another, each with its own line and flags; a note states it."""
     plot = pytest.importorskip("nedbus.tables.plot", exc_type=ImportError)
     address, array = flight_of()
     assert "restarts" not in notes_of(plot.draw_figure([(address, array)], title="a flight"))
     twice = np.concatenate([array, array])
+    twice["z_reset_counter"][:100] = 3
     figure = plot.draw_figure([(address, twice)], title="a flight")
     assert f"{address} restarts, as after a reboot" in notes_of(figure)
+    axes = {str(each.get_label()): each for each in figure.axes}
+    [height] = [line for line in axes["altitude"].lines if line.get_label() == str(address)]
+    seconds = height.get_xdata()
+    assert (len(seconds), np.flatnonzero(np.isnan(seconds)).tolist()) == (201, [100])
+    assert [len(each.get_paths()) for each in axes["flags"].collections][:4] == [2, 2, 2, 2]
+    assert not any("z resets" in row for row in rows_of(axes["flags"]))
 
 
 def notes_of(figure: Any) -> str:
