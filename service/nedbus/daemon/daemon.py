@@ -64,7 +64,9 @@ def plan_sources(
             plan.append(PlannedSource(index, spec.text, settings.vehicle, source))
     is_endless = plan and not any(is_finite(planned.source) for planned in plan)
     if settings.until_done and is_endless and not mistakes:
-        reason = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
+        reason = (
+            "no source ever ends: use a log or a recording without loop=1, or sim: with duration="
+        )
         mistakes.append(ConfigError("until_done", reason))
     return plan, mistakes
 

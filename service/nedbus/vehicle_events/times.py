@@ -99,6 +99,8 @@ class Times:
         start = self.text(begin)
         if end is not None:
             unit = Times.unit(self.clock(end))
+            if begin.boot is not None and end.boot is not None and end.boot < begin.boot:
+                unit += ", after a reboot"
             return f"from {start} to {self.text(end)} {unit} {duration}"
         unit = Times.unit(self.clock(begin))
         if lasted == 0:

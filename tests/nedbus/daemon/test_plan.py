@@ -11,7 +11,7 @@ from nedbus.daemon import Daemon, plan_sources
 from nedbus.settings import load_settings
 from nedbus_msgs import Address
 
-ENDLESS = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
+ENDLESS = "no source ever ends: use a log or a recording without loop=1, or sim: with duration="
 
 
 @pytest.mark.parametrize(
