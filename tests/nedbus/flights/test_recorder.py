@@ -651,6 +651,13 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
     assert done == [1024, 2048]
 
 
+def test_conversion_without_an_output_names_it() -> None:
+    """The error of `nedbus convert flight.ulg` names the missing recording, not the flight."""
+    ended = run_command("convert", "flight.ulg")
+    assert ended.exit_code == 2
+    assert "name the recording to write, as in 'nedbus convert flight.ulg" in ended.err
+
+
 def test_conversion_without_a_valid_message_fails(tmp_path: Path) -> None:
     """If all messages are rejected, `convert` exits with an error that quotes the first reason, and writes no file."""
     writer, path = UlogWriter(), tmp_path / "a.mcap"

@@ -26,7 +26,11 @@ FlightsArgument = Annotated[
 
 @command
 def convert(
-    sources: FlightsArgument,
+    sources: Annotated[
+        list[Path],
+        # of one argument alone, the error names the other one
+        typer.Argument(metavar="FLIGHT", help=_FLIGHTS, show_default=False, default_factory=list),
+    ],
     output: Annotated[
         Path, typer.Argument(metavar="FILE.mcap", help="Recording to write", show_default=False)
     ],
@@ -42,6 +46,9 @@ def convert(
 
     Validates every message, and converts the topics of all built-in messages unless --topics selects others.
     """
+    if not sources:
+        reason = f"name the recording to write, as in 'nedbus convert {output} converted.mcap'"
+        raise ConfigError("FILE.mcap", reason)
     with show_progress() as show:
         done = nedbus.convert(
             sources,
