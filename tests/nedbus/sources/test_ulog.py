@@ -260,7 +260,7 @@ def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> 
         (lambda path: path.write_bytes(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + bytes(8)), NOTHING),
         (
             lambda path: write_log(path, [1], topic="something_else"),
-            f"{NOTHING}, but of something_else; choose .* topics=\\*",
+            f"{NOTHING}, but of something_else; choose .* all with '\\*'",
         ),
     ],
 )
