@@ -446,8 +446,8 @@ def test_history_contains_px4_texts(
         assert first.endswith('1        WATCH  PX4: "[ekf2] reset"')
         assert second.endswith('PX4: "[failsafe] Failsafe activated"')
     for result in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
-        # without the names of PX4's modules
-        assert 'PX4: "reset", PX4: "Failsafe activated"' in result
+        # without the names of PX4's modules; a busy service may receive the second text later
+        assert re.search(r'PX4: "reset"(, |; \S+ )PX4: "Failsafe activated"', result)
 
 
 @pytest.mark.long
